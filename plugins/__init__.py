@@ -1,0 +1,1 @@
+"""Thin adapters to the programs people already use: TomoPy and ASTRA."""

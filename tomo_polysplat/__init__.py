@@ -1,0 +1,37 @@
+"""Polychromatic Gaussian-splatting CT reconstruction that leaves no metal artefacts.
+
+The names below are the public interface; each is imported when first used, so that importing the package
+is quick and loads neither a GPU stack nor a compiler.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+__version__ = "0.1.0"
+
+_PUBLIC = {
+    "Detector": "tomo_polysplat.physics.detector",
+    "Materials": "tomo_polysplat.physics.materials",
+    "Result": "tomo_polysplat.result.result",
+    "Scan": "tomo_polysplat.scan.scan",
+    "Spectrum": "tomo_polysplat.physics.spectrum",
+    "load_scan": "tomo_polysplat.scan.io",
+    "reconstruct": "tomo_polysplat.reconstruct",
+    "simulate_scan": "tomo_polysplat.simulate.scenes",
+}
+
+__all__ = ["__version__", *sorted(_PUBLIC)]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _PUBLIC:
+        value = getattr(import_module(_PUBLIC[name]), name)
+        globals()[name] = value
+        return value
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

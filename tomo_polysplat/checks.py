@@ -1,0 +1,69 @@
+"""Checks of what a caller hands over.
+
+Every failure names the argument, says what was expected and what was got, and how to mend it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+__all__ = ["fail", "require_array", "require_choice", "require_number", "require_shape"]
+
+
+def fail(argument: str, expected: str, got: Any, remedy: str = "", error: type[Exception] = ValueError) -> Exception:
+    """The exception to raise: ``raise fail("angles", "radians", "degrees", "use numpy.deg2rad")``."""
+    message = f"{argument}: expected {expected}, got {got}"
+    return error(f"{message}; {remedy}" if remedy else message)
+
+
+def require_number(
+    argument: str,
+    value: Any,
+    *,
+    above: float = -math.inf,
+    at_least: float = -math.inf,
+    at_most: float = math.inf,
+    remedy: str = "",
+) -> float:
+    """A finite number within bounds, as a float."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise fail(argument, "a number", f"{value!r}", remedy, TypeError) from None
+    if not (math.isfinite(number) and number > above and at_least <= number <= at_most):
+        bounds = [
+            f"> {above:g}" if above > -math.inf else "",
+            f">= {at_least:g}" if at_least > -math.inf else "",
+            f"<= {at_most:g}" if at_most < math.inf else "",
+        ]
+        wanted = " and ".join(b for b in bounds if b)
+        raise fail(argument, f"a finite number {wanted}".rstrip(), f"{number!r}", remedy)
+    return number
+
+
+def require_choice(argument: str, value: Any, choices: Iterable[str], remedy: str = "") -> str:
+    """One of a few names."""
+    known = list(choices)
+    if value not in known:
+        raise fail(argument, f"one of {', '.join(known)}", repr(value), remedy)
+    return value
+
+
+def require_array(argument: str, value: Any, ndim: int | None = None, remedy: str = "") -> np.ndarray:
+    """A numeric array of real numbers (never an object array), of ``ndim`` axes when given."""
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiub":
+        raise fail(argument, "an array of real numbers", f"dtype {array.dtype}", remedy, TypeError)
+    if ndim is not None and array.ndim != ndim:
+        raise fail(argument, f"{ndim} axes", f"shape {array.shape}", remedy)
+    return array
+
+
+def require_shape(argument: str, array: np.ndarray, shape: tuple[int, ...], meaning: str, remedy: str = "") -> None:
+    """An exact shape; ``meaning`` names its axes, such as ``"(rows, views, columns)"``."""
+    if tuple(array.shape) != tuple(shape):
+        raise fail(argument, f"shape {tuple(shape)} {meaning}", f"{tuple(array.shape)}", remedy)

@@ -1,0 +1,1 @@
+"""Losses, held-out rays, the plan of what a scene needs, and the optimiser."""

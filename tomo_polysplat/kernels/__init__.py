@@ -1,0 +1,1 @@
+"""Compiled and reference implementations of projecting and voxelising Gaussians."""

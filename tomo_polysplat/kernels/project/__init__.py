@@ -1,0 +1,1 @@
+"""Line integrals of Gaussians over the detector."""

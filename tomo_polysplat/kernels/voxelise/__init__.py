@@ -1,0 +1,1 @@
+"""Gaussians sampled on a voxel grid."""

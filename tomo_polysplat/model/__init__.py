@@ -1,0 +1,1 @@
+"""What is unknown: the Gaussians, how they are seeded, added and removed."""

@@ -1,0 +1,40 @@
+"""Work shared out over CPU threads.
+
+The compiled CPU kernels release the interpreter lock, so plain threads run them side by side. Unlike a
+compiler's own thread pool this may be used from several threads at once and after a fork.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+__all__ = ["cpu_threads", "split_range", "run_tasks"]
+
+
+def cpu_threads() -> int:
+    """Threads this process may use: its CPU affinity, or ``OMP_NUM_THREADS`` where that is smaller."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    available = len(affinity(0)) if affinity else (os.cpu_count() or 1)
+    requested = os.environ.get("OMP_NUM_THREADS", "")
+    return max(1, min(available, int(requested))) if requested.isdigit() else available
+
+
+def split_range(length: int, parts: int) -> list[tuple[int, int]]:
+    """Cut ``range(length)`` into at most ``parts`` contiguous, non-empty ``(start, stop)`` pieces."""
+    parts = max(1, min(parts, length))
+    bounds = [length * k // parts for k in range(parts + 1)]
+    return [(a, b) for a, b in zip(bounds[:-1], bounds[1:]) if b > a]
+
+
+def run_tasks(function: Callable[..., object], tasks: Sequence[tuple]) -> list:
+    """Call ``function(*task)`` for every task over the CPU threads; results in the order of the tasks.
+
+    The first exception is raised after the tasks already running have finished.
+    """
+    threads = min(cpu_threads(), len(tasks))
+    if threads <= 1:
+        return [function(*task) for task in tasks]
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(lambda task: function(*task), tasks))

@@ -1,0 +1,1 @@
+"""Spectra, materials and the polychromatic transmission of a ray; knows no Gaussians."""

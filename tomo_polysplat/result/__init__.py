@@ -1,0 +1,1 @@
+"""What a reconstruction returns, its files and its metrics."""

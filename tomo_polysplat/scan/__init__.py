@@ -1,0 +1,1 @@
+"""What was measured: geometries, volumes, scan files."""
