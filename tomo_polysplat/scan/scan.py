@@ -1,0 +1,107 @@
+"""What was measured, with everything that is known about it.
+
+Arrays and geometries of a scan follow ASTRA's three-dimensional conventions: projections are
+``(rows, views, columns)``, volumes are ``(z, y, x)`` and y ascends with the index. A scan of one plane is
+a scan with one detector row and one slice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tomo_polysplat.checks import fail, require_array, require_shape
+
+if TYPE_CHECKING:
+    from tomo_polysplat.physics.spectrum import Spectrum
+
+__all__ = ["Scan"]
+
+
+@dataclass
+class Scan:
+    """A measured or simulated scan.
+
+    Parameters
+    ----------
+    projections : array, shape (rows, views, columns)
+        Line integrals -log(I/I0), stored as float32. Values of rays marked invalid are not used.
+    proj_geom, vol_geom : dict
+        ASTRA geometries of three-dimensional type (``parallel3d``, ``parallel3d_vec``, ``cone``,
+        ``cone_vec``), lengths in `unit`.
+    unit : str
+        Unit of the geometry's lengths: ``"cm"``, ``"mm"``, ``"um"``, ``"m"``, or ``"pixel"`` when unknown.
+    spectrum : Spectrum or None
+        Effective spectrum (tube, filters and detector); None when unknown or monochromatic.
+    truth : array, shape (z, y, x), or None
+        True attenuation in 1/`unit` at `truth_energy_kev`, where it is known.
+    metal_mask : bool array, shape (z, y, x), or None
+        Voxels of metal, used for measuring errors only; the reconstruction never sees it.
+    truth_energy_kev : float or None
+        Photon energy of `truth`; None stands for the spectrum's effective energy.
+    name : str
+        A name for reports.
+    valid : bool array, shape (rows, views, columns), or None
+        False where a ray was not measured properly; None when every ray is good.
+    notes : dict
+        Counts and choices made while reading, such as the number of rays without light.
+    """
+
+    projections: np.ndarray
+    proj_geom: dict[str, Any]
+    vol_geom: dict[str, Any]
+    unit: str = "cm"
+    spectrum: Spectrum | None = None
+    truth: np.ndarray | None = None
+    metal_mask: np.ndarray | None = None
+    truth_energy_kev: float | None = None
+    name: str = "scan"
+    valid: np.ndarray | None = None
+    notes: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        projections = require_array("projections", self.projections, 3)
+        self.projections = np.ascontiguousarray(projections, np.float32)
+        if "type" not in self.proj_geom or "GridRowCount" not in self.vol_geom:
+            raise fail("proj_geom, vol_geom", "ASTRA geometries", "dicts without 'type' or 'GridRowCount'")
+        if self.valid is not None:
+            self.valid = np.ascontiguousarray(self.valid, bool)
+            require_shape("valid", self.valid, self.projections.shape, "(rows, views, columns)")
+        if self.truth is not None:
+            self.truth = np.ascontiguousarray(require_array("truth", self.truth, 3), np.float32)
+            require_shape("truth", self.truth, self.volume_shape, "(z, y, x)")
+        if self.metal_mask is not None:
+            self.metal_mask = np.ascontiguousarray(self.metal_mask, bool)
+            require_shape("metal_mask", self.metal_mask, self.volume_shape, "(z, y, x)")
+
+    @property
+    def rows(self) -> int:
+        """Detector rows."""
+        return self.projections.shape[0]
+
+    @property
+    def views(self) -> int:
+        """Projection images."""
+        return self.projections.shape[1]
+
+    @property
+    def columns(self) -> int:
+        """Detector columns."""
+        return self.projections.shape[2]
+
+    @property
+    def volume_shape(self) -> tuple[int, int, int]:
+        """Voxels ``(z, y, x)`` of the volume geometry."""
+        grid = self.vol_geom
+        return int(grid.get("GridSliceCount", 1)), int(grid["GridRowCount"]), int(grid["GridColCount"])
+
+    def __repr__(self) -> str:
+        spectrum = (
+            "no spectrum" if self.spectrum is None else f"{self.spectrum.effective_energy:.1f} keV effective"
+        )
+        return (
+            f"Scan({self.name!r}, {self.proj_geom['type']}, rows={self.rows}, views={self.views}, "
+            f"columns={self.columns}, volume={self.volume_shape}, unit={self.unit!r}, {spectrum})"
+        )
