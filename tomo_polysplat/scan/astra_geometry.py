@@ -1,0 +1,288 @@
+"""Between ASTRA's geometries and array orders, and ours."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from itertools import permutations
+from typing import Any
+
+import numpy as np
+
+from tomo_polysplat.checks import fail, require_array, require_choice, require_number
+from tomo_polysplat.scan.curved_detector import flat_geometry, flatten_projections
+from tomo_polysplat.scan.view_geometry import Geometry
+from tomo_polysplat.scan.volume_grid import VolumeGrid, require_count
+
+__all__ = [
+    "from_astra",
+    "is_planar_geometry",
+    "projections_from_astra",
+    "volume_from_astra",
+    "volume_to_astra",
+]
+
+_log = logging.getLogger(__name__)
+
+_PLANAR_TYPES = ("parallel", "parallel_vec", "fanflat", "fanflat_vec")
+_SPATIAL_TYPES = ("parallel3d", "parallel3d_vec", "cone", "cone_vec", "cyl_cone_vec")
+_VECTOR_LENGTH = {
+    "parallel_vec": 6,
+    "fanflat_vec": 6,
+    "parallel3d_vec": 12,
+    "cone_vec": 12,
+    "cyl_cone_vec": 13,
+}
+
+
+def is_planar_geometry(geometry: Mapping[str, Any]) -> bool:
+    """True if an ASTRA projection or volume geometry is a 2D one."""
+    if "GridRowCount" in geometry:
+        return "GridSliceCount" not in geometry
+    return _type_of(geometry) in _PLANAR_TYPES
+
+
+def from_astra(proj_geom: Mapping[str, Any], vol_geom: Mapping[str, Any]) -> tuple[Geometry, VolumeGrid]:
+    """Translate ASTRA's geometries.
+
+    Parameters
+    ----------
+    proj_geom : dict
+        Any ASTRA projection geometry but ``sparse_matrix``. A curved detector (``cyl_cone_vec``) comes back
+        as the flat one that `projections_from_astra` resamples to.
+    vol_geom : dict
+        ASTRA volume geometry; 2D with a 2D projection geometry. Window options that are absent stand for
+        voxels of size 1 around the origin, as in ASTRA.
+
+    Returns
+    -------
+    Geometry, VolumeGrid
+        A 2D scan becomes one detector row and one slice at z = 0.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If something is missing, not finite, in degrees, or does not fit together.
+    """
+    from astra import geom_2vec
+
+    kind = _type_of(proj_geom)
+    if is_planar_geometry(proj_geom) != is_planar_geometry(vol_geom):
+        kinds = [f"a {'2D' if is_planar_geometry(g) else '3D'} one" for g in (proj_geom, vol_geom)]
+        remedy = "give create_vol_geom (rows, columns) in 2D or (rows, columns, slices) in 3D"
+        raise fail("vol_geom", f"{kinds[0]} to go with proj_geom {kind!r}", kinds[1], remedy)
+    grid = _volume_grid(vol_geom)
+    proj_geom = dict(proj_geom)
+    if "Vectors" in proj_geom or kind.endswith("_vec"):
+        proj_geom["Vectors"] = _checked_vectors(proj_geom, kind)
+    else:
+        proj_geom["ProjectionAngles"] = _checked_angles(proj_geom)
+        _check_distances(proj_geom)
+    vectors = geom_2vec(proj_geom)["Vectors"]
+    if kind in _PLANAR_TYPES:
+        geometry = _planar_geometry(kind, vectors, _entry(proj_geom, "DetectorCount"))
+    else:
+        rows, columns = _entry(proj_geom, "DetectorRowCount"), _entry(proj_geom, "DetectorColCount")
+        geometry = _spatial_geometry(kind, vectors, rows, columns)
+    _check_source(geometry, grid)
+    _log.debug("%s", geometry.describe())
+    return geometry, grid
+
+
+def projections_from_astra(projections: Any, proj_geom: Mapping[str, Any]) -> np.ndarray:
+    """Projections in our order.
+
+    Parameters
+    ----------
+    projections : array
+        ``(rows, views, columns)`` for a 3D geometry, ``(views, columns)`` for a 2D one.
+    proj_geom : dict
+        The ASTRA geometry that they belong to.
+
+    Returns
+    -------
+    (views, rows, columns) float32, C-contiguous
+        Possibly the caller's own memory: not to be written to. Pixels of a flat detector that the curved one
+        of ``cyl_cone_vec`` does not cover are NaN.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If the shape is not that of the geometry; the message names the order that was probably given.
+    """
+    array = require_array("projections", projections)
+    views = _number_of_views(proj_geom)
+    if is_planar_geometry(proj_geom):
+        columns = require_count("DetectorCount", _entry(proj_geom, "DetectorCount"))
+        _require_order(array, {"views": views, "columns": columns})
+        return np.ascontiguousarray(array[:, None, :], dtype=np.float32)
+    rows = require_count("DetectorRowCount", _entry(proj_geom, "DetectorRowCount"))
+    columns = require_count("DetectorColCount", _entry(proj_geom, "DetectorColCount"))
+    _require_order(array, {"rows": rows, "views": views, "columns": columns})
+    ordered = np.ascontiguousarray(array.swapaxes(0, 1), dtype=np.float32)
+    if _type_of(proj_geom) != "cyl_cone_vec":
+        return ordered
+    return flatten_projections(ordered, _checked_vectors(proj_geom, "cyl_cone_vec"))
+
+
+def volume_from_astra(volume: Any, vol_geom: Mapping[str, Any]) -> np.ndarray:
+    """A volume ``(z, y, x)`` with y ascending, from ASTRA's ``(z, y, x)`` or 2D image (row 0 at +y)."""
+    array = require_array("volume", volume)
+    grid = _volume_grid(vol_geom)
+    expected = grid.shape[1:] if is_planar_geometry(vol_geom) else grid.shape
+    if array.shape != expected:
+        order = "(y, x)" if len(expected) == 2 else "(z, y, x)"
+        raise fail("volume", f"shape {expected} {order}", f"{array.shape}")
+    return array[None, ::-1, :] if is_planar_geometry(vol_geom) else array
+
+
+def volume_to_astra(volume: np.ndarray, vol_geom: Mapping[str, Any]) -> np.ndarray:
+    """The inverse of `volume_from_astra`."""
+    return volume[0, ::-1, :] if is_planar_geometry(vol_geom) else volume
+
+
+def _type_of(proj_geom: Mapping[str, Any]) -> str:
+    if not isinstance(proj_geom, Mapping) or "type" not in proj_geom:
+        raise fail(
+            "proj_geom", "a dict from astra.create_proj_geom", repr(type(proj_geom).__name__), "", TypeError
+        )
+    remedy = (
+        "a matrix has no rays; give the geometry that it was made from"
+        if (proj_geom["type"] == "sparse_matrix")
+        else ""
+    )
+    return require_choice("proj_geom type", proj_geom["type"], _PLANAR_TYPES + _SPATIAL_TYPES, remedy)
+
+
+def _entry(geometry: Mapping[str, Any], key: str) -> Any:
+    if key not in geometry:
+        raise fail(key, "an entry of the ASTRA geometry", "none", "make it with astra.create_proj_geom")
+    return geometry[key]
+
+
+def _number_of_views(proj_geom: Mapping[str, Any]) -> int:
+    return len(_entry(proj_geom, "Vectors" if _type_of(proj_geom).endswith("_vec") else "ProjectionAngles"))
+
+
+def _volume_grid(vol_geom: Mapping[str, Any]) -> VolumeGrid:
+    names = {"X": "GridColCount", "Y": "GridRowCount", "Z": "GridSliceCount"}
+    planar = is_planar_geometry(vol_geom)
+    counts, lower, upper = [], [], []
+    options = vol_geom.get("option", vol_geom.get("options", {}))
+    for axis in "XY" if planar else "XYZ":
+        count = require_count(names[axis], _entry(vol_geom, names[axis]))
+        counts.append(count)
+        lower.append(require_number(f"WindowMin{axis}", options.get(f"WindowMin{axis}", -0.5 * count)))
+        upper.append(require_number(f"WindowMax{axis}", options.get(f"WindowMax{axis}", 0.5 * count)))
+    if planar:
+        # A slice has no thickness; one voxel wide keeps its only voxel a cube for square pixels.
+        half = 0.5 * abs(upper[0] - lower[0]) / counts[0]
+        counts, lower, upper = [*counts, 1], [*lower, -half], [*upper, half]
+    return VolumeGrid((counts[2], counts[1], counts[0]), np.array(lower), np.array(upper))
+
+
+def _checked_vectors(proj_geom: Mapping[str, Any], kind: str) -> np.ndarray:
+    vectors = require_array("Vectors", _entry(proj_geom, "Vectors"), ndim=2).astype(np.float64)
+    if vectors.shape[1] != _VECTOR_LENGTH[kind]:
+        raise fail("Vectors", f"shape (views, {_VECTOR_LENGTH[kind]}) for {kind!r}", f"{vectors.shape}")
+    bad = ~np.isfinite(vectors).all(axis=1)
+    if bad.any():
+        raise fail(
+            "Vectors", "finite numbers", f"NaN or infinity in {bad.sum()} views, first {np.argmax(bad)}"
+        )
+    return vectors
+
+
+def _checked_angles(proj_geom: Mapping[str, Any]) -> np.ndarray:
+    angles = require_array("ProjectionAngles", _entry(proj_geom, "ProjectionAngles"), ndim=1).astype(
+        np.float64
+    )
+    if not np.isfinite(angles).all():
+        raise fail("ProjectionAngles", "finite numbers", f"{np.sum(~np.isfinite(angles))} NaN or infinite")
+    if _look_like_degrees(angles):
+        raise fail(
+            "ProjectionAngles",
+            "radians",
+            f"{angles.min():g} to {angles.max():g}, which look like degrees",
+            "use numpy.deg2rad(angles); if they are radians over many turns, take them modulo 2*pi",
+        )
+    return angles
+
+
+def _look_like_degrees(angles: np.ndarray) -> bool:
+    """More than two turns, and either a round arc in degrees or small steps that make no whole turns."""
+    if len(angles) < 2 or np.ptp(angles) <= 4 * np.pi:
+        return False
+    step = float(np.median(np.abs(np.diff(angles))))
+    arcs = np.ptp(angles) + np.array([0.0, step])  # without and with the end point
+    round_degrees = np.abs(arcs / 45 - np.round(arcs / 45)) < 1e-4
+    whole_turns = np.abs(arcs / (2 * np.pi) - np.round(arcs / (2 * np.pi))) < 0.02
+    return bool(round_degrees.any() or (step < 1.5 and not whole_turns.any()))
+
+
+def _check_distances(proj_geom: Mapping[str, Any]) -> None:
+    for key in ("DetectorWidth", "DetectorSpacingX", "DetectorSpacingY"):
+        if key in proj_geom:
+            require_number(key, proj_geom[key], above=0.0)
+    if "DistanceOriginSource" in proj_geom:
+        require_number("DistanceOriginSource", proj_geom["DistanceOriginSource"], above=0.0)
+        require_number("DistanceOriginDetector", _entry(proj_geom, "DistanceOriginDetector"), at_least=0.0)
+
+
+def _planar_geometry(kind: str, vectors: np.ndarray, columns: Any) -> Geometry:
+    columns = require_count("DetectorCount", columns)
+    origin, centre, u = (np.pad(part, ((0, 0), (0, 1))) for part in np.split(vectors, 3, axis=1))
+    v = np.zeros_like(u)
+    v[:, 2] = np.linalg.norm(u, axis=1)
+    beam = "cone" if kind.startswith("fanflat") else "parallel"
+    return Geometry(beam, origin, centre - 0.5 * (columns - 1) * u, u, v, 1, columns)
+
+
+def _spatial_geometry(kind: str, vectors: np.ndarray, rows: Any, columns: Any) -> Geometry:
+    rows, columns = require_count("DetectorRowCount", rows), require_count("DetectorColCount", columns)
+    if kind == "cyl_cone_vec":
+        return flat_geometry(vectors, rows, columns)
+    origin, centre, u, v = np.split(vectors, 4, axis=1)
+    corner = centre - 0.5 * (columns - 1) * u - 0.5 * (rows - 1) * v
+    beam = "cone" if kind.startswith("cone") else "parallel"
+    return Geometry(beam, origin, corner, u, v, rows, columns)
+
+
+def _check_source(geometry: Geometry, grid: VolumeGrid) -> None:
+    """Refuse a source within the object, whose rays would start inside it.
+
+    The object is taken to fill the elliptic cylinder inscribed in the window; corners of the box may well
+    reach beyond the orbit.
+    """
+    if geometry.beam == "parallel":
+        return
+    offset = np.abs(geometry.origin - grid.centre) / (0.5 * grid.extent)
+    inside = (np.hypot(offset[:, 0], offset[:, 1]) < 1.0) & (offset[:, 2] < 1.0)
+    if inside.any():
+        raise fail(
+            "source positions",
+            "all outside the volume",
+            f"{inside.sum()} of {geometry.views} inside its window, first in view {np.argmax(inside)}",
+            "give distances and the window of vol_geom in the same unit; without a window voxels have size 1",
+        )
+    reached = (offset < 1.0).all(axis=1)
+    if reached.any():
+        _log.warning("The source lies in a corner of the volume window in %d views.", int(reached.sum()))
+
+
+def _require_order(array: np.ndarray, axes: dict[str, int]) -> None:
+    """Refuse a wrong shape, naming the order of axes that would explain it."""
+    shape = tuple(axes.values())
+    if array.shape == shape:
+        return
+    names = tuple(axes)
+    remedy = ""
+    for order in permutations(range(len(names))):
+        if array.ndim == len(names) and tuple(shape[k] for k in order) == array.shape:
+            given = ", ".join(names[k] for k in order)
+            back = tuple(order.index(k) for k in range(len(names)))
+            swap = "numpy.swapaxes(projections, 0, 1)"
+            turn = swap if back in ((1, 0), (1, 0, 2)) else f"numpy.transpose(projections, {back})"
+            remedy = f"the axes look like ({given}) where ASTRA wants ({', '.join(names)}): use {turn}"
+            break
+    raise fail("projections", f"shape {shape} ({', '.join(names)})", f"{array.shape}", remedy)
