@@ -1,0 +1,56 @@
+"""The projection as a differentiable torch operation, whichever implementation does the work."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from tomo_polysplat.kernels.project import reference
+from tomo_polysplat.kernels.views import DetectorViews
+
+__all__ = ["project"]
+
+
+def project(
+    position: torch.Tensor,
+    scale: torch.Tensor,
+    rotation: torch.Tensor,
+    weight: torch.Tensor,
+    views: DetectorViews,
+    *,
+    kernel: str,
+    cutoff: float,
+) -> tuple[torch.Tensor, int]:
+    """Line integrals of weighted Gaussians over every pixel; arguments and results as in ``reference.project``.
+
+    ``kernel`` is ``"reference"``, ``"numba"`` or ``"triton"``; the compiled ones take float32 only.
+    """
+    if kernel == "reference":
+        return reference.project(position, scale, rotation, weight, views, cutoff)
+    if kernel == "numba":
+        image, skipped = _NumbaProject.apply(position, scale, rotation, weight, views, cutoff)
+    else:
+        from tomo_polysplat.kernels.project import triton_kernel
+
+        image, skipped = triton_kernel.project(position, scale, rotation, weight, views, cutoff)
+    factor = math.sqrt(2 * math.pi) * views.ray_lengths(position.device, position.dtype)
+    return image * factor, skipped
+
+
+class _NumbaProject(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, position, scale, rotation, weight, views, cutoff):
+        from tomo_polysplat.kernels.project import numba_kernel
+
+        arrays = [t.detach().contiguous().numpy() for t in (position, scale, rotation, weight)]
+        image, skipped, state = numba_kernel.forward(*arrays, views, cutoff)
+        ctx.arrays, ctx.views, ctx.cutoff, ctx.state = arrays, views, cutoff, state
+        return torch.from_numpy(image), skipped
+
+    @staticmethod
+    def backward(ctx, grad_image, _):
+        from tomo_polysplat.kernels.project import numba_kernel
+
+        grads = numba_kernel.backward(*ctx.arrays, ctx.views, ctx.cutoff, ctx.state, grad_image.numpy())
+        return (*map(torch.from_numpy, grads), None, None)

@@ -1,0 +1,74 @@
+"""The detector views a kernel projects onto, as plain arrays.
+
+A view maps a point to the detector through one 3x3 matrix. With the columns of ``matrix`` being the step
+``U`` from column to column, the step ``V`` from row to row and ``D``,
+
+* cone beam: ``D`` runs from the source to pixel (0, 0); for a point ``p`` and
+  ``(a, b, c) = matrix^-1 (p - origin)`` the projection is column ``a / c``, row ``b / c``, and
+  ``kappa = 1 / c`` stretches ``p - origin`` to the detector plane. ``origin`` is the source.
+* parallel beam: ``D`` is the ray direction; for ``(a, b, c) = matrix^-1 (p - origin)`` the projection is
+  column ``a``, row ``b``. ``origin`` is the centre of pixel (0, 0).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+__all__ = ["DetectorViews"]
+
+
+@dataclass(frozen=True)
+class DetectorViews:
+    """Views of one scan.
+
+    Parameters
+    ----------
+    cone : bool
+        Rays leave a point (True) or are parallel (False).
+    origin : (views, 3) float64
+        Source, or centre of pixel (0, 0) for parallel rays.
+    matrix : (views, 3, 3) float64
+        Columns ``U``, ``V``, ``D`` of the module docstring.
+    rows, columns : int
+        Detector size.
+    planar : bool
+        One detector row whose rays stay in a plane of constant z: a two-dimensional scan.
+    """
+
+    cone: bool
+    origin: np.ndarray
+    matrix: np.ndarray
+    rows: int
+    columns: int
+    planar: bool = False
+
+    def __len__(self) -> int:
+        return len(self.origin)
+
+    def select(self, indices: np.ndarray | list[int]) -> DetectorViews:
+        """The views of these indices, in their order."""
+        return DetectorViews(
+            self.cone, self.origin[indices], self.matrix[indices], self.rows, self.columns, self.planar
+        )
+
+    @property
+    def inverse(self) -> np.ndarray:
+        """(views, 3, 3) float64 inverse of ``matrix``."""
+        return np.linalg.inv(self.matrix)
+
+    def ray_lengths(self, device: torch.device | str, dtype: torch.dtype) -> torch.Tensor:
+        """(views, rows, columns) length of the unnormalised ray vector of every pixel.
+
+        It is the factor of the line integral that depends on the pixel alone (one value a view when parallel).
+        """
+        matrix = torch.as_tensor(self.matrix, device=device, dtype=dtype)
+        if not self.cone:
+            return matrix[:, :, 2].norm(dim=1)[:, None, None].expand(-1, self.rows, self.columns)
+        column = torch.arange(self.columns, device=device, dtype=dtype)
+        row = torch.arange(self.rows, device=device, dtype=dtype)
+        u, v, d = (matrix[:, :, None, None, k] for k in range(3))
+        ray = d + row[:, None] * v + column * u
+        return ray.square().sum(dim=1).sqrt()
