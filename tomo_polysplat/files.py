@@ -1,0 +1,138 @@
+"""Writing files so that an interrupted run leaves the old or the new one, and reading them without trust."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from tomo_polysplat.checks import fail
+
+__all__ = ["available_memory", "existing_file", "replacing", "require_room", "require_plausible_size"]
+
+# Deflate, the strongest compression met in these formats, cannot shrink data by more than 1032.
+LARGEST_COMPRESSION = 1100
+
+
+@contextmanager
+def replacing(path: str | os.PathLike, *, overwrite: bool, needed_bytes: int = 0) -> Iterator[Path]:
+    """A temporary path in the folder of `path` that becomes `path` when the block ends without an error.
+
+    Parameters
+    ----------
+    path : path
+        The file to write; its folder must exist.
+    overwrite : bool
+        Whether an existing file may be replaced.
+    needed_bytes : int
+        Size to be written, compared with the free disk space before anything is written.
+
+    Raises
+    ------
+    FileExistsError
+        If the file exists and `overwrite` is false.
+    OSError
+        If the disk has too little free space.
+    """
+    target = Path(path)
+    _require_replaceable(target, overwrite)
+    require_room(target.parent, needed_bytes)
+    handle, name = tempfile.mkstemp(
+        prefix=f".{target.stem}-", suffix=f".part{target.suffix}", dir=target.parent
+    )
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        _flush(temporary)
+        _take_default_mode(temporary)
+        _require_replaceable(target, overwrite)
+        os.replace(temporary, target)
+    finally:
+        with suppress(FileNotFoundError):
+            temporary.unlink()
+
+
+def _require_replaceable(target: Path, overwrite: bool) -> None:
+    if target.is_dir():
+        raise fail("path", "a file", f"the folder {target}", error=IsADirectoryError)
+    if not target.parent.is_dir():
+        raise fail(
+            "path", "a file in an existing folder", str(target), "create the folder", FileNotFoundError
+        )
+    if target.exists() and not overwrite:
+        raise fail("path", "a new file", f"{target}, which exists", "pass overwrite=True", FileExistsError)
+
+
+def _flush(path: Path) -> None:
+    # Without this a crash of the machine could leave the new name with none of the new contents.
+    with open(path, "rb+") as file:
+        os.fsync(file.fileno())
+
+
+def _take_default_mode(path: Path) -> None:
+    # mkstemp makes files that only their owner can read; a result should get the usual permissions.
+    mask = os.umask(0)
+    os.umask(mask)
+    path.chmod(0o666 & ~mask)
+
+
+def require_room(folder: str | os.PathLike, needed_bytes: int) -> None:
+    """Refuse to start writing what the disk cannot hold."""
+    free = shutil.disk_usage(folder or ".").free
+    if needed_bytes > free:
+        raise fail(
+            "path",
+            f"{needed_bytes / 2**20:,.0f} MiB of free disk space",
+            f"{free / 2**20:,.0f} MiB in {folder}",
+            "free some space or choose another folder",
+            OSError,
+        )
+
+
+def available_memory() -> int | None:
+    """Bytes of memory that a process may still take, or None where the system does not say."""
+    try:
+        with open("/proc/meminfo", encoding="ascii") as file:
+            for line in file:
+                if line.startswith("MemAvailable:"):
+                    return int(line.split()[1]) * 1024
+    except OSError:
+        pass
+    return None
+
+
+def require_plausible_size(name: str, declared_bytes: int, stored_bytes: int) -> None:
+    """Refuse an array whose header promises more than the file or the memory can hold.
+
+    A damaged or hostile header may declare any size, and memory would be taken before the first byte is read.
+    """
+    if declared_bytes > LARGEST_COMPRESSION * max(stored_bytes, 1):
+        raise fail(
+            name,
+            "as much data as its header declares",
+            f"{declared_bytes} bytes declared but {stored_bytes} stored",
+            "the file is truncated or damaged: copy or write it again",
+        )
+    memory = available_memory()
+    if memory is not None and declared_bytes > memory:
+        raise fail(
+            name,
+            f"at most the {memory / 2**30:.1f} GiB of free memory",
+            f"{declared_bytes / 2**30:.1f} GiB",
+            "bin or crop the data",
+            MemoryError,
+        )
+
+
+def existing_file(path: str | os.PathLike) -> Path:
+    """`path` as a Path to a file that exists and is not empty."""
+    file = Path(path)
+    if not file.is_file():
+        raise fail("path", "an existing file", str(file), error=FileNotFoundError)
+    if file.stat().st_size == 0:
+        raise fail("path", "a file with contents", f"{file}, which is empty")
+    return file

@@ -1,0 +1,289 @@
+"""Data Exchange HDF5: ``/exchange/data`` (views, rows, columns), ``data_white``, ``data_dark``, ``theta``.
+
+Read with h5py alone. What the layout has no place for is kept in a group of our own, ``/polysplat``:
+
+- ``geometry``: attributes ``astra_type`` (``cone_vec``, ``parallel3d_vec`` or ``cyl_cone_vec``) and ``unit``;
+  datasets ``vectors`` (views, 12 or 13), ``volume_shape`` (nz, ny, nx) and ``volume_window`` (xmin, xmax,
+  ymin, ymax, zmin, zmax);
+- ``spectrum``: datasets ``energies`` (keV) and ``weights``;
+- ``truth`` (z, y, x) in 1/unit with attribute ``energy_kev``; ``metal_mask`` (z, y, x);
+  ``valid`` (like data).
+
+The attribute ``input`` of ``/exchange/data`` tells counts, transmission and attenuation apart.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tomo_polysplat.checks import fail, require_array, require_choice, require_shape
+from tomo_polysplat.files import replacing
+from tomo_polysplat.scan.centre import estimate_centre
+from tomo_polysplat.scan.defects import attenuation, fill_invalid, flat_and_dark
+from tomo_polysplat.scan.hdf5 import find_array, opened, read_numbers, read_text
+from tomo_polysplat.scan.layout import (
+    parallel_geometry,
+    spatial_geometry,
+    vector_form,
+    vector_geometry,
+    volume_geometry,
+    window_of,
+)
+from tomo_polysplat.scan.reading import INPUT_KINDS, ReadOptions
+from tomo_polysplat.scan.scan import Scan
+
+if TYPE_CHECKING:
+    import h5py
+
+__all__ = ["scan_from_hdf5", "write_hdf5"]
+
+logger = logging.getLogger(__name__)
+
+BLOCK_BYTES = 2**27
+# Where APS tomography files keep the size of a pixel in the plane of the object. The size of a camera's own
+# pixel is not used: without the magnification it is off by the objective's factor.
+PIXEL_SIZE_PATHS = ("measurement/instrument/detection_system/objective/resolution",)
+LENGTH_NAMES = {
+    "um": "um",
+    "micron": "um",
+    "microns": "um",
+    "micrometers": "um",
+    "mm": "mm",
+    "cm": "cm",
+    "m": "m",
+}
+
+
+def scan_from_hdf5(path: Path, options: ReadOptions) -> Scan:
+    """Read a scan; see :func:`tomo_polysplat.load_scan`."""
+    with opened(path) as file:
+        exchange = file.get("exchange")
+        data = None if exchange is None else find_array(exchange, "data")
+        if exchange is None or data is None or data.ndim != 3 or 0 in data.shape:
+            got = "no such dataset" if data is None else f"shape {data.shape}"
+            raise fail("path", "a dataset /exchange/data of shape (views, rows, columns)", f"{got} in {path}")
+        projections, valid, notes = _line_integrals(exchange, data, options)
+        own = file.get("polysplat/valid")
+        if own is not None:
+            stored = read_numbers(file["polysplat"], "valid", data.shape).astype(bool)
+            valid &= stored.transpose(1, 0, 2)
+        _report_defects(notes["rays"], valid)
+        geometry = _geometry(file, projections, valid, options, notes)
+        return Scan(
+            projections=projections,
+            valid=None if valid.all() else valid,
+            name=read_text(file, "measurement/sample/name") or path.stem,
+            notes=notes,
+            **geometry,
+            **_knowledge(file, options),
+        )
+
+
+def _line_integrals(
+    exchange: h5py.Group, data: h5py.Dataset, options: ReadOptions
+) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+    """Projections and validity in the order (rows, views, columns), read a block of views at a time."""
+    views, rows, columns = data.shape
+    white, dark = find_array(exchange, "data_white"), find_array(exchange, "data_dark")
+    kind = _input_kind(data, white is not None, options.input)
+    flat = background = None
+    if kind == "counts":
+        if white is None:
+            raise fail(
+                "path",
+                "/exchange/data_white beside counts",
+                "none",
+                "or pass input='transmission' or 'attenuation'",
+            )
+        flat, background = flat_and_dark(white[()], None if dark is None else dark[()], (rows, columns))
+    projections = np.empty((rows, views, columns), np.float32)
+    valid = np.empty((rows, views, columns), bool)
+    rays: dict[str, int] = {}
+    block = max(1, BLOCK_BYTES // (rows * columns * 8))
+    for first in range(0, views, block):
+        part = slice(first, min(first + block, views))
+        values, usable, counts = attenuation(data[part], kind, flat, background, options.saturation)
+        projections[:, part], valid[:, part] = values.transpose(1, 0, 2), usable.transpose(1, 0, 2)
+        rays = {name: rays.get(name, 0) + count for name, count in counts.items()}
+    return projections, valid, {"input": kind, "rays": rays}
+
+
+def _input_kind(data: h5py.Dataset, has_white: bool, stated: str | None) -> str:
+    """What the numbers are: as the caller or the file states it, else as they look, with a warning."""
+    if stated is not None:
+        return stated
+    attribute = data.attrs.get("input")
+    if attribute is not None:
+        attribute = attribute.decode() if isinstance(attribute, bytes) else attribute
+        return require_choice("attribute 'input' of /exchange/data", attribute, INPUT_KINDS)
+    if has_white:
+        return "counts"
+    sample = np.asarray(data[:: max(1, data.shape[0] // 8)], np.float64)
+    sample = sample[np.isfinite(sample)]
+    if sample.size and np.percentile(sample, 99) > 30:
+        raise fail(
+            "input",
+            "open-beam images (/exchange/data_white) for what looks like counts",
+            "none",
+            "or state input=",
+        )
+    # Air is the commonest value at one end: near 1 in transmission, near 0 in attenuation.
+    kind = "transmission" if sample.size and 0.7 < np.percentile(sample, 95) < 1.3 else "attenuation"
+    logger.warning("no open-beam images: the data look like %s; pass input= to be sure", kind)
+    return kind
+
+
+def _report_defects(rays: dict[str, int], valid: np.ndarray) -> None:
+    lost = valid.size - np.count_nonzero(valid)
+    if lost:
+        kinds = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in rays.items() if count)
+        logger.warning("%d of %d rays are left out (%s)", lost, valid.size, kinds or "marked in the file")
+
+
+def _geometry(
+    file: h5py.File, projections: np.ndarray, valid: np.ndarray, options: ReadOptions, notes: dict[str, Any]
+) -> dict[str, Any]:
+    """``proj_geom``, ``vol_geom`` and ``unit``: the caller's, the file's, or a parallel beam."""
+    group = file.get("polysplat/geometry")
+    if options.proj_geom is not None or group is not None:
+        options.refuse_parallel_only()
+    if options.proj_geom is not None:
+        assert options.vol_geom is not None  # ReadOptions refuses one without the other
+        proj_geom = spatial_geometry(dict(options.proj_geom))
+        return {
+            "proj_geom": proj_geom,
+            "vol_geom": dict(options.vol_geom),
+            "unit": options.settled_unit(None, "cm"),
+        }
+    if group is not None:
+        proj_geom = vector_geometry(
+            _attribute(group, "astra_type"), read_numbers(group, "vectors"), projections.shape
+        )
+        vol_geom = volume_geometry(read_numbers(group, "volume_shape"), read_numbers(group, "volume_window"))
+        unit = options.settled_unit(_attribute(group, "unit"), "cm")
+        return {"proj_geom": proj_geom, "vol_geom": dict(options.vol_geom or vol_geom), "unit": unit}
+    rows, views, columns = projections.shape
+    theta = _angles(file, views, options.theta)
+    centre = options.centre
+    if centre is None:
+        centre = estimate_centre(fill_invalid(projections, valid), theta, valid)
+    notes |= {"centre": float(centre), "centre_estimated": options.centre is None}
+    pixel_size, unit = _pixel_size(file, options)
+    proj_geom, vol_geom = parallel_geometry(theta, rows, columns, centre, pixel_size)
+    return {"proj_geom": proj_geom, "vol_geom": dict(options.vol_geom or vol_geom), "unit": unit}
+
+
+def _attribute(group: h5py.Group, name: str) -> str:
+    value = group.attrs.get(name)
+    if not isinstance(value, (str, bytes)):
+        raise fail("path", f"an attribute '{name}' of {group.name}", repr(value))
+    return value.decode() if isinstance(value, bytes) else value
+
+
+def _angles(file: h5py.File, views: int, given: Any) -> np.ndarray:
+    """View angles in radians."""
+    in_radians = False
+    if given is None:
+        dataset = find_array(file["exchange"], "theta")
+        if dataset is None:
+            raise _missing_theta(views)
+        in_radians = str(dataset.attrs.get("units", "")).strip("b'\"").lower().startswith("rad")
+        given = dataset[()]
+    theta = require_array("theta", given, 1).astype(np.float64)
+    require_shape("theta", theta, (views,), "(views,)")
+    if not np.isfinite(theta).all():
+        raise fail("theta", "finite angles", "NaN or infinity")
+    if not in_radians and views > 2 and np.ptp(theta) < 2 * np.pi + 0.1:
+        logger.warning("theta spans %.3g degrees only: are these radians?", np.ptp(theta))
+    return theta if in_radians else np.deg2rad(theta)
+
+
+def _missing_theta(views: int) -> Exception:
+    return fail(
+        "theta",
+        "the angle of every view",
+        "no /exchange/theta in the file",
+        f"pass theta= in degrees, such as numpy.linspace(0, 180, {views}, endpoint=False)",
+    )
+
+
+def _pixel_size(file: h5py.File, options: ReadOptions) -> tuple[float, str]:
+    """Size of a pixel in the plane of the object, and its unit; ``(1, "pixel")`` when unknown."""
+    if options.pixel_size is not None:
+        return options.pixel_size, options.unit or "cm"
+    for path in PIXEL_SIZE_PATHS:
+        dataset = find_array(file, path)
+        if dataset is not None and dataset.size == 1:
+            unit = LENGTH_NAMES.get(str(dataset.attrs.get("units", "")).strip("b'\"").lower())
+            if unit is not None:
+                return float(np.asarray(dataset[()]).reshape(())), options.settled_unit(unit, unit)
+    if options.unit not in (None, "pixel"):
+        raise fail(
+            "unit", "'pixel', as the file states no pixel size", repr(options.unit), "pass pixel_size= too"
+        )
+    return 1.0, "pixel"
+
+
+def _knowledge(file: h5py.File, options: ReadOptions) -> dict[str, Any]:
+    """Spectrum, truth and metal mask, where the file has them."""
+    group = file.get("polysplat", {})
+    lines = group.get("spectrum")
+    energies = None if lines is None else read_numbers(lines, "energies")
+    weights = None if lines is None else read_numbers(lines, "weights")
+    known: dict[str, Any] = {"spectrum": options.settled_spectrum(energies, weights)}
+    if options.vol_geom is None and "truth" in group:
+        energy = group["truth"].attrs.get("energy_kev")
+        known |= {
+            "truth": read_numbers(group, "truth"),
+            "truth_energy_kev": None if energy is None else float(energy),
+            "metal_mask": read_numbers(group, "metal_mask") if "metal_mask" in group else None,
+        }
+    return known
+
+
+def write_hdf5(scan: Scan, path: str | Path, *, overwrite: bool = False) -> None:
+    """Write a scan as Data Exchange with the group ``/polysplat`` described above."""
+    import h5py
+
+    needed = sum(
+        a.nbytes for a in (scan.projections, scan.truth, scan.metal_mask, scan.valid) if a is not None
+    )
+    with (
+        replacing(path, overwrite=overwrite, needed_bytes=needed) as temporary,
+        h5py.File(temporary, "w") as file,
+    ):
+        file["implements"] = "exchange:measurement:polysplat"
+        file["measurement/sample/name"] = scan.name
+        data = file.create_dataset("exchange/data", data=scan.projections.transpose(1, 0, 2))
+        data.attrs.update(input="attenuation", description="attenuation", axes="theta:y:x", units="1")
+        geometry = vector_form(scan.proj_geom)
+        theta = file.create_dataset("exchange/theta", data=_theta_degrees(geometry["Vectors"]))
+        theta.attrs["units"] = "degrees"
+        group = file.create_group("polysplat/geometry")
+        group.attrs.update(astra_type=geometry["type"], unit=scan.unit)
+        group["vectors"] = geometry["Vectors"]
+        group["volume_shape"], group["volume_window"] = np.array(scan.volume_shape), window_of(scan.vol_geom)
+        _write_knowledge(file["polysplat"], scan)
+
+
+def _write_knowledge(group: h5py.Group, scan: Scan) -> None:
+    if scan.spectrum is not None:
+        group["spectrum/energies"], group["spectrum/weights"] = scan.spectrum.energies, scan.spectrum.weights
+    if scan.valid is not None:
+        group["valid"] = scan.valid.transpose(1, 0, 2)
+    if scan.metal_mask is not None:
+        group["metal_mask"] = scan.metal_mask
+    if scan.truth is not None:
+        group["truth"] = scan.truth
+        group["truth"].attrs["unit"] = f"1/{scan.unit}"
+        if scan.truth_energy_kev is not None:
+            group["truth"].attrs["energy_kev"] = scan.truth_energy_kev
+
+
+def _theta_degrees(vectors: np.ndarray) -> np.ndarray:
+    """Azimuth of the source (or of a parallel beam's direction) as ASTRA counts angles: 0 is at -y."""
+    return np.rad2deg(np.unwrap(np.arctan2(vectors[:, 0], -vectors[:, 1])))

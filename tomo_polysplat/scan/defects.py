@@ -1,0 +1,106 @@
+"""From counts to line integrals, keeping account of the rays that were not measured properly."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from tomo_polysplat.checks import fail, require_shape
+
+__all__ = ["attenuation", "fill_invalid", "flat_and_dark"]
+
+logger = logging.getLogger(__name__)
+
+
+def flat_and_dark(
+    white: np.ndarray, dark: np.ndarray | None, shape: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean open-beam and dark images of a detector of `shape` (rows, columns); no dark image means zero."""
+    return _mean_frame("data_white", white, shape), (
+        np.zeros(shape) if dark is None else _mean_frame("data_dark", dark, shape)
+    )
+
+
+def _mean_frame(name: str, frames: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    frames = np.asarray(frames)
+    frames = frames[None] if frames.ndim == 2 else frames
+    if frames.ndim != 3 or not len(frames):
+        raise fail(name, "frames of shape (frames, rows, columns)", f"shape {frames.shape}")
+    require_shape(name, frames[0], shape, "(rows, columns) of the data")
+    return frames.mean(axis=0, dtype=np.float64)
+
+
+def attenuation(
+    values: np.ndarray,
+    kind: str,
+    flat: np.ndarray | None = None,
+    dark: np.ndarray | None = None,
+    saturation: float | None = None,
+) -> tuple[np.ndarray, np.ndarray, dict[str, int]]:
+    """Line integrals and which of them can be trusted.
+
+    Parameters
+    ----------
+    values : array, shape (views, rows, columns)
+        What the file holds.
+    kind : {"counts", "transmission", "attenuation"}
+        Detector counts, I/I0, or -log(I/I0) already.
+    flat, dark : array, shape (rows, columns)
+        Mean open-beam and dark images; for counts only.
+    saturation : float or None
+        Counts from which the detector is saturated; None takes the largest value of an integer type.
+
+    Returns
+    -------
+    projections : float32 array, shape of `values`
+        ``-log((values - dark) / (flat - dark))``; 0 where it is not valid.
+    valid : bool array, shape of `values`
+        False for rays without light, of dead pixels, saturated, or not finite. Nothing is clipped.
+    counts : dict
+        How many rays of each kind were found.
+    """
+    usable = np.isfinite(values)
+    counts = {"not_finite": int(values.size - np.count_nonzero(usable))}
+    if kind == "attenuation":
+        return np.where(usable, values, 0).astype(np.float32), usable, counts
+    if kind == "counts":
+        if flat is None or dark is None:
+            raise fail(
+                "flat, dark", "open-beam and dark images", "None", "counts cannot be used without them"
+            )
+        limit = np.iinfo(values.dtype).max if saturation is None and values.dtype.kind in "iu" else saturation
+        if limit is not None:
+            counts["saturated"] = _drop(usable, values >= limit)
+        light = flat - dark
+        counts["dead_pixel"] = _drop(
+            usable, np.broadcast_to(~(np.isfinite(light) & (light > 0)), values.shape)
+        )
+        with np.errstate(divide="ignore", invalid="ignore"):
+            values = (values - dark) / light
+    counts["no_light"] = _drop(usable, ~(values > 0))
+    return -np.log(np.where(usable, values, 1)).astype(np.float32), usable, counts
+
+
+def _drop(usable: np.ndarray, bad: np.ndarray) -> int:
+    """Mark the bad ones among the usable as unusable, and say how many that were."""
+    newly = usable & bad
+    usable &= ~bad
+    return int(np.count_nonzero(newly))
+
+
+def fill_invalid(projections: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
+    """Projections with every invalid ray replaced, linearly between the valid ones of its detector row.
+
+    For methods that cannot leave a ray out, such as filtered backprojection. The last axis is the detector
+    column; rows without a valid ray become 0. Returns the input itself when there is nothing to replace.
+    """
+    if valid is None or valid.all():
+        return projections
+    filled = projections.copy()
+    column = np.arange(projections.shape[-1])
+    for index in np.argwhere(~valid.all(axis=-1)):
+        row = tuple(index)
+        good = valid[row]
+        filled[row] = np.interp(column, column[good], projections[row][good]) if good.any() else 0
+    return filled

@@ -1,0 +1,164 @@
+"""The ``.npz`` scan: a cone-beam scan in one NumPy archive.
+
+``projections`` (views, rows, columns) = -log(I/I0); ``vectors`` (views, 12), ASTRA ``cone_vec`` unless
+``astra_type`` says otherwise; ``vol_shape`` (nz, ny, nx);
+``vol_window`` (xmin, xmax, ymin, ymax, zmin, zmax); optional ``unit`` (cm if absent), ``energies`` (keV) with
+``spectrum``, ``truth_mu`` and ``metal_mask`` (z, y, x), ``e_ref`` or ``e_eff`` (keV, energy of the truth) and
+``valid`` (like the projections).
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from tomo_polysplat.checks import fail, require_array, require_shape
+from tomo_polysplat.files import existing_file, replacing, require_plausible_size
+from tomo_polysplat.scan.defects import attenuation
+from tomo_polysplat.scan.layout import (
+    spatial_geometry,
+    vector_form,
+    vector_geometry,
+    volume_geometry,
+    window_of,
+)
+from tomo_polysplat.scan.reading import ReadOptions
+from tomo_polysplat.scan.scan import Scan
+
+__all__ = ["read_archive", "scan_from_npz", "write_npz"]
+
+NAMES = (
+    *("projections", "valid", "astra_type", "vectors", "vol_shape", "vol_window", "unit"),
+    *("energies", "spectrum", "truth_mu", "metal_mask", "e_ref", "e_eff"),
+)
+
+_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+
+
+def read_archive(path: str | Path, names: Iterable[str]) -> dict[str, np.ndarray]:
+    """Arrays called `names` of a NumPy archive, those that it has.
+
+    Nothing is unpickled, and each header is compared with what is stored before memory is taken.
+
+    Raises
+    ------
+    ValueError
+        If the file is not such an archive, is truncated, or a header does not fit its data.
+    """
+    file = existing_file(path)
+    try:
+        with zipfile.ZipFile(file) as archive:
+            members = {info.filename: info for info in archive.infolist()}
+            chosen = [name for name in names if f"{name}.npy" in members]
+            return {name: _read_member(archive, members[f"{name}.npy"]) for name in chosen}
+    except (zipfile.BadZipFile, EOFError, OSError, zlib.error) as error:
+        raise fail(
+            "path", "a readable .npz archive", f"{file} ({error})", "copy or write the file again"
+        ) from error
+
+
+def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
+    with archive.open(info) as stream:
+        _check_header(stream, info)
+    with archive.open(info) as stream:
+        return np.lib.format.read_array(stream, allow_pickle=False)
+
+
+def _check_header(stream: IO[bytes], info: zipfile.ZipInfo) -> None:
+    version = np.lib.format.read_magic(stream)
+    if version not in _HEADERS:
+        raise fail(info.filename, "a NumPy array of format 1.0 or 2.0", f"format {version}")
+    shape, _, dtype = _HEADERS[version](stream)
+    if dtype.hasobject:
+        raise fail(info.filename, "an array of numbers", "pickled objects, which are never loaded")
+    declared = int(np.prod(shape, dtype=object)) * dtype.itemsize
+    if declared > info.file_size:
+        raise fail(
+            info.filename, f"{declared} bytes as its header declares", f"{info.file_size}", "damaged file"
+        )
+    require_plausible_size(info.filename, declared, info.compress_size)
+
+
+def scan_from_npz(path: Path, options: ReadOptions) -> Scan:
+    """Read a scan; see :func:`tomo_polysplat.load_scan`."""
+    options.refuse_parallel_only()
+    arrays = read_archive(path, NAMES)
+    missing = [name for name in ("projections", "vectors", "vol_shape", "vol_window") if name not in arrays]
+    if missing:
+        raise fail(
+            "path", "projections, vectors, vol_shape and vol_window", f"no {', '.join(missing)} in {path}"
+        )
+    values = require_array("projections", arrays["projections"], 3)
+    if options.input not in (None, "attenuation"):
+        raise fail("input", "'attenuation', which an .npz scan holds", repr(options.input))
+    integrals, valid, counts = attenuation(values, "attenuation")
+    if "valid" in arrays:
+        require_shape("valid", arrays["valid"], values.shape, "(views, rows, columns)")
+        valid &= arrays["valid"].astype(bool)
+    views, rows, columns = values.shape
+    own_volume = options.vol_geom is None
+    return Scan(
+        projections=integrals.transpose(1, 0, 2),
+        valid=None if valid.all() else valid.transpose(1, 0, 2),
+        spectrum=options.settled_spectrum(arrays.get("energies"), arrays.get("spectrum")),
+        truth=arrays.get("truth_mu") if own_volume else None,
+        metal_mask=arrays.get("metal_mask") if own_volume else None,
+        truth_energy_kev=_number(arrays, "e_ref", "e_eff"),
+        name=path.stem,
+        notes={"input": "attenuation", "rays": counts},
+        **_geometry(arrays, (rows, views, columns), options),
+    )
+
+
+def _geometry(
+    arrays: dict[str, np.ndarray], shape: tuple[int, int, int], options: ReadOptions
+) -> dict[str, Any]:
+    """``proj_geom``, ``vol_geom`` and ``unit``: the caller's or the file's."""
+    if options.proj_geom is not None:
+        proj_geom = spatial_geometry(dict(options.proj_geom))
+    else:
+        proj_geom = vector_geometry(_text(arrays, "astra_type") or "cone_vec", arrays["vectors"], shape)
+    vol_geom = dict(options.vol_geom or volume_geometry(arrays["vol_shape"], arrays["vol_window"]))
+    stated = _text(arrays, "unit") if options.proj_geom is None else None
+    return {"proj_geom": proj_geom, "vol_geom": vol_geom, "unit": options.settled_unit(stated, "cm")}
+
+
+def _number(arrays: dict[str, np.ndarray], *names: str) -> float | None:
+    """The first of the named numbers that is there."""
+    present = [name for name in names if name in arrays]
+    return float(require_array(present[0], arrays[present[0]]).reshape(())) if present else None
+
+
+def _text(arrays: dict[str, np.ndarray], name: str) -> str | None:
+    return str(arrays[name]) if name in arrays else None
+
+
+def write_npz(scan: Scan, path: str | Path, *, overwrite: bool = False) -> None:
+    """Write a scan as ``.npz``; see the module's description for what it holds."""
+    geometry = vector_form(scan.proj_geom)
+    content: dict[str, Any] = {
+        "projections": scan.projections.transpose(1, 0, 2),
+        "astra_type": geometry["type"],
+        "vectors": geometry["Vectors"],
+        "vol_shape": np.array(scan.volume_shape),
+        "vol_window": window_of(scan.vol_geom),
+        "unit": scan.unit,
+        "truth_mu": scan.truth,
+        "metal_mask": scan.metal_mask,
+        "e_ref": scan.truth_energy_kev,
+        "valid": None if scan.valid is None else scan.valid.transpose(1, 0, 2),
+    }
+    if scan.spectrum is not None:
+        content |= {"energies": scan.spectrum.energies, "spectrum": scan.spectrum.weights}
+    arrays = {name: np.asarray(value) for name, value in content.items() if value is not None}
+    needed = sum(array.nbytes for array in arrays.values())
+    with (
+        replacing(path, overwrite=overwrite, needed_bytes=needed) as temporary,
+        open(temporary, "wb") as file,
+    ):
+        np.savez(file, **arrays)  # type: ignore[arg-type]  # its stubs know only NumPy 2.1 and later

@@ -1,0 +1,31 @@
+"""Units of length. Materials are tabulated in cm, scans come in whatever their geometry is in."""
+
+from __future__ import annotations
+
+from tomo_polysplat.checks import fail
+
+__all__ = ["LENGTH_UNITS", "cm_per"]
+
+CM_PER_UNIT = {"m": 100.0, "cm": 1.0, "mm": 0.1, "um": 1e-4}
+
+LENGTH_UNITS = (*CM_PER_UNIT, "pixel")
+
+
+def cm_per(unit: str) -> float:
+    """Centimetres in one `unit`: multiply a value in 1/cm by it to have it in 1/`unit`.
+
+    Raises
+    ------
+    ValueError
+        For an unknown unit, and for ``"pixel"``, whose size nobody has stated.
+    """
+    if unit == "pixel":
+        raise fail(
+            "unit",
+            "a unit of length",
+            "'pixel'",
+            "a spectrum needs real lengths: give the pixel size, or reconstruct without a spectrum",
+        )
+    if unit not in CM_PER_UNIT:
+        raise fail("unit", f"one of {', '.join(LENGTH_UNITS)}", repr(unit))
+    return CM_PER_UNIT[unit]
