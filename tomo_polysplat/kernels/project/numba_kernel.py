@@ -17,7 +17,7 @@ from tomo_polysplat.parallel import cpu_threads, run_tasks, split_range
 
 __all__ = ["backward", "forward"]
 
-_LANES = 8  # pixels of a row handled together; images are padded so that a block may run past the row's end
+_LANES = 16  # pixels of a row handled together; images are padded so that a block may run past the row's end
 _RECORD = 12  # numbers of a footprint, in the order written by _footprint
 
 
@@ -148,106 +148,109 @@ def _set_up(start, stop, position, scale, rotation, cone, planar, origin, invers
     return skipped
 
 
+@njit(inline="always")
+def _block(x0, r11, across, up2, e0, e1, e2, cut, value):
+    """``exp(-distance^2 / 2) / |e|`` of the pixels x0, x0 + 1, ... of one row, zero beyond the cut."""
+    for k in range(_LANES):
+        x = np.float32(k) + x0
+        t = r11 * x + across
+        inverse = np.float32(1) / (e0 + x * (e1 + x * e2))
+        q = (t * t + up2) * inverse
+        f = exp_negative(np.float32(-0.5) * (q if q < cut else cut)) * np.sqrt(inverse)
+        value[k] = f if q <= cut else np.float32(0)
+
+
 @njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def _splat(v, first, last, record, span, weight, cutoff, columns, image):
     """Add every footprint to the rows first..last of view ``v`` of ``image`` (views, rows, channels, padded)."""
-    channels = len(weight)
     cut = np.float32(cutoff * cutoff)
-    half = np.float32(-0.5)
+    two = np.float32(2)
     value = np.empty(_LANES, np.float32)
     for n in range(record.shape[1]):
         low, high = max(first, span[v, n, 0]), min(last, span[v, n, 1])
         if low >= high:
             continue
         rec = record[v, n]
+        # Locals, not array reads, inside the row: only then does the compiler vectorise it.
+        x0, y0, r11, r12, r22, ex, exx = rec[0], rec[1], rec[2], rec[3], rec[4], rec[6], rec[8]
         for i in range(low, high):
-            y = np.float32(i) - rec[1]
-            j0, j1 = _columns(rec, float(y), float(cut), columns)
-            across, up = rec[3] * y, rec[4] * y
-            e0 = rec[5] + np.float32(2) * rec[7] * y + rec[10] * y * y
-            e1 = np.float32(2) * (rec[6] + rec[9] * y)
+            y = np.float32(i) - y0
+            j0, j1 = _columns(rec, y, cut, columns)
+            across, up2 = r12 * y, (r22 * y) * (r22 * y)
+            e0, e1 = rec[5] + y * (two * rec[7] + y * rec[10]), two * (ex + rec[9] * y)
             for j in range(j0, j1, _LANES):
-                for k in range(_LANES):
-                    x = np.float32(j + k) - rec[0]
-                    t = rec[2] * x + across
-                    inverse = np.float32(1) / (e0 + x * (e1 + x * rec[8]))
-                    q = (t * t + up * up) * inverse
-                    f = exp_negative(half * min(q, cut)) * np.sqrt(inverse)
-                    value[k] = f if q <= cut else np.float32(0)
-                for c in range(channels):
+                _block(np.float32(j) - x0, r11, across, up2, e0, e1, exx, cut, value)
+                for c in range(len(weight)):
                     w = weight[c, n]
+                    line = image[v, i, c, j : j + _LANES]
                     for k in range(_LANES):
-                        image[v, i, c, j + k] += w * value[k]
-
-
-@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
-def _gather(v, n, record, span, weight, cutoff, columns, grad_image, moments, grad_weight):
-    """Sums over the footprint of Gaussian ``n`` in view ``v``: of dL/df f by channel, and of h and k times
-    the monomials (1, x, y, x^2, xy, y^2), with h = dL/d(distance^2 |e|^2) and k = dL/d|e|^2."""
-    channels = len(weight)
-    cut = np.float32(cutoff * cutoff)
-    rec = record[v, n]
-    half = np.float32(0.5)
-    acc = np.empty((6, _LANES), np.float32)
-    channel_acc = np.empty((channels, _LANES), np.float32)
-    value = np.empty(_LANES, np.float32)
-    total = np.empty(_LANES, np.float32)
-    moments[:] = 0.0
-    for i in range(span[v, n, 0], span[v, n, 1]):
-        y = np.float32(i) - rec[1]
-        j0, j1 = _columns(rec, float(y), float(cut), columns)
-        if j0 >= j1:
-            continue
-        acc[:] = np.float32(0)
-        channel_acc[:] = np.float32(0)
-        across, up = rec[3] * y, rec[4] * y
-        e0 = rec[5] + np.float32(2) * rec[7] * y + rec[10] * y * y
-        e1 = np.float32(2) * (rec[6] + rec[9] * y)
-        for j in range(j0, j1, _LANES):
-            for k in range(_LANES):
-                x = np.float32(j + k) - rec[0]
-                t = rec[2] * x + across
-                inverse = np.float32(1) / (e0 + x * (e1 + x * rec[8]))
-                q = (t * t + up * up) * inverse
-                f = exp_negative(-half * min(q, cut)) * np.sqrt(inverse)
-                value[k] = f if q <= cut else np.float32(0)
-                total[k] = np.float32(0)
-            for c in range(channels):
-                w = weight[c, n]
-                for k in range(_LANES):
-                    g = grad_image[v, i, c, j + k]
-                    channel_acc[c, k] += g * value[k]
-                    total[k] += w * g
-            for k in range(_LANES):
-                x = np.float32(j + k) - rec[0]
-                t = rec[2] * x + across
-                inverse = np.float32(1) / (e0 + x * (e1 + x * rec[8]))
-                q = (t * t + up * up) * inverse
-                h = -half * total[k] * value[k] * inverse
-                s = -h * (q - np.float32(1))
-                acc[0, k] += h
-                acc[1, k] += h * x
-                acc[2, k] += h * x * x
-                acc[3, k] += s
-                acc[4, k] += s * x
-                acc[5, k] += s * x * x
-        for m in range(2):
-            one, x1, x2 = acc[3 * m].sum(), acc[3 * m + 1].sum(), acc[3 * m + 2].sum()
-            moments[m, 0] += one
-            moments[m, 1] += x1
-            moments[m, 2] += one * y
-            moments[m, 3] += x2
-            moments[m, 4] += x1 * y
-            moments[m, 5] += one * y * y
-        for c in range(channels):
-            grad_weight[c, n] += channel_acc[c].sum()
+                        line[k] += w * value[k]
 
 
 @njit(inline="always")
-def _pull_back(v, cone, planar, vec, inverse, matrix, white, moments, grad_point, grad_white):
+def _add_moments(x0, y, r11, across, up2, e0, e1, e2, value, total, acc):
+    """Add h and s of one block, times (1, x, y, x^2, xy, y^2), to ``acc``, one lane sum after the other."""
+    half, one = np.float32(0.5), np.float32(1)
+    for k in range(_LANES):
+        x = np.float32(k) + x0
+        t = r11 * x + across
+        inverse = one / (e0 + x * (e1 + x * e2))
+        h = -half * total[k] * value[k] * inverse
+        s = h * (one - (t * t + up2) * inverse)
+        acc[0 * _LANES + k] += h
+        acc[1 * _LANES + k] += h * x
+        acc[2 * _LANES + k] += h * y
+        acc[3 * _LANES + k] += h * x * x
+        acc[4 * _LANES + k] += h * x * y
+        acc[5 * _LANES + k] += h * y * y
+        acc[6 * _LANES + k] += s
+        acc[7 * _LANES + k] += s * x
+        acc[8 * _LANES + k] += s * y
+        acc[9 * _LANES + k] += s * x * x
+        acc[10 * _LANES + k] += s * x * y
+        acc[11 * _LANES + k] += s * y * y
+
+
+@njit(inline="always")
+def _gather(
+    v, n, record, span, weight, cutoff, columns, grad_image, value, total, sums, acc, moments, grad_weight
+):  # fmt: skip
+    """Sums over the footprint of Gaussian ``n`` in view ``v``: of dL/df f by channel, and of h and s times
+    the monomials (1, x, y, x^2, xy, y^2), with h = dL/d(distance^2 |e|^2) and s = dL/d|e|^2."""
+    cut = np.float32(cutoff * cutoff)
+    two = np.float32(2)
+    rec = record[v, n]
+    x0, y0, r11, r12, r22, ex, exx = rec[0], rec[1], rec[2], rec[3], rec[4], rec[6], rec[8]
+    channels = len(weight)
+    sums[:] = np.float32(0)
+    acc[:] = np.float32(0)
+    for i in range(span[v, n, 0], span[v, n, 1]):
+        y = np.float32(i) - y0
+        j0, j1 = _columns(rec, y, cut, columns)
+        across, up2 = r12 * y, (r22 * y) * (r22 * y)
+        e0, e1 = rec[5] + y * (two * rec[7] + y * rec[10]), two * (ex + rec[9] * y)
+        for j in range(j0, j1, _LANES):
+            _block(np.float32(j) - x0, r11, across, up2, e0, e1, exx, cut, value)
+            total[:] = np.float32(0)
+            for c in range(channels):
+                w = weight[c, n]
+                line = grad_image[v, i, c, j : j + _LANES]
+                channel = sums[c]
+                for k in range(_LANES):
+                    channel[k] += line[k] * value[k]
+                    total[k] += w * line[k]
+            _add_moments(np.float32(j) - x0, y, r11, across, up2, e0, e1, exx, value, total, acc)
+    for m in range(12):
+        moments[m // 6, m % 6] = acc[m * _LANES : (m + 1) * _LANES].sum()
+    for c in range(channels):
+        grad_weight[c, n] += sums[c].sum()
+
+
+@njit(inline="always")
+def _pull_back(v, cone, planar, vec, inverse, matrix, white, moments, g, grad_point, grad_white):
     """Add dL/dposition and dL/dW of one view, from the moments of its footprint."""
     h, k = moments[0], moments[1]
-    g = np.zeros((6, 3))  # gradients of w, WU, WV, nu, nv, e_centre
+    g[:] = 0.0  # gradients of w, WU, WV, nu, nv, e_centre
     hy, hxy, hyy = (0.0, 0.0, 0.0) if planar else (h[2], h[4], h[5])
     for a in range(3):
         g[3, a] = 2 * (vec[4, a] * h[3] + vec[5, a] * hxy)
@@ -286,23 +289,28 @@ def _pull_back(v, cone, planar, vec, inverse, matrix, white, moments, grad_point
         grad_point[b] += kappa * (g_column * inverse[v, 0, b] + g_row * inverse[v, 1, b]) + g_depth * inverse[v, 2, b]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def _gather_range(
     start, stop, position, scale, rotation, weight, cone, planar, origin, inverse, matrix, cutoff, columns,
     record, span, grad_image, grad_position, grad_scale, grad_rotation, grad_weight,
 ):  # fmt: skip
     """The gradients of the Gaussians start..stop, summed over the views."""
-    white, vec, moments = np.empty((3, 3)), np.empty((8, 3)), np.empty((2, 6))
+    white, vec, moments, g = np.empty((3, 3)), np.empty((8, 3)), np.empty((2, 6)), np.empty((6, 3))
     grad_white, grad_point = np.empty((3, 3)), np.empty(3)
+    value, total = np.empty(_LANES, np.float32), np.empty(_LANES, np.float32)
+    sums, acc = np.empty((len(weight), _LANES), np.float32), np.empty(12 * _LANES, np.float32)
     for n in range(start, stop):
         whitening(scale, rotation, n, white)
         grad_white[:] = 0.0
         grad_point[:] = 0.0
         for v in range(len(origin)):
             if span[v, n, 0] < span[v, n, 1]:
-                _gather(v, n, record, span, weight, cutoff, columns, grad_image, moments, grad_weight)
+                _gather(
+                    v, n, record, span, weight, cutoff, columns, grad_image, value, total, sums, acc,
+                    moments, grad_weight,
+                )  # fmt: skip
                 _chain(position, cone, origin, inverse, matrix, white, n, v, vec)
-                _pull_back(v, cone, planar, vec, inverse, matrix, white, moments, grad_point, grad_white)
+                _pull_back(v, cone, planar, vec, inverse, matrix, white, moments, g, grad_point, grad_white)
         for a in range(3):
             grad_position[n, a] = grad_point[a]
         whitening_adjoint(scale, rotation, n, white, grad_white, grad_scale, grad_rotation)
