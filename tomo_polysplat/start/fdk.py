@@ -1,0 +1,133 @@
+"""Filtered backprojection: parallel, fan and circular cone beams."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tomo_polysplat.checks import require_array, require_choice, require_shape
+from tomo_polysplat.parallel import cpu_threads, run_tasks, split_range
+from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.start.backproject import accumulate, voxel_maps
+from tomo_polysplat.start.filters import FILTERS, filter_rows
+from tomo_polysplat.start.orbit import Orbit, find_orbit
+from tomo_polysplat.start.weights import object_radius, pixel_weights, ray_offsets, redundancy
+
+__all__ = ["fdk", "fits_fdk"]
+
+# Views filtered and backprojected together: few enough to stay in cache, enough to share out over threads.
+_CHUNK = 32
+
+
+def fits_fdk(geometry: Geometry, grid: VolumeGrid) -> tuple[bool, str]:
+    """Whether filtered backprojection suits a scan, and why (not).
+
+    It wants a circular orbit about an axis parallel to z, an untilted detector, and every line through the
+    object measured at least once.
+    """
+    orbit, reason = find_orbit(geometry)
+    if orbit is None:
+        return False, reason
+    if np.hypot(*(grid.centre[:2] - orbit.axis)) > 0.5 * max(orbit.radius, 0.0):
+        return False, "the volume lies far off the axis of rotation"
+    offsets = ray_offsets(geometry, orbit)
+    if orbit.full:
+        if not offsets.min(axis=1).max() < 0 < offsets.max(axis=1).min():
+            return False, "the detector does not reach the shadow of the axis of rotation"
+        return True, f"{reason}, full turn"
+    arc = np.rad2deg(orbit.arc)
+    needed = np.pi
+    if geometry.beam == "cone":
+        reach = min(np.abs(offsets).max(), object_radius(grid, orbit)) / orbit.radius
+        needed += 2 * np.arcsin(min(reach, 1.0))
+    if orbit.arc + orbit.steps.max() < needed:
+        return False, f"{arc:.0f} degrees of arc where {np.rad2deg(needed):.0f} are needed"
+    return True, f"{reason}, {arc:.0f} degrees of arc"
+
+
+def fdk(
+    projections: np.ndarray,
+    geometry: Geometry,
+    grid: VolumeGrid,
+    *,
+    filter_name: str = "ram-lak",
+    device: str = "cpu",
+) -> np.ndarray:
+    """Reconstruct by filtered backprojection.
+
+    Parameters
+    ----------
+    projections : (views, rows, columns) float32
+        ``-log(I / I0)``, finite.
+    geometry, grid : Geometry, VolumeGrid
+        A scan for which `fits_fdk` holds: parallel or fan or cone beam, full turn or part of one, views at
+        any angles in any order, detector centred or not, pixels and voxels of any proportions.
+    filter_name : {"ram-lak", "shepp-logan", "cosine", "hamming", "hann"}
+        Ramp filter, from sharp to smooth.
+    device : {"cpu", "cuda"}
+        On ``"cuda"`` ASTRA does it where it can (`fdk_cuda`), else the CPU.
+
+    Returns
+    -------
+    (nz, ny, nx) float32
+        Attenuation per unit of length, not clipped. Slices that most views do not see are zero.
+
+    Raises
+    ------
+    ValueError
+        If the shapes disagree or the scan does not fit; the message says why.
+    """
+    projections = require_array("projections", projections, ndim=3)
+    require_shape("projections", projections, geometry.shape, "(views, rows, columns)")
+    require_choice("filter_name", filter_name, FILTERS)
+    fits, reason = fits_fdk(geometry, grid)
+    orbit, _ = find_orbit(geometry)
+    if orbit is None or not fits:
+        raise ValueError(f"filtered backprojection does not fit this scan: {reason}; use sirt instead")
+    if device.startswith("cuda"):
+        from tomo_polysplat.start.astra_fdk import fdk_cuda, suits_fdk_cuda
+
+        if suits_fdk_cuda(geometry, grid, orbit)[0]:
+            return fdk_cuda(projections, geometry, grid, orbit, filter_name=filter_name, device=device)
+    return _fdk_cpu(projections, geometry, grid, orbit, filter_name)
+
+
+def _fdk_cpu(
+    projections: np.ndarray, geometry: Geometry, grid: VolumeGrid, orbit: Orbit, filter_name: str
+) -> np.ndarray:
+    share = redundancy(geometry, orbit, grid)
+    before, after = _shadow_margins(geometry, grid)
+    maps = voxel_maps(geometry, grid)
+    # Columns are counted from the first one kept, so that the map must move by as many.
+    maps[:, 0] += before * maps[:, 2]
+    volume = np.zeros(grid.shape, np.float32)
+    for start in range(0, geometry.views, _CHUNK):
+        chunk = slice(start, min(start + _CHUNK, geometry.views))
+
+        def prepare(a: int, b: int) -> np.ndarray:
+            weighted = projections[a:b] * pixel_weights(geometry, orbit, share, slice(a, b))
+            return filter_rows(weighted, filter_name, before, after)
+
+        parts = split_range(chunk.stop - chunk.start, cpu_threads())
+        filtered = run_tasks(prepare, [(start + a, start + b) for a, b in parts])
+        accumulate(volume, np.concatenate(filtered), maps[chunk])
+    volume[~_slices_seen(geometry, grid, orbit)] = 0.0
+    return volume
+
+
+def _shadow_margins(geometry: Geometry, grid: VolumeGrid) -> tuple[int, int]:
+    """Columns beyond either end of the detector on which the volume casts a shadow, at most its width."""
+    corners = np.stack(np.meshgrid(*zip(grid.lower, grid.upper), indexing="ij"), axis=-1).reshape(-1, 3)
+    columns = geometry.project_points(corners)[..., 0]
+    before, after = -np.nanmin(columns), np.nanmax(columns) - (geometry.columns - 1)
+    return tuple(int(np.clip(np.ceil(n), 0, geometry.columns)) for n in (before, after))  # type: ignore[return-value]
+
+
+def _slices_seen(geometry: Geometry, grid: VolumeGrid, orbit: Orbit) -> np.ndarray:
+    """Slices whose point on the axis falls on the detector in most views, (nz,) bool."""
+    z = grid.axes()[2]
+    points = np.column_stack([np.full_like(z, orbit.axis[0]), np.full_like(z, orbit.axis[1]), z])
+    row = geometry.project_points(points)[..., 1]
+    # A voxel counts as seen as soon as any of it is, so the margin is half a voxel and half a pixel.
+    margin = 0.5 + 0.5 * grid.voxel_size[2] / geometry.pixel_size_at(grid.centre)[1]
+    seen = (row > -margin) & (row < geometry.rows - 1 + margin)
+    return seen.mean(axis=0) >= 0.5
