@@ -1,0 +1,31 @@
+"""The block of voxels a kernel samples Gaussians on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+__all__ = ["VoxelBox"]
+
+
+@dataclass(frozen=True)
+class VoxelBox:
+    """Voxel centres ``first + index * spacing``.
+
+    Parameters
+    ----------
+    first : (3,) float64
+        Centre (x, y, z) of voxel (0, 0, 0).
+    spacing : (3,) float64
+        Distance of neighbouring centres along x, y, z.
+    shape : (nz, ny, nx)
+    """
+
+    first: np.ndarray
+    spacing: np.ndarray
+    shape: tuple[int, int, int]
+
+    def part(self, start: tuple[int, int, int], shape: tuple[int, int, int]) -> VoxelBox:
+        """The sub-block of ``shape`` that begins at voxel ``start`` (z, y, x)."""
+        return VoxelBox(self.first + np.array(start[::-1]) * self.spacing, self.spacing, shape)
