@@ -24,7 +24,14 @@ from tomo_polysplat.checks import fail, require_array, require_choice, require_s
 from tomo_polysplat.files import replacing
 from tomo_polysplat.scan.centre import estimate_centre
 from tomo_polysplat.scan.defects import attenuation, fill_invalid, flat_and_dark
-from tomo_polysplat.scan.hdf5 import find_array, opened, read_numbers, read_text
+from tomo_polysplat.scan.hdf5 import (
+    find_array,
+    opened,
+    read_numbers,
+    read_spectrum,
+    read_text,
+    write_spectrum,
+)
 from tomo_polysplat.scan.layout import (
     parallel_geometry,
     spatial_geometry,
@@ -230,11 +237,10 @@ def _pixel_size(file: h5py.File, options: ReadOptions) -> tuple[float, str]:
 
 def _knowledge(file: h5py.File, options: ReadOptions) -> dict[str, Any]:
     """Spectrum, truth and metal mask, where the file has them."""
-    group = file.get("polysplat", {})
-    lines = group.get("spectrum")
-    energies = None if lines is None else read_numbers(lines, "energies")
-    weights = None if lines is None else read_numbers(lines, "weights")
-    known: dict[str, Any] = {"spectrum": options.settled_spectrum(energies, weights)}
+    group = file.get("polysplat")
+    if group is None:
+        return {"spectrum": options.spectrum}
+    known: dict[str, Any] = {"spectrum": options.spectrum or read_spectrum(group)}
     if options.vol_geom is None and "truth" in group:
         energy = group["truth"].attrs.get("energy_kev")
         known |= {
@@ -271,8 +277,7 @@ def write_hdf5(scan: Scan, path: str | Path, *, overwrite: bool = False) -> None
 
 
 def _write_knowledge(group: h5py.Group, scan: Scan) -> None:
-    if scan.spectrum is not None:
-        group["spectrum/energies"], group["spectrum/weights"] = scan.spectrum.energies, scan.spectrum.weights
+    write_spectrum(group, scan.spectrum)
     if scan.valid is not None:
         group["valid"] = scan.valid.transpose(1, 0, 2)
     if scan.metal_mask is not None:

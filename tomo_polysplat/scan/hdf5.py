@@ -16,7 +16,17 @@ from tomo_polysplat.files import existing_file, require_plausible_size
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["find_array", "opened", "read_json", "read_numbers", "read_text"]
+    from tomo_polysplat.physics.spectrum import Spectrum
+
+__all__ = [
+    "find_array",
+    "opened",
+    "read_json",
+    "read_numbers",
+    "read_spectrum",
+    "read_text",
+    "write_spectrum",
+]
 
 
 @contextmanager
@@ -90,3 +100,22 @@ def read_json(group: h5py.Group, name: str, default: Any) -> Any:
         return json.loads(text) if text else default
     except ValueError as error:
         raise fail(f"{group.name}/{name}", "JSON text", f"{text[:40]!r}") from error
+
+
+def write_spectrum(group: h5py.Group, spectrum: Spectrum | None) -> None:
+    """Keep a spectrum, if there is one, in a group ``spectrum``: ``energies`` (keV) and ``weights``."""
+    if spectrum is not None:
+        lines = group.create_group("spectrum")
+        lines["energies"], lines["weights"] = spectrum.energies, spectrum.weights
+        lines.attrs["label"] = spectrum.label
+
+
+def read_spectrum(group: h5py.Group) -> Spectrum | None:
+    """What :func:`write_spectrum` kept, or None."""
+    from tomo_polysplat.physics.spectrum import Spectrum
+
+    lines = group.get("spectrum")
+    if lines is None:
+        return None
+    label = str(lines.attrs.get("label", "measured spectrum"))
+    return Spectrum(read_numbers(lines, "energies"), read_numbers(lines, "weights"), label)

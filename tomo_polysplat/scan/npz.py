@@ -13,7 +13,7 @@ import zipfile
 import zlib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -30,11 +30,14 @@ from tomo_polysplat.scan.layout import (
 from tomo_polysplat.scan.reading import ReadOptions
 from tomo_polysplat.scan.scan import Scan
 
+if TYPE_CHECKING:
+    from tomo_polysplat.physics.spectrum import Spectrum
+
 __all__ = ["read_archive", "scan_from_npz", "write_npz"]
 
 NAMES = (
     *("projections", "valid", "astra_type", "vectors", "vol_shape", "vol_window", "unit"),
-    *("energies", "spectrum", "truth_mu", "metal_mask", "e_ref", "e_eff"),
+    *("energies", "spectrum", "spectrum_label", "truth_mu", "metal_mask", "e_ref", "e_eff"),
 )
 
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
@@ -105,7 +108,7 @@ def scan_from_npz(path: Path, options: ReadOptions) -> Scan:
     return Scan(
         projections=integrals.transpose(1, 0, 2),
         valid=None if valid.all() else valid.transpose(1, 0, 2),
-        spectrum=options.settled_spectrum(arrays.get("energies"), arrays.get("spectrum")),
+        spectrum=options.spectrum or _spectrum(arrays),
         truth=arrays.get("truth_mu") if own_volume else None,
         metal_mask=arrays.get("metal_mask") if own_volume else None,
         truth_energy_kev=_number(arrays, "e_ref", "e_eff"),
@@ -126,6 +129,16 @@ def _geometry(
     vol_geom = dict(options.vol_geom or volume_geometry(arrays["vol_shape"], arrays["vol_window"]))
     stated = _text(arrays, "unit") if options.proj_geom is None else None
     return {"proj_geom": proj_geom, "vol_geom": vol_geom, "unit": options.settled_unit(stated, "cm")}
+
+
+def _spectrum(arrays: dict[str, np.ndarray]) -> Spectrum | None:
+    if "energies" not in arrays or "spectrum" not in arrays:
+        return None
+    from tomo_polysplat.physics.spectrum import Spectrum
+
+    return Spectrum(
+        arrays["energies"], arrays["spectrum"], _text(arrays, "spectrum_label") or "measured spectrum"
+    )
 
 
 def _number(arrays: dict[str, np.ndarray], *names: str) -> float | None:
@@ -155,6 +168,7 @@ def write_npz(scan: Scan, path: str | Path, *, overwrite: bool = False) -> None:
     }
     if scan.spectrum is not None:
         content |= {"energies": scan.spectrum.energies, "spectrum": scan.spectrum.weights}
+        content["spectrum_label"] = scan.spectrum.label
     arrays = {name: np.asarray(value) for name, value in content.items() if value is not None}
     needed = sum(array.nbytes for array in arrays.values())
     with (

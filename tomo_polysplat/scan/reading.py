@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from tomo_polysplat.checks import fail, require_choice
 from tomo_polysplat.units import LENGTH_UNITS
 
@@ -55,11 +53,3 @@ class ReadOptions:
         for name in ("centre", "pixel_size", "theta"):
             if getattr(self, name) is not None:
                 raise fail(name, "None", "a value", "the geometry is known already and places every pixel")
-
-    def settled_spectrum(self, energies: np.ndarray | None, weights: np.ndarray | None) -> Spectrum | None:
-        """The caller's spectrum, or the file's."""
-        if self.spectrum is not None or energies is None or weights is None:
-            return self.spectrum
-        from tomo_polysplat.physics.spectrum import Spectrum
-
-        return Spectrum(energies, weights)

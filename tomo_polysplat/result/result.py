@@ -1,0 +1,217 @@
+"""What a reconstruction returns."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from tomo_polysplat.checks import fail, require_array, require_number, require_shape
+from tomo_polysplat.physics.materials import Materials
+from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.scan.geometry import VolumeGrid
+from tomo_polysplat.units import cm_per
+
+__all__ = ["Result"]
+
+GAUSSIAN_PARTS = {"position": (3,), "scale": (3,), "rotation": (4,), "density": (), "u": ()}
+
+
+@dataclass
+class Result:
+    """A reconstructed object: its Gaussians, and the volumes sampled from them.
+
+    Parameters
+    ----------
+    basis : float32 array, shape (3, z, y, x) or (1, z, y, x)
+        Sums over the Gaussians of ``density [(1-u)^2, 2u(1-u), u^2]`` in g/cm3: how much of the soft,
+        middle and dense curve each voxel holds. One channel of attenuation in 1/`unit` for a monochromatic result.
+        y ascends with the index.
+    grid : VolumeGrid
+        Where the voxels are.
+    unit : str
+        Unit of length.
+    energy_kev : float or None
+        Energy of :attr:`volume`; None when a monochromatic scan did not state it.
+    materials : Materials or None
+        The three curves; None for a monochromatic result.
+    spectrum : Spectrum or None
+        The spectrum of the model.
+    gaussians : mapping of arrays
+        ``position`` (n, 3) and ``scale`` (n, 3) in `unit`, ``rotation`` (n, 4) unit quaternions (w, x, y, z),
+        ``density`` (n,) in g/cm3 (1/`unit` when monochromatic), ``u`` (n,) material in [0, 1].
+    history : list of dict
+        ``seconds``, ``iteration``, ``loss``, ``held_out``, ``gaussians``, ``stage``: speed against error.
+    plan, counts, settings : dict
+        What was modelled and why; how many rays or Gaussians were masked, skipped or clamped; every tunable.
+    seconds : float
+        Time that the reconstruction took.
+    flipped_2d : bool
+        Hand volumes out as ASTRA does in two dimensions: (y, x), row 0 at the largest y.
+    """
+
+    basis: np.ndarray
+    grid: VolumeGrid
+    unit: str = "cm"
+    energy_kev: float | None = None
+    materials: Materials | None = None
+    spectrum: Spectrum | None = None
+    gaussians: Mapping[str, np.ndarray] = field(default_factory=dict)
+    history: list[dict[str, Any]] = field(default_factory=list)
+    plan: dict[str, Any] = field(default_factory=dict)
+    counts: dict[str, Any] = field(default_factory=dict)
+    settings: dict[str, Any] = field(default_factory=dict)
+    seconds: float = 0.0
+    flipped_2d: bool = False
+
+    def __post_init__(self) -> None:
+        self.basis = np.ascontiguousarray(require_array("basis", self.basis, 4), np.float32)
+        channels = 1 if self.materials is None else 3
+        require_shape("basis", self.basis, (channels, *self.grid.shape), "(channels, z, y, x)")
+        if self.materials is not None and self.energy_kev is None:
+            raise fail("energy_kev", "an energy in keV", "None", "a polychromatic result has one")
+        if self.flipped_2d and self.grid.shape[0] != 1:
+            raise fail("flipped_2d", "False for more than one slice", f"{self.grid.shape[0]} slices")
+        if self.gaussians:
+            self._check_gaussians()
+
+    def _check_gaussians(self) -> None:
+        number = len(self.gaussians["density"])
+        for name, tail in GAUSSIAN_PARTS.items():
+            require_shape(
+                f"gaussians[{name!r}]", np.asarray(self.gaussians[name]), (number, *tail), "(n, ...)"
+            )
+
+    @property
+    def is_monochromatic(self) -> bool:
+        """Whether there is one attenuation volume and nothing to say about other energies."""
+        return self.materials is None
+
+    @cached_property
+    def volume(self) -> np.ndarray:
+        """Attenuation at :attr:`energy_kev` in 1/`unit`, float32, (z, y, x), or (y, x) after a 2D scan."""
+        return self._public(self.basis[0] if self.materials is None else self._attenuation(self.energy_kev))
+
+    def attenuation(self, kev: float) -> np.ndarray:
+        """Virtual monoenergetic volume: attenuation at `kev` in 1/`unit`, shaped like :attr:`volume`.
+
+        Raises
+        ------
+        ValueError
+            If the result is monochromatic and `kev` is not its energy.
+        """
+        kev = require_number("kev", kev, above=0)
+        if self.materials is None:
+            if self.energy_kev is None or abs(kev - self.energy_kev) > 1e-6 * kev:
+                known = (
+                    "its energy is unknown"
+                    if self.energy_kev is None
+                    else f"it knows {self.energy_kev:g} keV only"
+                )
+                raise fail(
+                    "kev", "the energy of a monochromatic result", f"{kev:g}", f"{known}; pass a spectrum"
+                )
+            return self.volume
+        return self._public(self._attenuation(kev))
+
+    @cached_property
+    def density(self) -> np.ndarray:
+        """Density in g/cm3, shaped like :attr:`volume`: the sum of the three shares."""
+        self._require_materials("density")
+        return self._public(self.basis.sum(axis=0))
+
+    @cached_property
+    def material(self) -> np.ndarray:
+        """Material map u from 0 (soft) over 1/2 (mostly middle) to 1 (dense), shaped like :attr:`volume`.
+
+        ``u = (basis_middle / 2 + basis_dense) / density``, the mass-weighted mean u of the Gaussians
+        at a voxel, exact for one material because ``2u(1-u) / 2 + u^2 = u``. 0 where there is next to
+        nothing (below 1e-3 of the largest density).
+        """
+        self._require_materials("material")
+        density = self.basis.sum(axis=0)
+        dense_share = 0.5 * self.basis[1] + self.basis[2]
+        present = density > 1e-3 * float(density.max())
+        u = np.divide(dense_share, density, out=np.zeros_like(density), where=present)
+        return self._public(np.clip(u, 0, 1, out=u))
+
+    def _attenuation(self, kev: float | None) -> np.ndarray:
+        assert self.materials is not None and kev is not None
+        curves = self.materials.mass_attenuation([kev])[:, 0] * cm_per(self.unit)
+        return np.tensordot(curves.astype(np.float32), self.basis, axes=1)
+
+    def _require_materials(self, name: str) -> None:
+        if self.materials is None:
+            raise fail(name, "a polychromatic result", "a monochromatic one", "reconstruct with a spectrum")
+
+    def _public(self, volume: np.ndarray) -> np.ndarray:
+        """In the order of the caller's geometry."""
+        return np.ascontiguousarray(volume[0, ::-1]) if self.flipped_2d else volume
+
+    def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> None:
+        """Write everything to an HDF5 file in the Data Exchange layout; :meth:`load` reads it back.
+
+        An interrupted write leaves an existing file as it was.
+
+        Raises
+        ------
+        FileExistsError
+            If the file exists and `overwrite` is false.
+        OSError
+            If the disk has too little free space.
+        """
+        from tomo_polysplat.result.files import save_hdf5
+
+        save_hdf5(self, path, overwrite=overwrite)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike) -> Result:
+        """Read what :meth:`save` wrote. Nothing is unpickled, and declared sizes are checked first."""
+        from tomo_polysplat.result.files import load_hdf5
+
+        return load_hdf5(path)
+
+    def save_tiff(self, folder: str | os.PathLike, *, overwrite: bool = False) -> None:
+        """Write :attr:`volume` as 32-bit TIFF slices ``slice_0000.tif``, ... into a folder (made if need be)."""
+        from tomo_polysplat.result.files import save_tiff
+
+        save_tiff(self, folder, overwrite=overwrite)
+
+    def save_npy(self, path: str | os.PathLike, *, overwrite: bool = False) -> None:
+        """Write :attr:`volume` as a NumPy array file."""
+        from tomo_polysplat.result.files import save_npy
+
+        save_npy(self, path, overwrite=overwrite)
+
+    def report(
+        self,
+        path: str | os.PathLike,
+        *,
+        truth: np.ndarray | None = None,
+        metal_mask: np.ndarray | None = None,
+        overwrite: bool = False,
+    ) -> None:
+        """Write one self-contained HTML page: slices, speed against error, the plan and the settings.
+
+        Parameters
+        ----------
+        truth, metal_mask : array shaped like :attr:`volume`, or None
+            True attenuation in 1/`unit` at :attr:`energy_kev`, and voxels of metal, for an error map and
+            figures of merit.
+        """
+        from tomo_polysplat.report.html import write_report
+
+        write_report(self, path, truth=truth, metal_mask=metal_mask, overwrite=overwrite)
+
+    def __repr__(self) -> str:
+        energy = "unknown energy" if self.energy_kev is None else f"{self.energy_kev:.1f} keV"
+        kind = "monochromatic" if self.materials is None else "polychromatic"
+        number = len(self.gaussians.get("density", ()))
+        return (
+            f"Result({kind}, {self.grid.shape} voxels, 1/{self.unit} at {energy}, {number} Gaussians, "
+            f"{self.seconds:.1f} s)"
+        )
