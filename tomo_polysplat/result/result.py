@@ -29,8 +29,8 @@ class Result:
     ----------
     basis : float32 array, shape (3, z, y, x) or (1, z, y, x)
         Sums over the Gaussians of ``density [(1-u)^2, 2u(1-u), u^2]`` in g/cm3: how much of the soft,
-        middle and dense curve each voxel holds. One channel of attenuation in 1/`unit` for a monochromatic result.
-        y ascends with the index.
+        middle and dense curve each voxel holds. One channel of attenuation in 1/`unit` for a monochromatic
+        result. y ascends with the index.
     grid : VolumeGrid
         Where the voxels are.
     unit : str
@@ -176,7 +176,7 @@ class Result:
         return load_hdf5(path)
 
     def save_tiff(self, folder: str | os.PathLike, *, overwrite: bool = False) -> None:
-        """Write :attr:`volume` as 32-bit TIFF slices ``slice_0000.tif``, ... into a folder (made if need be)."""
+        """Write :attr:`volume` as 32-bit TIFF slices ``slice_0000.tif``, ... into `folder`, made if need be."""
         from tomo_polysplat.result.files import save_tiff
 
         save_tiff(self, folder, overwrite=overwrite)
