@@ -176,7 +176,7 @@ class Result:
         return load_hdf5(path)
 
     def save_tiff(self, folder: str | os.PathLike, *, overwrite: bool = False) -> None:
-        """Write :attr:`volume` as 32-bit TIFF slices ``slice_0000.tif``, ... into `folder`, made if need be."""
+        """Write :attr:`volume` as 32-bit TIFF slices ``slice_0000.tif``, ... to a folder, made if need be."""
         from tomo_polysplat.result.files import save_tiff
 
         save_tiff(self, folder, overwrite=overwrite)
