@@ -18,6 +18,7 @@ __all__ = [
     "from_astra",
     "is_planar_geometry",
     "projections_from_astra",
+    "to_astra",
     "volume_from_astra",
     "volume_to_astra",
 ]
@@ -87,6 +88,18 @@ def from_astra(proj_geom: Mapping[str, Any], vol_geom: Mapping[str, Any]) -> tup
     _check_source(geometry, grid)
     _log.debug("%s", geometry.describe())
     return geometry, grid
+
+
+def to_astra(geometry: Geometry, grid: VolumeGrid) -> tuple[dict[str, Any], dict[str, Any]]:
+    """ASTRA's 3D vector geometry and volume geometry for ours; a 2D scan becomes one row and one slice."""
+    import astra
+
+    kind = "cone_vec" if geometry.beam == "cone" else "parallel3d_vec"
+    vectors = np.hstack([geometry.origin, geometry.centre, geometry.u, geometry.v])
+    proj_geom = astra.create_proj_geom(kind, geometry.rows, geometry.columns, vectors)
+    slices, rows, columns = grid.shape
+    window = [float(edge) for pair in zip(grid.lower, grid.upper) for edge in pair]
+    return proj_geom, astra.create_vol_geom(rows, columns, slices, *window)
 
 
 def projections_from_astra(projections: Any, proj_geom: Mapping[str, Any]) -> np.ndarray:

@@ -12,6 +12,7 @@ from tomo_polysplat.scan.astra_geometry import (
     from_astra,
     is_planar_geometry,
     projections_from_astra,
+    to_astra,
     volume_from_astra,
     volume_to_astra,
 )
@@ -24,6 +25,7 @@ __all__ = [
     "from_astra",
     "is_planar_geometry",
     "projections_from_astra",
+    "to_astra",
     "volume_from_astra",
     "volume_to_astra",
 ]

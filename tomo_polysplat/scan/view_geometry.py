@@ -59,7 +59,7 @@ class Geometry:
             # A private, read-only copy: a geometry is a value, whatever the caller does to its arrays.
             array: np.ndarray = np.array(require_array(name, getattr(self, name)), dtype=np.float64)
             require_shape(name, array, (views, 3), "(views, xyz)")
-            _refuse_views(np.isnan(array.sum(axis=1) * 0.0), name, "finite vectors", "NaN or infinity")
+            _refuse_views(np.any(~np.isfinite(array), axis=1), name, "finite vectors", "NaN or infinity")
             array.setflags(write=False)
             object.__setattr__(self, name, array)
         self._check_vectors()

@@ -45,7 +45,11 @@ def accumulate(volume: np.ndarray, filtered: np.ndarray, maps: np.ndarray) -> No
 @njit(nogil=True, cache=True, fastmath=True)
 def _add_lines(lines, ny, filtered, maps, first, last):  # type: ignore[no-untyped-def]
     views, rows, columns = filtered.shape
-    last_row, last_column = np.float32(rows - 1), np.float32(columns - 1)
+    # Steps to the next column and row, and the last place from which there is a next one: the largest float
+    # below the last index, so that no index needs a test of its own.
+    right, down = min(1, columns - 1), columns if rows > 1 else 0
+    last_column = max(np.float32(columns - 1) * np.float32(1 - 1e-7), np.float32(0))
+    last_row = max(np.float32(rows - 1) * np.float32(1 - 1e-7), np.float32(0))
     zero, one = np.float32(0), np.float32(1)
     for line in range(first, last):
         z, y = line // ny, line % ny
@@ -56,16 +60,18 @@ def _add_lines(lines, ny, filtered, maps, first, last):  # type: ignore[no-untyp
             b0 = np.float32(m[1, 1] * y + m[1, 2] * z + m[1, 3])
             g0 = np.float32(m[2, 1] * y + m[2, 2] * z + m[2, 3])
             a1, b1, g1 = np.float32(m[0, 0]), np.float32(m[1, 0]), np.float32(m[2, 0])
-            image = filtered[view]
+            pixels = filtered[view].ravel()
             for x in range(target.size):
-                gamma = g0 + x * g1
+                fx = np.float32(x)
+                gamma = g0 + fx * g1
                 # At or behind the source there is nothing to look up.
                 kappa = one / gamma if gamma > np.float32(1e-3) else zero
-                column = min(max((a0 + np.float32(x) * a1) * kappa, zero), last_column)
-                row = min(max((b0 + np.float32(x) * b1) * kappa, zero), last_row)
+                column = min(max((a0 + fx * a1) * kappa, zero), last_column)
+                row = min(max((b0 + fx * b1) * kappa, zero), last_row)
                 j, i = np.int32(column), np.int32(row)
                 fj, fi = column - np.float32(j), row - np.float32(i)
-                j1, i1 = min(j + 1, columns - 1), min(i + 1, rows - 1)
-                near = image[i, j] + fj * (image[i, j1] - image[i, j])
-                far = image[i1, j] + fj * (image[i1, j1] - image[i1, j])
+                at = np.int64(i) * columns + j
+                near = pixels[at] + fj * (pixels[at + right] - pixels[at])
+                at += down
+                far = pixels[at] + fj * (pixels[at + right] - pixels[at])
                 target[x] += kappa * kappa * (near + fi * (far - near))

@@ -1,0 +1,93 @@
+"""ASTRA's FDK on a GPU, where it is exact for the scan at hand."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, to_astra
+from tomo_polysplat.start.orbit import Orbit
+
+__all__ = ["fdk_cuda", "suits_fdk_cuda"]
+
+
+def suits_fdk_cuda(geometry: Geometry, grid: VolumeGrid, orbit: Orbit) -> tuple[bool, str]:
+    """Whether ASTRA's FDK_CUDA may and can do a scan, and why not.
+
+    It reads the distances from the first view, takes the views as evenly spread over a full turn and the
+    detector as centred and facing the axis, and knows cubic voxels only. Without a usable GPU it would end
+    the process, so that is asked first.
+    """
+    import astra
+    import torch
+
+    if not (torch.cuda.is_available() and astra.use_cuda()):
+        return False, "no GPU that ASTRA can use"
+    if geometry.beam != "cone" or geometry.planar:
+        return False, "not a 3D cone beam"
+    if np.ptp(grid.voxel_size) > 1e-6 * grid.voxel_size.max():
+        return False, "voxels are not cubes"
+    even = orbit.full and np.ptp(orbit.steps) < 0.02 * orbit.steps.mean()
+    if not even:
+        return False, "views are not evenly spread over a full turn"
+    axis = np.column_stack([np.tile(orbit.axis, (geometry.views, 1)), geometry.origin[:, 2]])
+    middle = geometry.centre - geometry.origin
+    towards = axis - geometry.origin
+    ratio = np.einsum("vk,vk->v", middle, towards) / np.einsum("vk,vk->v", towards, towards)
+    astray = np.linalg.norm(middle - ratio[:, None] * towards, axis=1)
+    if (astray > 0.05 * np.linalg.norm(geometry.u, axis=1)).any() or np.ptp(ratio) > 1e-3 * ratio.mean():
+        return False, "the detector is not centred on the axis"
+    skew = np.einsum("vk,vk->v", geometry.u, towards) / np.linalg.norm(geometry.u, axis=1)
+    if (np.abs(skew) > 1e-3 * orbit.radius).any():
+        return False, "the detector does not face the axis"
+    return True, "circular cone beam"
+
+
+def fdk_cuda(
+    projections: np.ndarray,
+    geometry: Geometry,
+    grid: VolumeGrid,
+    orbit: Orbit,
+    *,
+    filter_name: str = "ram-lak",
+    device: str = "cuda",
+) -> np.ndarray:
+    """ASTRA's FDK_CUDA on linked torch tensors, for a scan that `suits_fdk_cuda`.
+
+    Parameters and result are those of `fdk`.
+
+    Raises
+    ------
+    RuntimeError
+        If ASTRA left any voxel unwritten.
+    """
+    import astra
+    import torch
+
+    target = torch.device(device)
+    index = torch.cuda.current_device() if target.index is None else target.index
+    # ASTRA takes the origin for the centre of the orbit.
+    shift = -np.array([*orbit.axis, geometry.origin[:, 2].mean()])
+    proj_geom, vol_geom = to_astra(geometry.shifted(shift), grid.shifted(shift))
+    ordered = np.ascontiguousarray(projections.swapaxes(0, 1), dtype=np.float32)
+    sinogram = torch.from_numpy(ordered).to(f"cuda:{index}")
+    volume = torch.full(grid.shape, torch.nan, dtype=torch.float32, device=sinogram.device)
+    # ASTRA works on streams of its own and asks for none of torch's.
+    torch.cuda.synchronize(index)
+    data, algorithm = [], None
+    try:
+        data.append(astra.data3d.link("-sino", proj_geom, sinogram))
+        data.append(astra.data3d.link("-vol", vol_geom, volume))
+        config = astra.astra_dict("FDK_CUDA")
+        config["ProjectionDataId"], config["ReconstructionDataId"] = data
+        config["option"] = {"FilterType": filter_name, "GPUindex": index}
+        algorithm = astra.algorithm.create(config)
+        astra.algorithm.run(algorithm)
+    finally:
+        if algorithm is not None:
+            astra.algorithm.delete(algorithm)
+        for identifier in data:
+            astra.data3d.delete(identifier)
+    torch.cuda.synchronize(index)
+    if not bool(torch.isfinite(volume).all()):
+        raise RuntimeError("ASTRA's FDK_CUDA left voxels unwritten; is its GPU out of memory?")
+    return volume.cpu().numpy()

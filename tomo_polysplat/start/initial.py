@@ -1,0 +1,128 @@
+"""The volume that a fit starts from."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import numpy as np
+
+from tomo_polysplat.checks import require_array, require_shape
+from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.start.fdk import fdk, fits_fdk
+from tomo_polysplat.start.sirt import sirt
+
+__all__ = ["fill_invalid", "initial_volume"]
+
+_log = logging.getLogger(__name__)
+
+# Below this many views filtered backprojection is further from the truth than ten passes of SIRT (spheres in
+# 48^3 voxels with 1 % noise: errors of 1.4 and 1.2 % at 40 views, 1.1 and 1.3 % at 60).
+FEW_VIEWS = 40
+_VIEWS_PER_SUBSET = 6
+# Passes of SIRT times views: over ordered subsets the noise grows with the number of updates.
+_PASSES_TIMES_VIEWS, _PASSES = 400, (3, 10)
+# Steps along rays in one pass of SIRT beyond which a coarser volume and detector do for a start: a few
+# seconds for all passes on two CPU cores.
+_MOST_STEPS = 2e8
+
+
+def initial_volume(
+    projections: np.ndarray,
+    geometry: Geometry,
+    grid: VolumeGrid,
+    *,
+    valid: np.ndarray | None = None,
+    device: str = "cpu",
+) -> tuple[np.ndarray, dict[str, Any]]:
+    """Reconstruct quickly: filtered backprojection where it fits, else a few passes of SIRT.
+
+    Parameters
+    ----------
+    projections : (views, rows, columns) float32
+        ``-log(I / I0)``, water-corrected or not.
+    geometry, grid : Geometry, VolumeGrid
+        The scan and the voxels.
+    valid : (views, rows, columns) bool, optional
+        Pixels that may be used; pixels that are not finite never are.
+    device : {"cpu", "cuda"}
+        Where a GPU may be used.
+
+    Returns
+    -------
+    volume : (nz, ny, nx) float32
+        Attenuation per unit of length.
+    info : dict
+        ``method`` ("fdk" or "sirt"), ``reason`` and ``invalid_pixels`` (not used, and for FDK interpolated
+        from their row).
+    """
+    projections = require_array("projections", projections, ndim=3)
+    require_shape("projections", projections, geometry.shape, "(views, rows, columns)")
+    usable = np.isfinite(projections)
+    if valid is not None:
+        require_shape("valid", np.asarray(valid), geometry.shape, "(views, rows, columns)")
+        usable &= valid
+    if not usable.any():
+        raise ValueError("projections: expected some valid pixels, got none")
+    fits, reason = fits_fdk(geometry, grid)
+    if fits and geometry.views < FEW_VIEWS:
+        fits, reason = False, f"only {geometry.views} views"
+    method, invalid = ("fdk" if fits else "sirt"), int((~usable).sum())
+    _log.info("Start from %s: %s; %d invalid pixels.", method.upper(), reason, invalid)
+    if fits:
+        volume = fdk(fill_invalid(projections, usable), geometry, grid, device=device)
+    else:
+        volume = _sirt_start(np.where(usable, projections, np.nan), geometry, grid)
+    return volume, {"method": method, "reason": reason, "invalid_pixels": invalid}
+
+
+def _sirt_start(projections: np.ndarray, geometry: Geometry, grid: VolumeGrid) -> np.ndarray:
+    """SIRT from zero, on a grid and a detector coarse enough to take seconds."""
+    from scipy.ndimage import zoom
+
+    views = geometry.views
+    steps = float(np.prod(geometry.shape)) * max(grid.shape)
+    factor = 1
+    while steps > _MOST_STEPS and 16 * factor <= min(geometry.columns, *grid.shape[1:]):
+        factor, steps = 2 * factor, steps / (8 if geometry.rows > 1 else 4)
+    passes = int(np.clip(_PASSES_TIMES_VIEWS // views, *_PASSES))
+    factors = np.array([1 if n == 1 else factor for n in grid.shape])
+    counts = -(-np.array(grid.shape) // factors)
+    coarse = VolumeGrid(tuple(counts), grid.lower, grid.lower + (counts * factors)[::-1] * grid.voxel_size)
+    row_factor = factor if geometry.rows > 1 else 1
+    volume = sirt(
+        _binned(projections, row_factor, factor),
+        geometry.binned(factor),
+        coarse,
+        passes=passes,
+        subsets=max(1, views // _VIEWS_PER_SUBSET),
+    )
+    if factor == 1:
+        return volume
+    nz, ny, nx = grid.shape
+    return zoom(volume, factors, order=1, mode="nearest", grid_mode=True)[:nz, :ny, :nx]
+
+
+def _binned(projections: np.ndarray, row_factor: int, factor: int) -> np.ndarray:
+    """Mean of the finite pixels of each block, NaN where there is none."""
+    views, rows, columns = projections.shape
+    rows, columns = rows // row_factor, columns // factor
+    blocks = projections[:, : rows * row_factor, : columns * factor]
+    blocks = blocks.reshape(views, rows, row_factor, columns, factor)
+    finite = np.isfinite(blocks)
+    count = finite.sum(axis=(2, 4))
+    total = np.where(finite, blocks, 0).sum(axis=(2, 4))
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
+
+
+def fill_invalid(projections: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Invalid pixels interpolated linearly along their row; a row without any valid pixel becomes 0."""
+    if valid.all():
+        return projections
+    filled = np.where(valid, projections, 0).astype(np.float32)
+    column = np.arange(projections.shape[2])
+    for view, row in np.argwhere(~valid.all(axis=2)):
+        good = valid[view, row]
+        if good.any():
+            filled[view, row, ~good] = np.interp(column[~good], column[good], filled[view, row, good])
+    return filled
