@@ -1,0 +1,176 @@
+"""Few nodes that stand for a whole spectrum.
+
+A ray through areal densities ``a`` of the three base materials measures
+
+    P(a) = -log sum_E eta_E exp(-sum_k a_k b_kE).
+
+A quadrature replaces the spectrum's energies by a few nodes with free weights *and* free attenuation triples:
+they need not lie on the physical curves, since only ``P`` is ever made from them. Fitted to ``P`` itself over
+the range of the scan, 5 to 7 nodes are better than 63 plain samples, and absorption edges are no obstacle,
+because no node has to move across one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tomo_polysplat.checks import require_number
+from tomo_polysplat.physics.beer_lambert import projection
+from tomo_polysplat.physics.materials import Materials
+from tomo_polysplat.physics.quadrature_fit import fit_nodes
+from tomo_polysplat.physics.ray_range import MaxPath, span_rays
+from tomo_polysplat.physics.spectrum import Spectrum
+
+__all__ = ["Quadrature", "fit_quadrature", "sampled_quadrature"]
+
+MAX_FITTED_NODES = 16
+_SLOPE_TOLERANCE = 1e-3  # relative, of dP/da at P = 0: thin objects keep their attenuation
+# Steps between pure materials and levels of P, of the rays that a quadrature is fitted to. The levels are
+# dense near 0, where P bends fastest: the softest photons go first.
+_FIT_GRID = (4, np.linspace(0.0, 1.0, 21)[1:] ** 2)
+# The rays its errors are taken from: finer, and other mixtures but for the pure materials.
+_JUDGE_GRID = (11, np.linspace(0.0, 1.0, 41)[1:] ** 2)
+
+_Nodes = tuple[np.ndarray, np.ndarray]  # log weights (n,) and attenuation (3, n)
+
+
+@dataclass(frozen=True, eq=False)
+class Quadrature:
+    """Nodes of the polychromatic projection, ``P = -logsumexp_n(log_weights_n - sum_k a_k attenuation_kn)``.
+
+    Attributes
+    ----------
+    log_weights : (n,) float64 array
+        Logarithms of weights that add up to 1.
+    attenuation : (3, n) float64 array
+        Mass attenuation (cm2/g) of the soft, middle and dense material at each node.
+    error_bound : float
+        Largest ``|error of P|`` found on an independent, dense set of rays over the range ``max_path``.
+    rms_error : float
+        Root mean square error of ``P`` on the same rays.
+    slope_error : float
+        Largest relative error of ``dP/da_k`` at ``P = 0``.
+    max_path : float or tuple of three floats
+        Range for which the errors hold: the largest P, or the largest areal densities (g/cm2).
+    """
+
+    log_weights: np.ndarray
+    attenuation: np.ndarray
+    error_bound: float
+    rms_error: float
+    slope_error: float
+    max_path: float | tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        self.log_weights.flags.writeable = self.attenuation.flags.writeable = False
+
+    @property
+    def nodes(self) -> int:
+        """Number of nodes."""
+        return self.log_weights.size
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Weights ``(n,)`` that add up to 1."""
+        return np.exp(self.log_weights)
+
+    @property
+    def mean_attenuation(self) -> np.ndarray:
+        """``dP/da_k`` at ``P = 0``, ``(3,)`` in cm2/g."""
+        return self.attenuation @ self.weights
+
+    def describe(self) -> str:
+        """One line for reports."""
+        nodes = f"{self.nodes} spectral node{'s' if self.nodes > 1 else ''}"
+        if isinstance(self.max_path, tuple):
+            where = "areal densities up to " + ", ".join(f"{a:.3g}" for a in self.max_path) + " g/cm2"
+        else:
+            where = f"projection values up to {self.max_path:.3g}"
+        return f"{nodes}: error at most {self.error_bound:.1e}, rms {self.rms_error:.1e}, for {where}"
+
+
+def fit_quadrature(
+    spectrum: Spectrum,
+    materials: Materials | None = None,
+    max_path: MaxPath = 8.0,
+    nodes: int | None = None,
+    tolerance: float = 5e-4,
+) -> Quadrature:
+    """The fewest nodes that reproduce the measurement over the range of a scan.
+
+    Parameters
+    ----------
+    spectrum : Spectrum
+    materials : Materials, optional
+        Base materials; water, aluminium and iron by default.
+    max_path : float or three floats
+        Range of the scan: its largest projection value, or the largest areal density (g/cm2) of each base
+        material.
+    nodes : int, optional
+        Fix the number of nodes instead. A spectrum with no more energies than that is kept as it is.
+    tolerance : float
+        Root mean square error of ``P`` to reach. If 16 nodes do not, every energy of the spectrum becomes a
+        node.
+
+    Returns
+    -------
+    Quadrature
+        With its errors on rays that were not used in the fit.
+
+    Raises
+    ------
+    ValueError
+        For a range or number of nodes that is not positive.
+    """
+    full = _nodes_of(spectrum, materials or Materials())
+    bins = full[0].size
+    judge = _Judge(full, max_path)
+    require_number("tolerance", tolerance, above=0.0)
+    rays = span_rays(*full, max_path, *_FIT_GRID)
+    if nodes is not None:
+        nodes = int(require_number("nodes", nodes, at_least=1))
+        return judge(fit_nodes(*full, rays, nodes) if nodes < bins else full)
+    for count in range(1, min(bins, MAX_FITTED_NODES + 1)):
+        candidate = judge(fit_nodes(*full, rays, count))
+        if candidate.rms_error <= tolerance and candidate.slope_error <= _SLOPE_TOLERANCE:
+            return candidate
+    return judge(full)
+
+
+def sampled_quadrature(
+    spectrum: Spectrum, materials: Materials | None = None, n: int | None = None, max_path: MaxPath = 8.0
+) -> Quadrature:
+    """Plain nodes at ``n`` equally spaced energies (``Spectrum.sampled``); None: at all of them."""
+    full = _nodes_of(spectrum, materials or Materials())
+    chosen = full if n is None else _nodes_of(spectrum.sampled(n), materials or Materials())
+    return _Judge(full, max_path)(chosen)
+
+
+def _nodes_of(spectrum: Spectrum, materials: Materials) -> _Nodes:
+    """A spectrum's energies as nodes, those without weight left out."""
+    lit = spectrum.weights > 0
+    return np.log(spectrum.weights[lit]), materials.mass_attenuation(spectrum.energies[lit])
+
+
+class _Judge:
+    """Puts the errors against the full spectrum on nodes."""
+
+    def __init__(self, full: _Nodes, max_path: MaxPath) -> None:
+        self._rays = span_rays(*full, max_path, *_JUDGE_GRID)
+        self._target = projection(self._rays, *full)
+        self._slope = full[1] @ np.exp(full[0])
+        self._range = tuple(map(float, np.ravel(max_path)))
+
+    def __call__(self, nodes: _Nodes) -> Quadrature:
+        errors = projection(self._rays, *nodes) - self._target
+        slope = nodes[1] @ np.exp(nodes[0])
+        return Quadrature(
+            nodes[0].copy(),
+            nodes[1].copy(),
+            error_bound=float(np.abs(errors).max()),
+            rms_error=float(np.sqrt(np.mean(errors**2))),
+            slope_error=float(np.abs(slope / self._slope - 1.0).max()),
+            max_path=self._range if len(self._range) > 1 else self._range[0],
+        )

@@ -1,0 +1,83 @@
+"""Sets of rays that span what a scan can contain, to fit and to judge a quadrature on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from tomo_polysplat.checks import fail, require_array, require_number
+from tomo_polysplat.physics.beer_lambert import projection
+
+__all__ = ["MaxPath", "span_rays"]
+
+# The largest projection value of the scan, or the largest areal density (g/cm2) of each base material.
+MaxPath = float | Sequence[float]
+
+_STEPS = (
+    200  # of the tables of P along a direction; only places the samples, which are then evaluated exactly
+)
+_BISECTIONS = 50
+
+
+def span_rays(
+    log_weights: np.ndarray, attenuation: np.ndarray, max_path: MaxPath, divisions: int, levels: np.ndarray
+) -> np.ndarray:
+    """Areal densities ``(3, rays)`` in g/cm2 of rays that span the range of a scan.
+
+    Parameters
+    ----------
+    log_weights, attenuation : (n,) and (3, n) arrays
+        The full spectrum.
+    max_path : float or three floats
+        Largest projection value, or largest areal density of each base material.
+    divisions : int
+        The mixtures are a lattice of this many steps between the pure materials.
+    levels : (m,) array
+        Samples along each mixture as fractions of its largest P.
+    """
+    directions, reach = _directions(log_weights, attenuation, max_path, divisions)
+    steps = np.geomspace(1e-8, 1.0, _STEPS)
+    rays = []
+    for direction, end in zip(directions.T, reach):
+        line = direction[:, None] * (end * steps)
+        values = projection(line, log_weights, attenuation)
+        rays.append(direction[:, None] * (end * np.interp(levels * values[-1], values, steps)))
+    return np.concatenate(rays, axis=1)
+
+
+def _directions(
+    log_weights: np.ndarray, attenuation: np.ndarray, max_path: MaxPath, divisions: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mixtures ``(3, m)`` and how far along each the scan reaches ``(m,)``."""
+    shares = np.array(
+        [(i, j, divisions - i - j) for i in range(divisions + 1) for j in range(divisions + 1 - i)]
+    )
+    lattice = shares.T / divisions
+    if np.ndim(max_path) == 0:
+        largest = require_number(
+            "max_path", max_path, above=0.0, remedy="the largest projection value of the scan"
+        )
+        pure = _reach(np.eye(3), log_weights, attenuation, largest)
+        directions = lattice * pure[:, None]
+        return directions, _reach(directions, log_weights, attenuation, largest)
+    maxima = require_array("max_path", max_path, ndim=1).astype(np.float64)
+    if maxima.shape != (3,) or not (np.isfinite(maxima).all() and (maxima >= 0).all() and maxima.any()):
+        raise fail("max_path", "a projection value or three areal densities in g/cm2", repr(max_path))
+    directions = lattice * maxima[:, None]
+    present = directions.any(axis=0)
+    return directions[:, present], 1.0 / lattice[maxima > 0].max(axis=0)[present]
+
+
+def _reach(
+    directions: np.ndarray, log_weights: np.ndarray, attenuation: np.ndarray, largest: float
+) -> np.ndarray:
+    """Multiple of each direction ``(3, m)`` at which P reaches ``largest``."""
+    low = np.zeros(directions.shape[1])
+    # P rises at least as fast as at the energy that penetrates best.
+    high = largest / (directions.T @ attenuation).min(axis=1)
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        beyond = projection(middle * directions, log_weights, attenuation) > largest
+        low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
+    return high
