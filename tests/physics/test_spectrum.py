@@ -35,8 +35,9 @@ def half_value_layer(spectrum):
     return 10 * np.interp(-0.5, -(np.exp(-np.outer(thickness, mu)) @ kerma) / kerma.sum(), thickness)
 
 
-# kVp, anode, filters in cm, then mean energy (keV) and first half-value layer (mm Al) that SpekPy 2.5.4 gives
-# with 0.5 keV bins and its own attenuation data. Half of the voltages lie between those of the packaged tables.
+# kVp, anode, filters in cm, then mean energy (keV) and first half-value layer (mm Al) by SpekPy 2.5.4 itself
+# with 0.5 keV bins and its own attenuation data. Half of the voltages lie between those of the
+# packaged tables.
 SPEKPY = [
     (90.0, "W", {"Al": 0.1}, 42.108, 1.8238),
     (92.3, "W", {"Al": 0.1}, 42.827, 1.8773),
