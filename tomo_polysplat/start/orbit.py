@@ -10,7 +10,7 @@ from tomo_polysplat.scan.geometry import Geometry
 
 __all__ = ["Orbit", "find_orbit"]
 
-# A gap between neighbouring views this many times the median one, and this wide, is a part not scanned.
+# A gap between neighbouring views this many times the usual one, and this wide, is a part not scanned.
 _GAP_RATIO, _GAP_RADIANS = 4.0, np.deg2rad(5.0)
 # Largest sine between the detector's rows and the plane of the orbit, or its columns and the axis. Ramp
 # filtering along rows that stray by more than this leaves visible streaks.
@@ -72,7 +72,8 @@ def find_orbit(geometry: Geometry) -> tuple[Orbit | None, str]:
     height = np.ptp(geometry.origin[:, 2])
     if not (np.abs(distance - radius).max() < _ROUND * radius and height < _ROUND * radius):
         return None, "the source does not move on a horizontal circle"
-    if not (np.einsum("vk,vk->v", offset, geometry.centre[:, :2] - axis) < 0).all():
+    # From the source, not from the axis: a detector scaled to the axis (a virtual one) is as good.
+    if not (np.einsum("vk,vk->v", offset, (geometry.centre - geometry.origin)[:, :2]) < 0).all():
         return None, "the detector does not face the source across the axis"
     return _cover(np.arctan2(offset[:, 1], offset[:, 0]), 2 * np.pi, axis, radius), "circular orbit"
 
@@ -112,8 +113,8 @@ def _cover(angles: np.ndarray, period: float, axis: np.ndarray, radius: float) -
     folded = np.mod(angles, period)
     order = np.argsort(folded, kind="stable")
     ahead = np.diff(folded[order], append=folded[order[0]] + period)
-    typical = np.median(ahead[ahead > 0.01 * period / len(angles)])
-    missing = ahead > max(_GAP_RATIO * typical, _GAP_RADIANS)
+    # A high quantile rather than the median: views may come in pairs, or at the uneven golden angle.
+    missing = ahead > max(_GAP_RATIO * np.quantile(ahead, 0.9), _GAP_RADIANS)
     start = folded[order[(int(np.argmax(ahead)) + 1) % len(angles)]] if missing.any() else folded[order[0]]
     covered = np.where(missing, 0.0, ahead)
     steps = np.empty_like(folded)

@@ -1,0 +1,61 @@
+"""The measured rays on the solver's device: values, weights, and those held out of the fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from tomo_polysplat.kernels.views import DetectorViews
+
+__all__ = ["Rays"]
+
+
+@dataclass
+class Rays:
+    """Projections with the views they belong to.
+
+    Parameters
+    ----------
+    projections : (views, rows, columns) float32 tensor
+        -log(I/I0); NaN where a ray is not to be used.
+    views : DetectorViews
+        In the solver's coordinates.
+    weighted : bool
+        Weigh rays by photon statistics instead of alike.
+    held_out : float
+        Share of the rays kept from the fit.
+    """
+
+    projections: torch.Tensor
+    views: DetectorViews
+    weighted: bool
+    held_out: float
+
+    def batch(self, chosen: np.ndarray) -> tuple[DetectorViews, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Views, values (0 where unusable), fit weights and held-out weights of the chosen views.
+
+        The variance of -log(I/I0) is exp(P)/I0 for Poisson counts, so a weight exp(-P/2) makes all residuals
+        alike. Negative values are noise in air and weigh as air.
+        """
+        values = self.projections[torch.as_tensor(chosen, device=self.projections.device)]
+        usable = torch.isfinite(values)
+        values = torch.where(usable, values, torch.zeros_like(values))
+        weight = usable.to(values.dtype)
+        if self.weighted:
+            weight = weight * torch.exp(-0.5 * values.clamp(min=0))
+        aside = self._aside(chosen, values.shape[1:])
+        return self.views.select(chosen), values, weight * ~aside, weight * aside
+
+    def _aside(self, chosen: np.ndarray, shape: torch.Size) -> torch.Tensor:
+        """Pixels held out: a fixed pseudo-random choice, different in every view, that needs no memory."""
+        device = self.projections.device
+        if not self.held_out:
+            return torch.zeros((len(chosen), *shape), dtype=torch.bool, device=device)
+        pixel = torch.arange(shape.numel(), device=device, dtype=torch.int64).reshape(shape)
+        view = torch.as_tensor(chosen, device=device, dtype=torch.int64)[:, None, None]
+        # One round of a multiplicative hash (Knuth) over the pair, to 16 even bits.
+        mixed = (pixel * 2654435761 + view * 40503 + 12345) & 0xFFFFFFFF
+        mixed = ((mixed ^ (mixed >> 15)) * 2246822519) & 0xFFFFFFFF
+        return (mixed >> 16) < int(self.held_out * 65536)

@@ -1,0 +1,72 @@
+"""The unknowns: a cloud of Gaussians with a density and a material number each.
+
+Coordinates are relative to the volume's centre in units of half its longest side; densities are in units of
+the scan's soft reference.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import torch
+
+__all__ = ["Gaussians"]
+
+
+@dataclass
+class Gaussians:
+    """Parameters of n Gaussians.
+
+    Parameters
+    ----------
+    position : (n, 3) tensor
+    log_scale : (n, 3) tensor
+        Natural logarithm of the standard deviations; (n, 2) for the endless Gaussians of a planar scan.
+    rotation : (n, 4) tensor
+        Quaternions (w, x, y, z) of any length.
+    density : (n,) tensor
+        At the centre, not negative.
+    material : (n,) tensor
+        The number u in [0, 1].
+    """
+
+    position: torch.Tensor
+    log_scale: torch.Tensor
+    rotation: torch.Tensor
+    density: torch.Tensor
+    material: torch.Tensor
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """The parameters by name."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def copy(self) -> Gaussians:
+        """Detached copies of the parameters."""
+        return Gaussians(**{name: t.detach().clone() for name, t in self.tensors().items()})
+
+    def select(self, chosen: torch.Tensor) -> Gaussians:
+        """The Gaussians of an index or mask, still attached to the graph."""
+        return Gaussians(**{name: t[chosen] for name, t in self.tensors().items()})
+
+    @property
+    def planar(self) -> bool:
+        """Whether they are two-dimensional."""
+        return self.log_scale.shape[1] == 2
+
+    def scale(self) -> torch.Tensor:
+        """(n, 3) standard deviations; infinite along z when planar."""
+        scale = self.log_scale.exp()
+        if self.planar:
+            scale = torch.cat([scale, scale.new_full((len(scale), 1), math.inf)], dim=1)
+        return scale
+
+    def weights(self, polychromatic: bool) -> torch.Tensor:
+        """(3, n) densities of the soft, middle and dense curve, or (1, n) densities."""
+        if not polychromatic:
+            return self.density[None]
+        u = self.material
+        return self.density * torch.stack([(1 - u).square(), 2 * u * (1 - u), u.square()])

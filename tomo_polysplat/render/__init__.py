@@ -1,0 +1,1 @@
+"""Gaussians to rays and to voxels, through whichever kernel fits the device."""

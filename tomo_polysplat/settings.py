@@ -1,0 +1,96 @@
+"""Every tunable of a reconstruction, its unit and its default, and the quality presets."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+from tomo_polysplat.checks import fail, require_choice
+
+__all__ = ["PRESETS", "Settings", "make_settings"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Tunables of the solver.
+
+    Lengths are in units of the mean spacing of the seeds or of the voxel, as said; attenuation and density in
+    units of the scan's soft reference (water, for most objects).
+    """
+
+    passes: float = 16.0
+    """Times every view is used, unless the held-out rays or a time budget end the run before."""
+    views_per_step: int = 4
+    """Views whose gradients make one step of the optimiser."""
+    max_gaussians: int = 0
+    """Upper bound of the number of Gaussians; 0 leaves it to the plan."""
+    seed_spacing: float = 0.0
+    """Distance of the seeds in voxels; 0 leaves it to the plan."""
+    seed_width: float = 0.6
+    """Standard deviation of a seed in units of the spacing."""
+    support_level: float = 0.1
+    """Voxels of the start below this share of the soft reference get no Gaussian."""
+    smallest_scale: float = 0.35
+    """Smallest standard deviation in voxels."""
+    largest_scale: float = 8.0
+    """Largest standard deviation in seed spacings."""
+    bone_level: float = 2.2
+    """Start attenuation, in soft references, above which a Gaussian starts as bone-like."""
+    metal_level: float = 6.0
+    """The same for metal."""
+    soft_u: float = 0.002
+    """Material number that soft matter starts from, and keeps away from dense matter."""
+    bone_u: float = 0.35
+    metal_u: float = 0.9
+    free_radius: float = 6.0
+    """Material numbers are free within this many voxels of bone-like or denser matter."""
+    learning_rate_position: float = 0.02
+    """Per step, in seed spacings."""
+    learning_rate_scale: float = 1.5e-2
+    """Per step, relative."""
+    learning_rate_rotation: float = 3e-3
+    learning_rate_density: float = 1e-2
+    learning_rate_material: float = 3e-3
+    final_rate: float = 0.1
+    """Learning rates fall exponentially to this share of their start."""
+    loss: str = "weighted-l1"
+    """"weighted-l1" (photon statistics) or "l1" (the paper's)."""
+    ssim_weight: float = 0.0
+    """Weight of 1 - SSIM of the projections (the paper uses 0.25)."""
+    tv_weight: float = 0.02
+    """Weight of the total variation per voxel, in soft references."""
+    tv_clip: float = 2.5
+    """Attenuation above this many soft references does not count as variation, which would erode metal."""
+    tv_box: int = 32
+    """Edge in voxels of the random box whose total variation is taken."""
+    held_out: float = 0.01
+    """Share of the rays kept from the fit to tell when it stops improving."""
+    patience: int = 4
+    """Checks without improvement of the held-out rays that end the run."""
+    cutoff: float = 3.0
+    """Standard deviations at which a projected Gaussian ends."""
+    kernel: str = "auto"
+    """"auto", "triton", "numba" or "reference"."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values by name."""
+        return asdict(self)
+
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "fast": {"passes": 8.0},
+    "balanced": {},
+    "best": {"passes": 40.0},
+}
+
+
+def make_settings(quality: str = "balanced", changes: dict[str, Any] | Settings | None = None) -> Settings:
+    """The settings of a preset with some of them changed by name."""
+    if isinstance(changes, Settings):
+        return changes
+    require_choice("quality", quality, PRESETS)
+    known = {field.name for field in fields(Settings)}
+    for name in changes or {}:
+        if name not in known:
+            raise fail("settings", f"names among {', '.join(sorted(known))}", repr(name))
+    return replace(Settings(), **{**PRESETS[quality], **(changes or {})})
