@@ -11,7 +11,14 @@ from pathlib import Path
 
 from tomo_polysplat.checks import fail
 
-__all__ = ["available_memory", "existing_file", "replacing", "require_room", "require_plausible_size"]
+__all__ = [
+    "available_memory",
+    "existing_file",
+    "replacing",
+    "require_plausible_size",
+    "require_replaceable",
+    "require_room",
+]
 
 # Deflate, the strongest compression met in these formats, cannot shrink data by more than 1032.
 LARGEST_COMPRESSION = 1100
@@ -38,7 +45,7 @@ def replacing(path: str | os.PathLike, *, overwrite: bool, needed_bytes: int = 0
         If the disk has too little free space.
     """
     target = Path(path)
-    _require_replaceable(target, overwrite)
+    require_replaceable(target, overwrite)
     require_room(target.parent, needed_bytes)
     handle, name = tempfile.mkstemp(
         prefix=f".{target.stem}-", suffix=f".part{target.suffix}", dir=target.parent
@@ -49,14 +56,15 @@ def replacing(path: str | os.PathLike, *, overwrite: bool, needed_bytes: int = 0
         yield temporary
         _flush(temporary)
         _take_default_mode(temporary)
-        _require_replaceable(target, overwrite)
+        require_replaceable(target, overwrite)
         os.replace(temporary, target)
     finally:
         with suppress(FileNotFoundError):
             temporary.unlink()
 
 
-def _require_replaceable(target: Path, overwrite: bool) -> None:
+def require_replaceable(target: Path, overwrite: bool) -> None:
+    """Refuse a file that could not be written: a folder, one in a missing folder, or one that must stay."""
     if target.is_dir():
         raise fail("path", "a file", f"the folder {target}", error=IsADirectoryError)
     if not target.parent.is_dir():

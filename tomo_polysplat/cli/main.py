@@ -1,0 +1,68 @@
+"""Parse the command line, run one subcommand, turn exceptions into exit codes."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from collections.abc import Sequence
+
+import tomo_polysplat
+from tomo_polysplat.cli import bench, check, demo, doctor, recon, simulate
+
+__all__ = ["main"]
+
+COMMANDS = (demo, recon, simulate, check, bench, doctor)
+BAD_INPUT, INTERRUPTED, FAILED = 2, 130, 1
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point.
+
+    Returns
+    -------
+    int
+        0 when all went well, 1 for a failure of ours, 2 for bad input, 130 when interrupted.
+    """
+    arguments = build_parser().parse_args(argv)
+    level = logging.DEBUG if arguments.debug else logging.INFO if arguments.verbose else logging.WARNING
+    logging.basicConfig(level=level, format="%(levelname)s: %(message)s", stream=sys.stderr)
+    if arguments.debug:
+        return arguments.run(arguments)
+    try:
+        return arguments.run(arguments)
+    except (ValueError, TypeError, OSError, MemoryError) as error:
+        return _complain(str(error) or type(error).__name__, BAD_INPUT)
+    except KeyboardInterrupt:
+        return _complain("interrupted", INTERRUPTED)
+    except Exception as error:  # the last place that can still say it in one line
+        return _complain(f"{type(error).__name__}: {error} (run again with --debug to see where)", FAILED)
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of every subcommand."""
+    parser = argparse.ArgumentParser(
+        prog="tomo-polysplat",
+        description="CT reconstruction with Gaussians of matter and the physics of a real x-ray spectrum: "
+        "no metal or beam-hardening artefacts, no metal mask.",
+    )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {tomo_polysplat.__version__}")
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("-v", "--verbose", action="store_true", help="say what is being done")
+    common.add_argument("--debug", action="store_true", help="say everything, and show tracebacks")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    for module in COMMANDS:
+        child = commands.add_parser(
+            module.NAME,
+            parents=[common],
+            help=module.HELP,
+            description=f"{module.HELP[0].upper()}{module.HELP[1:]}.",
+        )
+        module.add_arguments(child)
+        child.set_defaults(run=module.run)
+    return parser
+
+
+def _complain(message: str, code: int) -> int:
+    print(f"tomo-polysplat: error: {' '.join(message.split())}", file=sys.stderr)
+    return code

@@ -1,0 +1,173 @@
+"""Options that several subcommands share."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from tomo_polysplat.checks import fail
+from tomo_polysplat.files import existing_file, replacing
+
+if TYPE_CHECKING:
+    from tomo_polysplat.physics.detector import Detector
+    from tomo_polysplat.physics.spectrum import Spectrum
+
+__all__ = [
+    *("ProgressBar", "add_scan_options", "add_solver_options", "add_spectrum_options"),
+    *("scan_from", "spectrum_from", "write_json"),
+]
+
+
+def add_spectrum_options(parser: argparse.ArgumentParser) -> None:
+    """The x-ray spectrum: a tube with filters and a detector, or a table."""
+    group = parser.add_argument_group("spectrum (used instead of the file's)")
+    group.add_argument("--kvp", type=float, metavar="KV", help="tube voltage in kV")
+    group.add_argument("--anode", default="W", help="anode: W, Mo, Rh, Ag or Cu (default: W)")
+    group.add_argument(
+        "--filter",
+        action="append",
+        default=[],
+        metavar="MATERIAL:CM",
+        help="filter and its thickness in cm, such as Al:0.1; may be repeated",
+    )
+    group.add_argument(
+        "--detector",
+        default="counting",
+        metavar="KIND",
+        help="counting, or integrating:SCINTILLATOR:CM such as integrating:CsI:0.06 (default: counting)",
+    )
+    group.add_argument(
+        "--spectrum", metavar="FILE", help="detected spectrum as text: energy in keV and weight on each line"
+    )
+
+
+def spectrum_from(arguments: argparse.Namespace) -> Spectrum | None:
+    """The spectrum that the options describe, or None."""
+    from tomo_polysplat.physics.spectrum import Spectrum
+
+    if arguments.spectrum is not None:
+        if arguments.kvp is not None or arguments.filter:
+            raise fail("--spectrum", "no --kvp or --filter beside it", "both")
+        return Spectrum(*_two_columns(arguments.spectrum), label=Path(arguments.spectrum).name)
+    if arguments.kvp is None:
+        if arguments.filter:
+            raise fail("--filter", "--kvp with it", "no --kvp")
+        return None
+    filters = dict(_filter(text) for text in arguments.filter)
+    return Spectrum.from_tube(arguments.kvp, arguments.anode, filters, _detector(arguments.detector))
+
+
+def _two_columns(path: str) -> tuple[Any, Any]:
+    import numpy as np
+
+    file = existing_file(path)
+    with open(file, encoding="utf-8") as stream:
+        table = np.loadtxt((line.replace(",", " ") for line in stream), ndmin=2)
+    if table.shape[1] != 2:
+        raise fail("--spectrum", "two columns: keV and weight", f"{table.shape[1]} columns")
+    return table[:, 0], table[:, 1]
+
+
+def _filter(text: str) -> tuple[str, float]:
+    material, _, thickness = text.partition(":")
+    try:
+        return material, float(thickness)
+    except ValueError:
+        raise fail("--filter", "MATERIAL:CM, such as Al:0.1", repr(text)) from None
+
+
+def _detector(text: str) -> Detector:
+    from tomo_polysplat.physics.detector import Detector
+
+    kind, *rest = text.split(":")
+    if kind == "counting" and not rest:
+        return Detector.photon_counting()
+    try:
+        if kind == "integrating" and len(rest) == 2:
+            return Detector.energy_integrating(rest[0], float(rest[1]))
+    except ValueError as error:
+        raise fail("--detector", "a scintillator and its thickness in cm", f"{text!r} ({error})") from None
+    raise fail("--detector", "counting or integrating:SCINTILLATOR:CM", repr(text))
+
+
+def add_scan_options(parser: argparse.ArgumentParser) -> None:
+    """The scan and what its file leaves open."""
+    parser.add_argument("scan", metavar="SCAN", help="Data Exchange HDF5 file or .npz scan")
+    group = parser.add_argument_group("what the file does not say")
+    group.add_argument("--unit", help="unit of its lengths: cm (default), mm, um, m or pixel")
+    group.add_argument(
+        "--centre",
+        "--center",
+        type=float,
+        metavar="COLUMN",
+        help="parallel beam: rotation axis in columns from the detector's edge (default: estimated)",
+    )
+    group.add_argument(
+        "--pixel-size",
+        type=float,
+        metavar="SIZE",
+        help="parallel beam: pixel in the plane of the object, in --unit",
+    )
+    group.add_argument(
+        "--input",
+        choices=["counts", "transmission", "attenuation"],
+        help="what /exchange/data holds (default: by its attribute or its open-beam images)",
+    )
+    group.add_argument(
+        "--saturation", type=float, metavar="COUNTS", help="counts at which the detector saturates"
+    )
+
+
+def scan_from(arguments: argparse.Namespace, spectrum: Spectrum | None = None) -> Any:
+    """The scan that the options name."""
+    from tomo_polysplat.scan.io import load_scan
+
+    return load_scan(
+        arguments.scan,
+        spectrum=spectrum,
+        unit=arguments.unit,
+        centre=arguments.centre,
+        pixel_size=arguments.pixel_size,
+        input=arguments.input,
+        saturation=arguments.saturation,
+    )
+
+
+def add_solver_options(parser: argparse._ActionsContainer) -> None:
+    """Where and from what seed to compute."""
+    parser.add_argument("--device", default="auto", help="auto (default), cpu, cuda or cuda:N")
+    parser.add_argument("--seed", type=int, default=0, help="seed of everything random (default: 0)")
+
+
+def write_json(path: str | Path, content: Any, *, overwrite: bool) -> None:
+    """Write `content` as JSON, with numbers of NumPy turned into Python's."""
+    from tomo_polysplat.result.files import plain
+
+    with replacing(path, overwrite=overwrite) as temporary:
+        temporary.write_text(json.dumps(plain(content), indent=2) + "\n", encoding="utf-8")
+
+
+class ProgressBar:
+    """A bar on standard error; called with the share done (0 to 1) and a few words.
+
+    Only shown on a terminal, so that logs stay readable.
+    """
+
+    def __enter__(self) -> ProgressBar:
+        from tqdm import tqdm
+
+        layout = "{l_bar}{bar:24}| {elapsed}<{remaining} {postfix}"
+        self._bar = tqdm(total=1.0, bar_format=layout, disable=None, leave=False)
+        return self
+
+    def __call__(self, share: float, words: str = "") -> None:
+        self._bar.set_postfix_str(words, refresh=False)
+        self._bar.update(min(share, 1.0) - self._bar.n)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.close()

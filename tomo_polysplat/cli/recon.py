@@ -1,0 +1,163 @@
+"""``tomo-polysplat recon``: from a scan to a volume."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tomo_polysplat.checks import fail
+from tomo_polysplat.cli.options import (
+    ProgressBar,
+    add_scan_options,
+    add_solver_options,
+    add_spectrum_options,
+    scan_from,
+    spectrum_from,
+    write_json,
+)
+from tomo_polysplat.files import require_replaceable
+
+if TYPE_CHECKING:
+    from tomo_polysplat.result.result import Result
+    from tomo_polysplat.scan.scan import Scan
+
+NAME = "recon"
+HELP = "reconstruct a scan into a volume of attenuation in 1/length"
+OUTPUT_SUFFIXES = (".h5", ".hdf5", ".npy")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of this subcommand."""
+    add_scan_options(parser)
+    parser.add_argument("-o", "--output", required=True, metavar="FILE", help=".h5 with everything, or .npy")
+    parser.add_argument("--overwrite", action="store_true", help="replace files that exist")
+    parser.add_argument("--report", metavar="FILE", help="write a page about the reconstruction (.html)")
+    parser.add_argument("--tiff", metavar="FOLDER", help="write the slices as 32-bit TIFF")
+    parser.add_argument("--json", metavar="FILE", help="write the plan, the counts and the errors as JSON")
+    add_spectrum_options(parser)
+    group = parser.add_argument_group("reconstruction")
+    group.add_argument(
+        "--quality", choices=["fast", "balanced", "best"], default="balanced", help="default: balanced"
+    )
+    group.add_argument("--time-budget", type=float, metavar="SECONDS", help="stop after this long")
+    group.add_argument(
+        "--mono", action="store_true", help="ignore the spectrum: one energy, as most methods assume"
+    )
+    group.add_argument(
+        "--energy",
+        type=float,
+        metavar="KEV",
+        help="energy of the volume (default: the spectrum's effective energy)",
+    )
+    group.add_argument(
+        "--materials",
+        nargs=3,
+        metavar=("SOFT", "MIDDLE", "DENSE"),
+        help="base materials (default: water aluminium iron)",
+    )
+    group.add_argument(
+        "--set", action="append", default=[], metavar="NAME=VALUE", help="change one setting; may be repeated"
+    )
+    add_solver_options(group)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Reconstruct, and write what was asked for."""
+    _require_outputs(arguments)
+    scan = scan_from(arguments, spectrum_from(arguments))
+    spectrum = None if arguments.mono else scan.spectrum
+    if arguments.energy is not None and spectrum is None:
+        raise fail("--energy", "a spectrum, from the file or from --kvp", "none")
+    # Imported this late because it loads torch, and a mistake above should be told at once.
+    from tomo_polysplat.reconstruct import reconstruct
+
+    print(scan)
+    with ProgressBar() as progress:
+        result = reconstruct(
+            scan.projections,
+            scan.proj_geom,
+            scan.vol_geom,
+            spectrum=spectrum,
+            materials=arguments.materials,
+            unit=scan.unit,
+            quality=arguments.quality,
+            time_budget=arguments.time_budget,
+            seed=arguments.seed,
+            device=arguments.device,
+            valid=scan.valid,
+            progress=progress,
+            settings=dict(_setting(text) for text in arguments.set) or None,
+        )
+    if arguments.energy is not None:
+        result = replace(result, energy_kev=arguments.energy)
+    print(result)
+    _write(result, scan, arguments)
+    return 0
+
+
+def _require_outputs(arguments: argparse.Namespace) -> None:
+    """Find out before the work, not after it, that a result could not be written."""
+    if Path(arguments.output).suffix.lower() not in OUTPUT_SUFFIXES:
+        raise fail("--output", f"a name ending in {', '.join(OUTPUT_SUFFIXES)}", arguments.output)
+    for path in (arguments.output, arguments.report, arguments.json):
+        if path is not None:
+            require_replaceable(Path(path), arguments.overwrite)
+
+
+def _setting(text: str) -> tuple[str, Any]:
+    name, separator, value = text.partition("=")
+    if not separator:
+        raise fail("--set", "NAME=VALUE", repr(text))
+    try:
+        return name, json.loads(value)
+    except ValueError:
+        return name, value
+
+
+def _write(result: Result, scan: Scan, arguments: argparse.Namespace) -> None:
+    from tomo_polysplat.report.table import as_text
+
+    output, overwrite = Path(arguments.output), arguments.overwrite
+    save = result.save_npy if output.suffix.lower() == ".npy" else result.save
+    save(output, overwrite=overwrite)
+    print(f"wrote {output}")
+    errors = _errors(result, scan)
+    if arguments.tiff is not None:
+        result.save_tiff(arguments.tiff, overwrite=overwrite)
+        print(f"wrote {arguments.tiff}")
+    if arguments.report is not None:
+        known = {"truth": scan.truth, "metal_mask": scan.metal_mask} if _same_energy(result, scan) else {}
+        result.report(arguments.report, overwrite=overwrite, **known)
+        print(f"wrote {arguments.report}")
+    if errors is not None:
+        print(as_text([errors], result.unit))
+    if arguments.json is not None:
+        about = {name: getattr(result, name) for name in ("unit", "energy_kev", "seconds", "plan", "counts")}
+        write_json(arguments.json, about | {"scan": arguments.scan, "errors": errors}, overwrite=overwrite)
+        print(f"wrote {arguments.json}")
+
+
+def _errors(result: Result, scan: Scan) -> dict[str, Any] | None:
+    """Figures of merit at the energy of the truth, where the scan carries one."""
+    if scan.truth is None:
+        return None
+    from tomo_polysplat.result.metrics import compare
+
+    energy = _truth_energy(scan)
+    volume = result.volume if result.is_monochromatic or energy is None else result.attenuation(energy)
+    name = "mono" if result.is_monochromatic else "polysplat"
+    return {"name": name, "seconds": result.seconds, **compare(volume, scan.truth, scan.metal_mask)}
+
+
+def _truth_energy(scan: Scan) -> float | None:
+    if scan.truth_energy_kev is not None or scan.spectrum is None:
+        return scan.truth_energy_kev
+    return scan.spectrum.effective_energy
+
+
+def _same_energy(result: Result, scan: Scan) -> bool:
+    energy = _truth_energy(scan)
+    return energy is None or result.energy_kev is None or abs(energy - result.energy_kev) < 0.05
