@@ -159,12 +159,10 @@ def _type_of(proj_geom: Mapping[str, Any]) -> str:
         raise fail(
             "proj_geom", "a dict from astra.create_proj_geom", repr(type(proj_geom).__name__), "", TypeError
         )
-    remedy = (
-        "a matrix has no rays; give the geometry that it was made from"
-        if (proj_geom["type"] == "sparse_matrix")
-        else ""
-    )
-    return require_choice("proj_geom type", proj_geom["type"], _PLANAR_TYPES + _SPATIAL_TYPES, remedy)
+    kind = proj_geom["type"]
+    matrix = "a matrix has no rays; give the geometry that it was made from"
+    remedy = matrix if kind == "sparse_matrix" else ""
+    return require_choice("proj_geom type", kind, _PLANAR_TYPES + _SPATIAL_TYPES, remedy)
 
 
 def _entry(geometry: Mapping[str, Any], key: str) -> Any:

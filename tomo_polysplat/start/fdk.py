@@ -27,7 +27,7 @@ def fits_fdk(geometry: Geometry, grid: VolumeGrid) -> tuple[bool, str]:
     orbit, reason = find_orbit(geometry)
     if orbit is None:
         return False, reason
-    if np.hypot(*(grid.centre[:2] - orbit.axis)) > 0.5 * max(orbit.radius, 0.0):
+    if np.hypot(*(grid.centre[:2] - orbit.axis)) > 0.5 * orbit.radius:
         return False, "the volume lies far off the axis of rotation"
     offsets = ray_offsets(geometry, orbit)
     if orbit.full:

@@ -24,7 +24,7 @@ _VIEWS_PER_SUBSET = 6
 _PASSES_TIMES_VIEWS, _PASSES = 400, (3, 10)
 # Steps along rays in one pass of SIRT beyond which a coarser volume and detector do for a start: a few
 # seconds for all passes on two CPU cores.
-_MOST_STEPS = 2e8
+_MOST_STEPS = 4e7
 
 
 def initial_volume(
