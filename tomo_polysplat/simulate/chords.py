@@ -120,22 +120,28 @@ def trace_rays(origins, directions, bounds, solids, out):
 
 
 @njit(nogil=True, cache=True)
-def _choose(point, along, source, cone, solids, chosen):
-    """Solids that the bundle of rays through a tile may meet, by the four planes through its edges.
+def _pixel(corner, u, v, row, column, out):
+    for k in range(3):
+        out[k] = corner[k] + row * v[k] + column * u[k]
 
-    ``point`` (5, 3): the tile's corners in order, then its centre; ``along``: direction of a parallel beam.
-    """
-    centres, radii = solids[1], solids[3]
-    planes = np.empty((4, 4))
-    for k in range(4):
-        edge = point[(k + 1) % 4] - point[k]
-        ray = point[k] - source if cone else along
-        normal = np.cross(edge, ray)
-        normal /= math.sqrt((normal**2).sum())
-        if ((point[4] - point[k]) * normal).sum() > 0.0:
-            normal = -normal
-        planes[k, :3] = normal
-        planes[k, 3] = (point[k] * normal).sum()
+
+@njit(nogil=True, cache=True)
+def _plane(start, stop, inner, beam, cone, out):
+    """Plane (normal, offset) through two neighbouring corners of a tile and their rays, facing outwards."""
+    ray = out[:3]  # the ray, then the normal, in the same place
+    for k in range(3):
+        ray[k] = start[k] - beam[k] if cone else beam[k]
+    a, b, c = stop[0] - start[0], stop[1] - start[1], stop[2] - start[2]
+    x, y, z = b * ray[2] - c * ray[1], c * ray[0] - a * ray[2], a * ray[1] - b * ray[0]
+    within = (inner[0] - start[0]) * x + (inner[1] - start[1]) * y + (inner[2] - start[2]) * z
+    scale = math.copysign(1.0 / math.sqrt(x * x + y * y + z * z), -within)
+    out[0], out[1], out[2] = x * scale, y * scale, z * scale
+    out[3] = out[0] * start[0] + out[1] * start[1] + out[2] * start[2]
+
+
+@njit(nogil=True, cache=True)
+def _choose(planes, centres, radii, chosen):
+    """Solids not wholly outside any of the four planes about a bundle of rays: their indices and number."""
     count = 0
     for j in range(len(radii)):
         outside = False
@@ -162,24 +168,31 @@ def trace_view(cone, beam, corner, u, v, solids, out):
     chosen = np.empty(total, np.int64)
     covered = np.empty((total + 1, 2))
     local = np.empty((2, 3))
-    point = np.empty((5, 3))
+    point = np.empty((5, 3))  # corners of a tile in order round it, then its centre
+    planes = np.empty((4, 4))
+    pixel, ray = np.empty(3), beam.copy()
     bounds = (0.0, 1.0) if cone else (-math.inf, math.inf)
     for top in range(0, rows, TILE):
         bottom = min(top + TILE, rows)
         for left in range(0, columns, TILE):
             right = min(left + TILE, columns)
-            point[0] = corner + (top - 0.5) * v + (left - 0.5) * u
-            point[1] = corner + (top - 0.5) * v + (right - 0.5) * u
-            point[2] = corner + (bottom - 0.5) * v + (right - 0.5) * u
-            point[3] = corner + (bottom - 0.5) * v + (left - 0.5) * u
-            point[4] = (point[0] + point[2]) / 2.0
-            count = _choose(point, beam, beam, cone, solids, chosen)
+            _pixel(corner, u, v, top - 0.5, left - 0.5, point[0])
+            _pixel(corner, u, v, top - 0.5, right - 0.5, point[1])
+            _pixel(corner, u, v, bottom - 0.5, right - 0.5, point[2])
+            _pixel(corner, u, v, bottom - 0.5, left - 0.5, point[3])
+            _pixel(corner, u, v, (top + bottom - 1) / 2.0, (left + right - 1) / 2.0, point[4])
+            for k in range(4):
+                _plane(point[k], point[(k + 1) % 4], point[4], beam, cone, planes[k])
+            count = _choose(planes, solids[1], solids[3], chosen)
             for i in range(top, bottom if count else top):
                 for j in range(left, right):
-                    pixel = corner + i * v + j * u
-                    origin = beam if cone else pixel
-                    direction = pixel - beam if cone else beam
-                    _trace(origin, direction, bounds, chosen, count, solids, covered, local, out[i, j])
+                    _pixel(corner, u, v, i, j, pixel)
+                    if cone:
+                        for k in range(3):
+                            ray[k] = pixel[k] - beam[k]
+                    _trace(
+                        beam if cone else pixel, ray, bounds, chosen, count, solids, covered, local, out[i, j]
+                    )
 
 
 @njit(nogil=True, cache=True)

@@ -11,7 +11,7 @@ from tomo_polysplat.simulate.shapes import box, cylinder, ellipsoid, rotation
 __all__ = ["HALF_WIDTH", "parts"]
 
 HALF_WIDTH = 2.5
-ENAMEL = "Ca10P6O26H2"
+ENAMEL = "hydroxyapatite"  # at the density of young enamel
 FILLED = (1, 4, 8)
 
 
@@ -28,11 +28,11 @@ def parts() -> list[Part]:
     places = _arch(10)
     for x, y, angle in places:
         listed.append(
-            Part(ellipsoid((x, y, -0.85), (0.45, 0.42, 0.62), rotation((0, 0, 1), angle)), "bone", 1.75)
+            Part(ellipsoid((x, y, -0.85), (0.45, 0.42, 0.62), rotation((0, 0, 1), angle)), "bone", 1.55)
         )
     for x, y, angle in places:
         alveolar = ellipsoid((x, y, -0.95), (0.34, 0.30, 0.48), rotation((0, 0, 1), angle))
-        listed.append(Part(alveolar, "bone", 1.25))
+        listed.append(Part(alveolar, "bone", 1.18))
     for n, (x, y, angle) in enumerate(places):
         listed += _tooth(x, y, angle, molar=n in (0, 1, 2, 7, 8, 9))
     return listed + [_filling(*places[n]) for n in FILLED]
@@ -54,15 +54,15 @@ def _tooth(x: float, y: float, angle: float, molar: bool) -> list[Part]:
     along = turn @ np.array([0.13, 0.0, 0.0])
     centre = np.array([x, y, 0.0])
     roots = [centre - along, centre + along] if molar else [centre]
-    built = [Part(ellipsoid(c + (0, 0, -0.55), (0.11, 0.13, 0.62), turn), "bone", 1.95) for c in roots]
-    built.append(Part(ellipsoid(centre + (0, 0, 0.22), (wide, deep, 0.40), turn), ENAMEL, 2.4))
+    built = [Part(ellipsoid(c + (0, 0, -0.55), (0.11, 0.13, 0.62), turn), "bone", 1.80) for c in roots]
+    built.append(Part(ellipsoid(centre + (0, 0, 0.22), (wide, deep, 0.40), turn), ENAMEL, 1.9))
     if molar:
-        built += [Part(ellipsoid(c + (0, 0, 0.52), 0.09, turn), ENAMEL, 2.4) for c in roots]
-    built.append(Part(ellipsoid(centre + (0, 0, 0.08), (0.84 * wide, 0.82 * deep, 0.36), turn), "bone", 1.95))
+        built += [Part(ellipsoid(c + (0, 0, 0.52), 0.09, turn), ENAMEL, 1.9) for c in roots]
+    built.append(Part(ellipsoid(centre + (0, 0, 0.08), (0.84 * wide, 0.82 * deep, 0.36), turn), "bone", 1.80))
     built.append(Part(ellipsoid(centre, (0.07, 0.06, 0.22), turn), "water", 1.03))
     return built + [Part(cylinder(c + (0, 0, -0.45), 0.035, 0.45), "water", 1.03) for c in roots]
 
 
 def _filling(x: float, y: float, angle: float) -> Part:
     """A small inlay in the top of a crown."""
-    return Part(box((x, y, 0.44), (0.17, 0.13, 0.11), rotation((0, 0, 1), angle)), "iron", 7.87, metal=True)
+    return Part(box((x, y, 0.44), (0.16, 0.12, 0.11), rotation((0, 0, 1), angle)), "iron", 7.87, metal=True)
