@@ -61,7 +61,6 @@ def self_test() -> tuple[bool, str]:
     text : str
         What was measured, or what went wrong.
     """
-    from tomo_polysplat.reconstruct import reconstruct
     from tomo_polysplat.result.metrics import compare
     from tomo_polysplat.scan.geometry import from_astra, projections_from_astra
     from tomo_polysplat.simulate.scenes import simulate_scan
@@ -72,7 +71,7 @@ def self_test() -> tuple[bool, str]:
         scan = simulate_scan("pins", size=24, views=48)
         projections = projections_from_astra(scan.projections, scan.proj_geom)
         plain = fdk(projections, *from_astra(scan.proj_geom, scan.vol_geom))
-        result = reconstruct(
+        result = tomo_polysplat.reconstruct(
             scan.projections,
             scan.proj_geom,
             scan.vol_geom,

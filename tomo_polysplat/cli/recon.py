@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import tomo_polysplat
 from tomo_polysplat.checks import fail
 from tomo_polysplat.cli.options import (
     ProgressBar,
@@ -71,12 +72,9 @@ def run(arguments: argparse.Namespace) -> int:
     spectrum = None if arguments.mono else scan.spectrum
     if arguments.energy is not None and spectrum is None:
         raise fail("--energy", "a spectrum, from the file or from --kvp", "none")
-    # Imported this late because it loads torch, and a mistake above should be told at once.
-    from tomo_polysplat.reconstruct import reconstruct
-
     print(scan)
     with ProgressBar() as progress:
-        result = reconstruct(
+        result = tomo_polysplat.reconstruct(
             scan.projections,
             scan.proj_geom,
             scan.vol_geom,

@@ -1,0 +1,219 @@
+"""Volumes at any energy and material maps from the basis, and files that bring everything back."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+from tomo_polysplat.physics.materials import Materials, mass_attenuation
+from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.result.result import Result
+from tomo_polysplat.scan.geometry import VolumeGrid
+
+GRID = VolumeGrid((3, 4, 5), (-1.0, -2.0, -0.3), (1.5, 2.0, 0.3))
+
+
+def polychromatic(u=0.3, density=1.7, **changes):
+    """A result whose voxels all hold one material."""
+    basis = density * Materials.mixture(np.broadcast_to(u, GRID.shape))
+    content = {
+        "basis": basis,
+        "grid": GRID,
+        "energy_kev": 55.0,
+        "materials": Materials(),
+        "spectrum": Spectrum([40.0, 70.0], [1, 1], "two lines"),
+        "gaussians": {
+            "position": np.arange(6.0).reshape(2, 3),
+            "scale": np.ones((2, 3)),
+            "rotation": np.tile([1.0, 0, 0, 0], (2, 1)),
+            "density": np.array([1.0, 2.0]),
+            "u": np.array([0.1, 0.9]),
+        },
+        "history": [{"seconds": 0.5, "iteration": 3, "loss": np.float32(0.25), "held_out": None}],
+        "plan": {"channels": {"value": 3, "reason": "a spectrum is given"}},
+        "counts": {"masked_rays": np.int64(4)},
+        "settings": {"passes": 2.0},
+        "seconds": 1.25,
+    }
+    return Result(**(content | changes))
+
+
+@pytest.mark.parametrize(("unit", "cm"), [("cm", 1.0), ("mm", 0.1), ("um", 1e-4), ("m", 100.0)])
+def test_pure_materials_have_their_tabulated_attenuation(unit, cm):
+    for u, name in ((0.0, "water"), (1.0, "iron")):
+        result = polychromatic(u, density=2.0, unit=unit)
+        for kev in (30.0, 55.0, 120.0):
+            expected = 2.0 * mass_attenuation(name, kev) * cm
+            np.testing.assert_allclose(result.attenuation(kev), expected, rtol=1e-5)
+    np.testing.assert_allclose(result.volume, result.attenuation(55.0))
+    assert result.volume.shape == GRID.shape and result.volume.dtype == np.float32
+
+
+def test_material_and_density_are_recovered():
+    u = np.linspace(0, 1, 60).reshape(GRID.shape)
+    result = polychromatic(u, density=3.1)
+    np.testing.assert_allclose(result.material, u, atol=1e-6)
+    np.testing.assert_allclose(result.density, 3.1, rtol=1e-6)
+
+
+def test_a_mixture_has_the_mean_material_of_its_mass():
+    basis = 1.0 * Materials.mixture(np.full(GRID.shape, 0.2)) + 3.0 * Materials.mixture(
+        np.full(GRID.shape, 0.6)
+    )
+    result = polychromatic(basis=basis)
+    np.testing.assert_allclose(result.material, (1.0 * 0.2 + 3.0 * 0.6) / 4.0, rtol=1e-6)
+
+
+def test_empty_space_has_no_material():
+    density = np.ones(GRID.shape)
+    density[0] = 0
+    result = polychromatic(0.5, density=density)
+    assert (result.material[0] == 0).all() and np.isfinite(result.material).all()
+    np.testing.assert_allclose(result.material[1:], 0.5, rtol=1e-6)
+    assert (polychromatic(0.5, density=0.0).material == 0).all()
+
+
+def test_a_monochromatic_result_knows_one_energy_only():
+    mu = np.random.default_rng(0).random((1, *GRID.shape))
+    result = Result(mu, GRID, energy_kev=60.0)
+    np.testing.assert_allclose(result.attenuation(60.0), mu[0], rtol=1e-6)
+    with pytest.raises(ValueError, match="60 keV only"):
+        result.attenuation(61.0)
+    with pytest.raises(ValueError, match="energy is unknown"):
+        Result(mu, GRID).attenuation(60.0)
+    for name in ("material", "density"):
+        with pytest.raises(ValueError, match="polychromatic"):
+            getattr(result, name)
+
+
+def test_two_dimensional_results_have_row_0_at_the_largest_y():
+    grid = VolumeGrid((1, 4, 5), (-1, -1, -1), (1, 1, 1))
+    mu = np.arange(20.0).reshape(1, 1, 4, 5)
+    result = Result(mu, grid, flipped_2d=True)
+    np.testing.assert_array_equal(result.volume, mu[0, 0, ::-1])
+    assert result.volume.flags.c_contiguous
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"basis": np.zeros((1, 3, 4, 5))}, "basis: expected shape"),
+        ({"energy_kev": None}, "energy_kev"),
+        ({"flipped_2d": True}, "flipped_2d"),
+        (
+            {"gaussians": dict.fromkeys(("position", "scale", "rotation", "density", "u"), np.zeros(2))},
+            "position",
+        ),
+    ],
+)
+def test_inconsistent_parts_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        polychromatic(**changes)
+
+
+# Files
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_everything_comes_back_from_a_file(tmp_path, flat):
+    result = polychromatic(np.linspace(0, 1, 60).reshape(GRID.shape), unit="mm")
+    if flat:
+        grid = VolumeGrid((1, 4, 5), (-1, -1, -1), (1, 1, 1))
+        result = polychromatic(basis=result.basis[:, :1], grid=grid, flipped_2d=True)
+    result.save(tmp_path / "result.h5")
+    back = Result.load(tmp_path / "result.h5")
+    np.testing.assert_array_equal(back.volume, result.volume)
+    np.testing.assert_array_equal(back.basis, result.basis)
+    for name, values in result.gaussians.items():
+        np.testing.assert_array_equal(back.gaussians[name], values, err_msg=name)
+    for name in ("unit", "energy_kev", "materials", "spectrum", "plan", "settings", "seconds", "flipped_2d"):
+        assert getattr(back, name) == getattr(result, name), name
+    assert back.history == [{"seconds": 0.5, "iteration": 3, "loss": 0.25, "held_out": None}]
+    assert back.counts == {"masked_rays": 4}
+    np.testing.assert_array_equal([back.grid.lower, back.grid.upper], [result.grid.lower, result.grid.upper])
+
+
+def test_a_monochromatic_result_comes_back(tmp_path):
+    result = Result(np.random.default_rng(0).random((1, *GRID.shape)), GRID, unit="pixel")
+    result.save(tmp_path / "mono.h5")
+    back = Result.load(tmp_path / "mono.h5")
+    assert (
+        back.materials is None and back.spectrum is None and back.energy_kev is None and back.unit == "pixel"
+    )
+    np.testing.assert_array_equal(back.volume, result.volume)
+
+
+def test_the_file_is_data_exchange_with_where_and_what(tmp_path):
+    result = polychromatic(np.linspace(0, 1, 60).reshape(GRID.shape))
+    result.save(tmp_path / "result.h5")
+    with h5py.File(tmp_path / "result.h5") as file:
+        data = file["exchange/data"]
+        np.testing.assert_array_equal(data[()], result.volume)
+        assert (
+            data.attrs["unit"] == "1/cm"
+            and data.attrs["energy_kev"] == 55.0
+            and data.attrs["axes"] == "z:y:x"
+        )
+        np.testing.assert_allclose(data.attrs["voxel_size"], [0.5, 1.0, 0.2])
+        np.testing.assert_allclose(data.attrs["origin"], [-0.75, -1.5, -0.2])
+        assert file["implements"][()] == b"exchange:polysplat"
+
+
+def test_an_existing_file_is_kept_unless_told(tmp_path):
+    path = tmp_path / "result.h5"
+    path.write_text("mine")
+    for write in (polychromatic().save, polychromatic().save_npy):
+        with pytest.raises(FileExistsError, match="overwrite=True"):
+            write(path)
+    assert path.read_text() == "mine"
+    polychromatic().save(path, overwrite=True)
+    assert Result.load(path).seconds == 1.25
+    with pytest.raises(FileNotFoundError, match="existing folder"):
+        polychromatic().save(tmp_path / "nowhere" / "result.h5")
+
+
+def test_a_full_disk_is_noticed_before_writing(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "tomo_polysplat.files.shutil.disk_usage", lambda _: type("Usage", (), {"free": 100})()
+    )
+    with pytest.raises(OSError, match="free disk space"):
+        polychromatic().save(tmp_path / "result.h5")
+    assert not list(tmp_path.iterdir())
+
+
+def test_broken_files_are_refused(tmp_path):
+    path = tmp_path / "result.h5"
+    polychromatic().save(path)
+    data = path.read_bytes()
+    for share in (0.02, 0.5, 0.97):
+        path.write_bytes(data[: int(share * len(data))])
+        with pytest.raises(ValueError, match="readable HDF5"):
+            Result.load(path)
+    with h5py.File(path, "w") as file:
+        file["exchange/data"] = np.zeros(3)
+    with pytest.raises(ValueError, match=r"Result\.save"):
+        Result.load(path)
+
+
+def test_tiff_slices(tmp_path):
+    import tifffile
+
+    result = polychromatic(np.linspace(0, 1, 60).reshape(GRID.shape))
+    folder = tmp_path / "stack"
+    result.save_tiff(folder)
+    files = sorted(folder.iterdir())
+    assert [file.name for file in files] == ["slice_0000.tif", "slice_0001.tif", "slice_0002.tif"]
+    np.testing.assert_array_equal(np.stack([tifffile.imread(file) for file in files]), result.volume)
+    about = json.loads(tifffile.TiffFile(files[0]).pages[0].description)
+    assert about["unit"] == "1/cm" and about["energy_kev"] == 55.0
+    with pytest.raises(FileExistsError):
+        result.save_tiff(folder)
+    lower = polychromatic(basis=result.basis[:, :1], grid=VolumeGrid((1, 4, 5), (-1, -1, -1), (1, 1, 1)))
+    lower.save_tiff(folder, overwrite=True)
+    assert [file.name for file in folder.iterdir()] == ["slice_0000.tif"], "slices of the old stack are left"
+
+
+def test_npy(tmp_path):
+    polychromatic().save_npy(tmp_path / "volume.npy")
+    np.testing.assert_array_equal(np.load(tmp_path / "volume.npy"), polychromatic().volume)

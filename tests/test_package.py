@@ -1,0 +1,153 @@
+"""The package as a whole: what importing it costs, which way imports go, and that it is packaged whole."""
+
+import ast
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import tomo_polysplat
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "tomo_polysplat"
+BASICS = ("checks", "parallel", "files", "units", "settings")
+LAYERS = (
+    BASICS,
+    ("kernels",),
+    ("physics",),
+    ("scan",),
+    ("simulate", "start"),
+    ("model",),
+    ("render",),
+    ("fit",),
+    ("result", "report"),
+    ("reconstruction",),
+    ("baselines", "bench", "cli", "doctor", "plugins"),
+)
+LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
+# Loading any of these takes a good part of a second, or starts something.
+HEAVY = ("astra", "matplotlib", "numba", "triton", "torch", "skimage", "scipy", "h5py", "xraydb", "tomopy")
+
+PUBLIC = vars(tomo_polysplat)["_PUBLIC"]
+OPTIONAL = ("triton", "tomopy", "dxchange")
+
+
+def sources():
+    folders = {"": PACKAGE, "plugins/": ROOT / "plugins"}
+    return [
+        (part_of(path, folder, prefix), path)
+        for prefix, folder in folders.items()
+        for path in sorted(folder.rglob("*.py"))
+        if path != PACKAGE / "__init__.py"
+    ]
+
+
+def part_of(path, folder, prefix):
+    return "plugins" if prefix else path.relative_to(folder).with_suffix("").parts[0]
+
+
+def imported_parts(path):
+    """Parts of the package that a file imports anywhere in it, except for type checking."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    typing_only = {
+        child
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and ast.unparse(node.test) in ("TYPE_CHECKING", "typing.TYPE_CHECKING")
+        for child in ast.walk(node)
+    }
+    for node in ast.walk(tree):
+        if node in typing_only:
+            continue
+        if isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative imports hide where they lead"
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        elif isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        else:
+            continue
+        yield from (name.split(".")[1] for name in names if name.startswith("tomo_polysplat."))
+
+
+def test_importing_is_quick_and_light():
+    code = (
+        "import sys, time; start = time.perf_counter(); import tomo_polysplat, tomo_polysplat.cli;"
+        "print(time.perf_counter() - start, *sorted(m for m in sys.modules if '.' not in m))"
+    )
+    # The quickest of three: other programs may keep the machine busy.
+    answers = [
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
+        ).stdout
+        for _ in range(3)
+    ]
+    seconds, *modules = min(answers, key=lambda answer: float(answer.split()[0])).split()
+    assert "tomo_polysplat" in modules and not set(HEAVY) & set(modules)
+    assert float(seconds) < 1.0
+
+
+def test_imports_go_one_way():
+    found = [(part, other, path) for part, path in sources() for other in imported_parts(path)]
+    assert len(found) > 50, "the search for imports found next to nothing"
+    unknown = {part for part, _ in sources()} - set(LEVEL)
+    assert not unknown, f"no layer is named for {sorted(unknown)}"
+    home = {name: module.split(".")[1] for name, module in PUBLIC.items()} | {"__version__": "checks"}
+    upward = [
+        f"{path.relative_to(ROOT)} imports {other}"
+        for part, other, path in found
+        if LEVEL[home.get(other, other)] > LEVEL[part]
+    ]
+    assert not upward, "\n".join(upward)
+
+
+def test_basics_depend_on_basics_only():
+    for name in BASICS:
+        path = PACKAGE / f"{name}.py"
+        if path.exists():
+            assert set(imported_parts(path)) <= set(BASICS), path
+
+
+@pytest.mark.parametrize("name", sorted(tomo_polysplat.__all__))
+def test_every_public_name_is_there(name):
+    assert getattr(tomo_polysplat, name) is not None
+    assert name in dir(tomo_polysplat)
+
+
+def test_a_module_does_not_hide_the_public_name_it_defines():
+    """Importing a submodule binds it in the package; one called like its function would take its place."""
+    assert not {name for name, module in PUBLIC.items() if module == f"tomo_polysplat.{name}"}
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = tomo_polysplat.nothing
+
+
+def test_every_module_can_be_imported():
+    for _, path in sources():
+        if PACKAGE in path.parents:
+            name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+            try:
+                importlib.import_module(name)
+            except ModuleNotFoundError as error:
+                assert error.name in OPTIONAL, f"{name} needs {error.name}"
+
+
+def test_every_folder_is_packaged():
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    folders = {path.parent for path in PACKAGE.rglob("*.py")}
+    for folder in folders:
+        assert f'"{".".join(folder.relative_to(ROOT).parts)}",' in text, (
+            f"{folder.name} is missing in pyproject.toml"
+        )
+    assert (PACKAGE / "py.typed").exists()
+
+
+def test_constraints_cover_every_dependency():
+    """What is installed without a pin may break an installation on any day."""
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    block = text.split("dependencies = [", 1)[1].split("]", 1)[0]
+    wanted = {line.strip().strip('",').split(">=")[0] for line in block.splitlines() if line.strip()}
+    pinned = {line.split("==")[0] for line in (ROOT / "constraints.txt").read_text().splitlines()}
+    assert len(wanted) > 8 and wanted <= pinned
