@@ -1,4 +1,4 @@
-"""Scans from files: counts, the rotation axis, round trips, and files that must be refused."""
+"""Scans from files: geometry, round trips, and files that must be refused."""
 
 import io
 import logging
@@ -7,28 +7,13 @@ import zipfile
 import h5py
 import numpy as np
 import pytest
+from discs import CENTRE, COLUMNS, ROWS, discs
 
 from tomo_polysplat.physics.spectrum import Spectrum
-from tomo_polysplat.scan.centre import estimate_centre
-from tomo_polysplat.scan.defects import attenuation, fill_invalid, flat_and_dark
 from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.scan.io import load_scan, save_scan
 from tomo_polysplat.scan.layout import vector_geometry, volume_geometry
 from tomo_polysplat.scan.scan import Scan
-
-COLUMNS, ROWS = 63, 2
-CENTRE = 27.3
-
-
-def discs(angles, columns=COLUMNS, centre=CENTRE):
-    """Closed-form parallel projections (rows, views, columns) of three discs: 2 sqrt(r^2 - distance^2)."""
-    position = np.arange(columns) + 0.5 - centre
-    sinogram = np.zeros((len(angles), columns))
-    for x, y, radius, value in ((6.0, 3.0, 9.0, 0.05), (-9.0, 4.0, 5.0, 0.1), (2.0, -11.0, 4.0, 0.2)):
-        middle = x * np.cos(angles) + y * np.sin(angles)
-        chord = radius**2 - (position[None] - middle[:, None]) ** 2
-        sinogram += value * 2 * np.sqrt(np.clip(chord, 0, None))
-    return np.stack([sinogram, 0.5 * sinogram])
 
 
 @pytest.fixture
@@ -78,71 +63,7 @@ def cone_scan(seed=3):
     )
 
 
-# Counts
-
-
-def test_counts_become_line_integrals_and_bad_rays_are_marked_and_counted():
-    lines = np.linspace(0, 4, 2 * 3 * 5).reshape(2, 3, 5)
-    white = np.full((4, 3, 5), 60000.0)
-    white[0], white[1] = 50000.0, 70000.0  # only their mean counts
-    dark = np.full((3, 5), 500.0)
-    counts = np.round(500 + 59500 * np.exp(-lines)).astype(np.uint16)
-    counts[0, 0, 0], counts[0, 1, 1], counts[1, 2, 2] = 400, 500, 65535  # below dark, no light, saturated
-    white[:, 2, 4] = 500.0  # a dead pixel: as much light as without any
-    flat, background = flat_and_dark(white, dark, (3, 5))
-    found, valid, lost = attenuation(counts, "counts", flat, background)
-    expected = np.ones((2, 3, 5), bool)
-    expected[[0, 0, 1], [0, 1, 2], [0, 1, 2]] = False
-    expected[:, 2, 4] = False
-    np.testing.assert_array_equal(valid, expected)
-    assert lost == {"not_finite": 0, "saturated": 1, "dead_pixel": 2, "no_light": 2}
-    # Rounding to whole counts is worth exp(P) / 59500 / 2 at most.
-    np.testing.assert_allclose(found[valid], lines[valid], atol=0.6 * np.exp(4) / 59500)
-    assert np.isfinite(found).all()
-
-
-def test_negative_line_integrals_of_noisy_air_are_kept():
-    found, valid, lost = attenuation(np.array([[[1.02, 0.5, np.nan]]]), "transmission")
-    np.testing.assert_allclose(found[valid], [-np.log(1.02), np.log(2)], rtol=1e-6)
-    assert valid.tolist() == [[[True, True, False]]] and lost["not_finite"] == 1
-
-
-def test_holes_are_filled_linearly_along_the_detector_row():
-    straight = np.tile(np.arange(9.0), (2, 3, 1))
-    valid = np.ones(straight.shape, bool)
-    valid[0, 1, 3:6] = valid[1, 2] = False
-    damaged = np.where(valid, straight, -77)
-    filled = fill_invalid(damaged, valid)
-    expected = straight.copy()
-    expected[1, 2] = 0
-    np.testing.assert_allclose(filled, expected)
-    assert (damaged[~valid] == -77).all(), "the input was changed"
-
-
-# Rotation axis
-
-
-@pytest.mark.parametrize(
-    "theta",
-    [
-        np.linspace(0, 180, 91),
-        np.linspace(0, 180, 90, endpoint=False),
-        np.linspace(-30, 330, 120, endpoint=False),
-        np.random.default_rng(0).permutation(np.linspace(0, 180, 61)),
-    ],
-    ids=["half turn", "last angle left out", "full turn", "shuffled"],
-)
-@pytest.mark.parametrize("centre", [CENTRE, 31.5, 38.75])
-def test_rotation_axis_is_found(theta, centre):
-    angles = np.deg2rad(theta)
-    noise = np.random.default_rng(1).normal(0, 0.01, (ROWS, len(angles), COLUMNS))
-    assert estimate_centre(discs(angles, centre=centre) + noise, angles) == pytest.approx(centre, abs=0.15)
-
-
-def test_rotation_axis_needs_opposite_views():
-    angles = np.linspace(0, 2.0, 30)
-    with pytest.raises(ValueError, match=r"half a turn apart.*centre="):
-        estimate_centre(discs(angles), angles)
+# The rotation axis in the geometry
 
 
 def test_the_axis_of_the_geometry_is_the_centre(exchange):

@@ -1,0 +1,43 @@
+"""Counts into line integrals: exact where they can be trusted, marked and counted where not."""
+
+import numpy as np
+
+from tomo_polysplat.scan.defects import attenuation, fill_invalid, flat_and_dark
+
+
+def test_counts_become_line_integrals_and_bad_rays_are_marked_and_counted():
+    lines = np.linspace(0, 4, 2 * 3 * 5).reshape(2, 3, 5)
+    white = np.full((4, 3, 5), 60000.0)
+    white[0], white[1] = 50000.0, 70000.0  # only their mean counts
+    dark = np.full((3, 5), 500.0)
+    counts = np.round(500 + 59500 * np.exp(-lines)).astype(np.uint16)
+    counts[0, 0, 0], counts[0, 1, 1], counts[1, 2, 2] = 400, 500, 65535  # below dark, no light, saturated
+    white[:, 2, 4] = 500.0  # a dead pixel: as much light as without any
+    flat, background = flat_and_dark(white, dark, (3, 5))
+    found, valid, lost = attenuation(counts, "counts", flat, background)
+    expected = np.ones((2, 3, 5), bool)
+    expected[[0, 0, 1], [0, 1, 2], [0, 1, 2]] = False
+    expected[:, 2, 4] = False
+    np.testing.assert_array_equal(valid, expected)
+    assert lost == {"not_finite": 0, "saturated": 1, "dead_pixel": 2, "no_light": 2}
+    # Rounding to whole counts is worth exp(P) / 59500 / 2 at most.
+    np.testing.assert_allclose(found[valid], lines[valid], atol=0.6 * np.exp(4) / 59500)
+    assert np.isfinite(found).all()
+
+
+def test_negative_line_integrals_of_noisy_air_are_kept():
+    found, valid, lost = attenuation(np.array([[[1.02, 0.5, np.nan]]]), "transmission")
+    np.testing.assert_allclose(found[valid], [-np.log(1.02), np.log(2)], rtol=1e-6)
+    assert valid.tolist() == [[[True, True, False]]] and lost["not_finite"] == 1
+
+
+def test_holes_are_filled_linearly_along_the_detector_row():
+    straight = np.tile(np.arange(9.0), (2, 3, 1))
+    valid = np.ones(straight.shape, bool)
+    valid[0, 1, 3:6] = valid[1, 2] = False
+    damaged = np.where(valid, straight, -77)
+    filled = fill_invalid(damaged, valid)
+    expected = straight.copy()
+    expected[1, 2] = 0
+    np.testing.assert_allclose(filled, expected)
+    assert (damaged[~valid] == -77).all(), "the input was changed"
