@@ -141,6 +141,12 @@ def test_fan_is_the_middle_of_the_cone():
     np.testing.assert_allclose(fan.projections[0], cone.projections[10], atol=1e-5)
 
 
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_plane_of_a_fan_cuts_the_metal(scene):
+    scan = simulate_scan(scene, 24, 1, geometry="fan", noise=False)
+    assert 1 < scan.metal_mask.sum() < 0.1 * scan.metal_mask.size
+
+
 @pytest.mark.parametrize(
     "wrong, words",
     [
@@ -151,6 +157,7 @@ def test_fan_is_the_middle_of_the_cone():
         ({"geometry": "spiral"}, "geometry"),
         ({"metal": "unobtainium"}, "unobtainium"),
         ({"subrays": 0}, "subrays"),
+        ({"arc_degrees": 0.0}, "arc_degrees"),
     ],
 )
 def test_mistakes_are_named(wrong, words):

@@ -62,10 +62,10 @@ def _nail() -> list[Part]:
     """Shank and head of a nail driven in from the side, and a pellet in the far wall."""
     direction = np.array([1.0, 0.35, 0.25])
     direction /= np.linalg.norm(direction)
-    centre = np.array([0.75, 0.25, -0.35])
+    centre = np.array([0.75, 0.25, -0.10])
     shapes = [
         cylinder(centre, 0.085, 1.05, direction),
         cylinder(centre + 1.05 * direction, 0.19, 0.05, direction),
-        ellipsoid((-1.45, -0.85, -0.4), 0.14),
+        ellipsoid((-1.45, -0.85, 0.05), 0.14),
     ]
     return [Part(shape, "iron", 7.87, metal=True) for shape in shapes]

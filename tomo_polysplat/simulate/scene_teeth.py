@@ -18,7 +18,7 @@ FILLED = (1, 4, 8)
 def parts() -> list[Part]:
     """The parts in cm, in order of precedence."""
     listed = [
-        *domed_cylinder((2.25, 2.05), 1.3, 0.6, "muscle", 1.05),
+        *domed_cylinder((2.25, 2.05), 1.4, 0.5, "muscle", 1.05),
         Part(cylinder((0, -0.25, 0.55), (1.05, 1.25), 0.9), "water", 1.0),
         Part(ellipsoid((0, -0.45, 0.1), (0.80, 1.15, 0.55)), "muscle", 1.07),
         *strew(
@@ -28,10 +28,10 @@ def parts() -> list[Part]:
     places = _arch(10)
     for x, y, angle in places:
         listed.append(
-            Part(ellipsoid((x, y, -0.85), (0.45, 0.42, 0.62), rotation((0, 0, 1), angle)), "bone", 1.55)
+            Part(ellipsoid((x, y, -1.14), (0.45, 0.42, 0.50), rotation((0, 0, 1), angle)), "bone", 1.55)
         )
     for x, y, angle in places:
-        alveolar = ellipsoid((x, y, -0.95), (0.34, 0.30, 0.48), rotation((0, 0, 1), angle))
+        alveolar = ellipsoid((x, y, -1.18), (0.34, 0.30, 0.38), rotation((0, 0, 1), angle))
         listed.append(Part(alveolar, "bone", 1.18))
     for n, (x, y, angle) in enumerate(places):
         listed += _tooth(x, y, angle, molar=n in (0, 1, 2, 7, 8, 9))
@@ -52,7 +52,7 @@ def _tooth(x: float, y: float, angle: float, molar: bool) -> list[Part]:
     turn = rotation((0, 0, 1), angle)
     wide, deep = (0.27, 0.25) if molar else (0.21, 0.17)
     along = turn @ np.array([0.13, 0.0, 0.0])
-    centre = np.array([x, y, 0.0])
+    centre = np.array([x, y, -0.42])
     roots = [centre - along, centre + along] if molar else [centre]
     built = [Part(ellipsoid(c + (0, 0, -0.55), (0.11, 0.13, 0.62), turn), "bone", 1.80) for c in roots]
     built.append(Part(ellipsoid(centre + (0, 0, 0.22), (wide, deep, 0.40), turn), ENAMEL, 1.9))
@@ -65,4 +65,4 @@ def _tooth(x: float, y: float, angle: float, molar: bool) -> list[Part]:
 
 def _filling(x: float, y: float, angle: float) -> Part:
     """A small inlay in the top of a crown."""
-    return Part(box((x, y, 0.44), (0.16, 0.12, 0.11), rotation((0, 0, 1), angle)), "iron", 7.87, metal=True)
+    return Part(box((x, y, 0.02), (0.16, 0.12, 0.11), rotation((0, 0, 1), angle)), "iron", 7.87, metal=True)

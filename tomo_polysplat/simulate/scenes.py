@@ -143,9 +143,9 @@ def simulate_scan(
     chosen = SCENES[require_choice("scene", scene, SCENES)]
     columns = _count("columns", -(-3 * size // 2) if columns is None else columns)
     rows = 1 if geometry == "fan" else _count("rows", -(-3 * size // 2) if rows is None else rows)
-    arc = require_number(
-        "arc_degrees", arc_degrees or (180.0 if geometry == "parallel" else 360.0), above=0.0
-    )
+    if arc_degrees is None:
+        arc_degrees = 180.0 if geometry == "parallel" else 360.0
+    arc = require_number("arc_degrees", arc_degrees, above=0.0)
     angles = np.deg2rad(arc) * np.arange(_count("views", views)) / views
     proj_geom, vol_geom = circular_orbit(geometry, chosen.half_width, size, rows, columns, angles)
     if spectrum is None:
