@@ -31,7 +31,7 @@ def parts() -> list[Part]:
     for centre, radius in HEADS:
         listed += _branches(np.array(centre), radius, generator)
     screw = cylinder((0.35, -0.30, 0.25), 0.11, 0.85, (0.25, 0.15, 1.0))
-    ball = ellipsoid((-0.95, 0.75, 0.50), 0.17)
+    ball = ellipsoid((-0.95, 0.75, 0.10), 0.17)
     return [*listed, Part(screw, "iron", 7.87, metal=True), Part(ball, "iron", 7.87, metal=True)]
 
 
