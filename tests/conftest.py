@@ -1,0 +1,20 @@
+"""What every test folder shares: which devices there are, and GPU tests that cannot vanish unnoticed."""
+
+import os
+
+import pytest
+import torch
+
+
+def pytest_runtest_setup(item):
+    if item.get_closest_marker("gpu") is None or torch.cuda.is_available():
+        return
+    if os.environ.get("POLYSPLAT_REQUIRE_GPU") == "1":
+        pytest.fail("POLYSPLAT_REQUIRE_GPU=1, but torch finds no CUDA device", pytrace=False)
+    pytest.skip("needs a CUDA device")
+
+
+@pytest.fixture(scope="session")
+def devices() -> list[torch.device]:
+    """Every device of this machine, CPU first."""
+    return [torch.device("cpu"), *(torch.device("cuda", k) for k in range(torch.cuda.device_count()))]
