@@ -66,7 +66,8 @@ def availability(name: str, device_type: str) -> tuple[bool, str]:
         error = _self_check(name, device_type)
     except Exception as problem:  # a broken compiler or driver can raise anything; it must not end the run
         logger.debug("self-check of %s failed", name, exc_info=True)
-        return False, f"self-check raised {type(problem).__name__}: {str(problem).splitlines()[0][:120]}"
+        message = f"{type(problem).__name__}: {problem}".splitlines()[0]
+        return False, f"self-check raised {message[:150].rstrip(' :')}"
     if not error < _SELF_CHECK_TOLERANCE:
         return False, f"self-check differs from the reference by {error:.1e}"
     return True, f"compiled, self-check within {error:.0e} of the reference"

@@ -65,7 +65,7 @@ def project(
     for view in range(len(views)):
         one = views.select([view])
         image = torch.zeros((len(weight), views.rows, views.columns), **like)
-        for start in range(0, len(position), chunk):
+        for start in range(0, max(1, len(position)), chunk):
             part = slice(start, start + chunk)
             kernel, left_out = _one_view(position[part], whiten[part], scale[part], one, cutoff)
             image = image + torch.einsum("kn,nij->kij", weight[:, part], kernel)

@@ -31,7 +31,7 @@ def voxelise(
     whiten = whitening_matrices(scale, rotation)
     volume = torch.zeros((len(weight), len(centres)), **like)
     chunk = max(1, _PAIRS_AT_ONCE // max(1, len(centres)))
-    for start in range(0, len(position), chunk):
+    for start in range(0, max(1, len(position)), chunk):
         part = slice(start, start + chunk)
         offset = centres[None] - position[part, None]
         squared = torch.einsum("nab,nvb->nva", whiten[part], offset).square().sum(-1)
