@@ -12,8 +12,8 @@ _BITS = 10  # cells an axis: 1024
 def spatial_order(position: torch.Tensor) -> torch.Tensor:
     """Permutation (n,) int64 along a Morton (Z-order) curve through the bounding box of ``position`` (n, 3).
 
-    The CUDA kernels look for Gaussians by groups of neighbours in the list, so a model kept in this order runs
-    fast; sort it again whenever Gaussians are added or have moved far.
+    The CUDA kernels look for Gaussians by groups of neighbours in the list, so a model kept in this order
+    runs fast; sort it again whenever Gaussians are added or have moved far.
     """
     if not len(position):
         return torch.zeros(0, dtype=torch.int64, device=position.device)

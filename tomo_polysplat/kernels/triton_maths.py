@@ -1,7 +1,7 @@
 """Steps shared by the Triton kernels: scale and rotation to the whitening matrix and back, bit sets of lanes.
 
-The set-up of a Gaussian runs in float64 (its differences and cross products cancel), the sums over its pixels
-or voxels in float32.
+The set-up of a Gaussian runs in float64 (its differences and cross products cancel), the sums over its
+pixels or voxels in float32.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ __all__ = [
 
 # Gaussians next to each other in the list that share one bounding box; also the width of a set of lanes.
 GROUP = 32
-# exp(-q / 2) = 2^-(HALF_LOG2E q): the kernels carry q scaled so, because the hardware's exponential has base 2.
+# exp(-q / 2) = 2^-(HALF_LOG2E q): the kernels carry q scaled so, as the hardware's exponential has base 2.
 HALF_LOG2E = 0.7213475204444817
 
 
@@ -40,7 +40,8 @@ def on_device(tensor: torch.Tensor):
 
 def require_scene(position, scale, rotation, weight) -> None:
     """Raise ValueError unless all are float32 and ``weight`` has one to four channels."""
-    for name, tensor in (("position", position), ("scale", scale), ("rotation", rotation), ("weight", weight)):
+    scene = {"position": position, "scale": scale, "rotation": rotation, "weight": weight}
+    for name, tensor in scene.items():
         if tensor.dtype != torch.float32:
             raise fail(name, "a float32 tensor for the triton kernel", str(tensor.dtype))
     if not 1 <= len(weight) <= 4:

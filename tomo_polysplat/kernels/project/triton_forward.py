@@ -1,8 +1,8 @@
 """The projection on CUDA: every tile of pixels gathers the Gaussians that reach it.
 
-A tile finds them through the bounding boxes of groups of neighbours in the list, then through their outlines, so
-the order of the sum is that of the list: no atomics, the same bits on every run. The search is quick when Gaussians
-near in the list are near in space.
+A tile finds them through the bounding boxes of groups of neighbours in the list, then through their
+outlines, so the order of the sum is that of the list: no atomics, the same bits on every run. The search is
+quick when Gaussians near in the list are near in space.
 """
 
 from __future__ import annotations
@@ -15,20 +15,26 @@ from tomo_polysplat.kernels.project.triton_setup import RECORD
 from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, lane_set, lowest_lane, on_device
 from tomo_polysplat.kernels.views import DetectorViews
 
-__all__ = ["TILE", "footprint_value", "gather_image"]
+__all__ = ["TILE", "footprint_value", "gather_image", "squared_length"]
 
 TILE = (8, 16)  # rows and columns of a tile, handled by one warp
-_PROGRAMS = 1 << 14  # enough to even out the tiles' different loads: fewer tiles are shared by several programs
+_PROGRAMS = 1 << 14  # enough to even out the tiles' loads; fewer tiles are each shared by several programs
 _MOST_PARTS = 8
 
 
 @triton.jit
-def footprint_value(x, y, r11, r12, r22, lx, ly, lxx, lxy, lyy, cut, CONE: tl.constexpr):
-    """2^-q / sqrt(l) within the cut, zero beyond, then -q and 1 / l; see triton_setup."""
+def squared_length(x, y, lx, ly, lxx, lxy, lyy):
+    """l of a pixel: |e|^2 in units of its value at the projected centre; see triton_setup."""
+    return (1.0 + y * (ly + lyy * y)) + x * ((lx + lxy * y) + lxx * x)
+
+
+@triton.jit
+def footprint_value(x, y, r11, r12, r22, length, cut, CONE: tl.constexpr):
+    """2^-q / sqrt(l) within the cut, zero beyond, then -q and 1 / l, of pixels with l = ``length``."""
     t, up = r11 * x + r12 * y, r22 * y
     minus = -(t * t + up * up)
     if CONE:
-        root = tl.math.rsqrt((1.0 + y * (ly + lyy * y)) + x * ((lx + lxy * y) + lxx * x))
+        root = tl.math.rsqrt(length)
         inverse = root * root
         minus *= inverse
         value = tl.exp2(minus) * root
@@ -40,7 +46,7 @@ def footprint_value(x, y, r11, r12, r22, lx, ly, lxx, lxy, lyy, cut, CONE: tl.co
 
 @triton.jit
 def _reaches(ellipse, n, count, left, right, top, bottom):
-    """Whether the outlines of the Gaussians ``n`` meet a tile: their extreme columns within the tile's rows."""
+    """Whether the outlines of the Gaussians ``n``, within the rows of a tile, reach its columns."""
     live = n < count
     yc = tl.load(ellipse + n, mask=live, other=0.0)
     ry = tl.load(ellipse + count + n, mask=live, other=-1.0)
@@ -61,8 +67,8 @@ def _reaches(ellipse, n, count, left, right, top, bottom):
 @triton.jit
 def _gather_kernel(
     record, ellipse, boxes, image, count, groups, rows, columns, cut,
-    CHANNELS: tl.constexpr, CONE: tl.constexpr, TILE_H: tl.constexpr, TILE_W: tl.constexpr, PARTS: tl.constexpr,
-    GROUP: tl.constexpr,
+    CHANNELS: tl.constexpr, CONE: tl.constexpr, TILE_H: tl.constexpr, TILE_W: tl.constexpr,
+    PARTS: tl.constexpr, GROUP: tl.constexpr,
 ):  # fmt: skip
     across = tl.cdiv(columns, TILE_W)
     left, top = (tl.program_id(0) % across) * TILE_W, (tl.program_id(0) // across) * TILE_H
@@ -81,7 +87,8 @@ def _gather_kernel(
     lx, ly, lxx, lxy, lyy = 0.0, 0.0, 0.0, 0.0, 0.0
     for first in range(part * GROUP, groups, PARTS * GROUP):
         box, known = boxes + first + lane, first + lane < groups
-        meets = (tl.load(box, mask=known, other=0.0) <= x1) & (tl.load(box + groups, mask=known, other=0.0) >= x0)
+        meets = tl.load(box, mask=known, other=0.0) <= x1
+        meets &= tl.load(box + groups, mask=known, other=0.0) >= x0
         meets &= tl.load(box + 2 * groups, mask=known, other=0.0) <= y1
         meets &= tl.load(box + 3 * groups, mask=known, other=0.0) >= y0
         near = lane_set(meets & known, lane)
@@ -97,7 +104,9 @@ def _gather_kernel(
                 if CONE:
                     lx, ly = tl.load(at + 5), tl.load(at + 6)
                     lxx, lxy, lyy = tl.load(at + 7), tl.load(at + 8), tl.load(at + 9)
-                value, _, _ = footprint_value(x, y, r11, r12, r22, lx, ly, lxx, lxy, lyy, cut, CONE)
+                value, _, _ = footprint_value(
+                    x, y, r11, r12, r22, squared_length(x, y, lx, ly, lxx, lxy, lyy), cut, CONE
+                )
                 sum0 += tl.load(at + 11) * value
                 if CHANNELS > 1:
                     sum1 += tl.load(at + 12) * value
@@ -108,16 +117,21 @@ def _gather_kernel(
     views = tl.num_programs(1) // PARTS
     inside = (i[:, None] < rows) & (j[None, :] < columns)
     # image: (parts, channels, views, rows, columns)
-    plane = image + ((part * CHANNELS).to(tl.int64) * views + view) * rows * columns
-    pixel = i[:, None].to(tl.int64) * columns + j[None, :]
     stride = views.to(tl.int64) * rows * columns
-    tl.store(plane + pixel, sum0, mask=inside)
+    pixel = (
+        image
+        + part * CHANNELS * stride
+        + view * rows * columns
+        + i[:, None].to(tl.int64) * columns
+        + j[None, :]
+    )
+    tl.store(pixel, sum0, mask=inside)
     if CHANNELS > 1:
-        tl.store(plane + stride + pixel, sum1, mask=inside)
+        tl.store(pixel + stride, sum1, mask=inside)
     if CHANNELS > 2:
-        tl.store(plane + 2 * stride + pixel, sum2, mask=inside)
+        tl.store(pixel + 2 * stride, sum2, mask=inside)
     if CHANNELS > 3:
-        tl.store(plane + 3 * stride + pixel, sum3, mask=inside)
+        tl.store(pixel + 3 * stride, sum3, mask=inside)
 
 
 def gather_image(record, ellipse, boxes, channels: int, views: DetectorViews, cutoff: float) -> torch.Tensor:

@@ -1,15 +1,16 @@
 """The projection of Gaussians on CUDA, as a differentiable torch operation. README.md derives the formulas.
 
-Forward and backward are deterministic; see triton_forward.py and triton_backward.py. Gaussians that are near in
-space should be near in the list (``kernels.spatial_order``): that changes the speed, not the result.
+Forward and backward are deterministic; see triton_forward.py and triton_backward.py. Gaussians that are near
+in space should be near in the list (``kernels.spatial_order``): that changes the speed, not the result.
 """
 
 from __future__ import annotations
 
 import torch
 
-from tomo_polysplat.kernels.project.triton_backward import pull_back, sum_moments
+from tomo_polysplat.kernels.project.triton_backward import sum_moments
 from tomo_polysplat.kernels.project.triton_forward import gather_image
+from tomo_polysplat.kernels.project.triton_pull_back import pull_back
 from tomo_polysplat.kernels.project.triton_setup import footprints, view_table
 from tomo_polysplat.kernels.triton_maths import require_scene
 from tomo_polysplat.kernels.views import DetectorViews
@@ -45,19 +46,22 @@ def project(
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx, position, scale, rotation, weight, views, cutoff):
-        scene = tuple(t.detach().contiguous() for t in (position, scale, rotation, weight))
+        position, scale, rotation, weight = (
+            t.detach().contiguous() for t in (position, scale, rotation, weight)
+        )
         table = view_table(views, position.device)
-        record, ellipse, boxes, skipped = footprints(*scene, views, table, cutoff)
+        record, ellipse, boxes, skipped = footprints(position, scale, rotation, weight, views, table, cutoff)
         image = gather_image(record, ellipse, boxes, len(weight), views, cutoff)
-        ctx.save_for_backward(*scene, table, record, ellipse)
+        ctx.save_for_backward(position, scale, rotation, weight, table, record, ellipse)
         ctx.views, ctx.cutoff = views, cutoff
         ctx.mark_non_differentiable(skipped)
         return image, skipped
 
     @staticmethod
     def backward(ctx, grad_image, _):
-        *scene, table, record, ellipse = ctx.saved_tensors
+        position, scale, rotation, weight, table, record, ellipse = ctx.saved_tensors
         if not record.numel():
-            return (*map(torch.zeros_like, scene), None, None)
+            return (*map(torch.zeros_like, (position, scale, rotation, weight)), None, None)
         moments = sum_moments(record, ellipse, grad_image, ctx.views, ctx.cutoff)
-        return (*pull_back(*scene, table, ctx.views, record, ellipse, moments), None, None)
+        grads = pull_back(position, scale, rotation, weight, table, ctx.views, record, ellipse, moments)
+        return (*grads, None, None)

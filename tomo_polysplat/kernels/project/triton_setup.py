@@ -1,4 +1,6 @@
-"""Footprints: what the Triton kernels need of a Gaussian in a view, computed once. README.md has the formulas.
+"""Footprints: what the Triton kernels need of a Gaussian in a view, computed once.
+
+README.md has the formulas.
 
 ``record`` (views, count, 16) holds for one Gaussian at a time, with x and y counted from the projected centre
 
@@ -8,10 +10,10 @@
 * 10: 1 / |e_centre|;
 * 11-14: the weights, times 1 / |e_centre|.
 
-``ellipse`` (views, 5, count) holds the outline where the Gaussian is cut, for many Gaussians at a time: row yc and
-half-height ry, column xc, slope m and half-width hx with |column - xc - m (row - yc)| <= hx sqrt(1 - ((row - yc) /
-ry)^2); ry = -1 where there is none. ``boxes`` (views, 4, groups) are the bounding boxes (columns, rows) of GROUP
-neighbours in the list.
+``ellipse`` (views, 5, count) holds the outline where the Gaussian is cut, for many Gaussians at a time: row
+yc and half-height ry, column xc, slope m and half-width hx with
+|column - xc - m (row - yc)| <= hx sqrt(1 - ((row - yc) / ry)^2); ry = -1 where there is none. ``boxes``
+(views, 4, groups) are the bounding boxes, columns then rows, of GROUP neighbours in the list.
 """
 
 from __future__ import annotations
@@ -35,9 +37,10 @@ _BLOCK = 128
 
 
 def view_table(views: DetectorViews, device: torch.device) -> torch.Tensor:
-    """(views, 21) float64 origin, inverse and matrix. A pageable copy this small does not wait for the device."""
+    """(views, 21) float64 origin, inverse and matrix."""
     count = len(views)
     parts = [views.origin, views.inverse.reshape(count, 9), views.matrix.reshape(count, 9)]
+    # From ordinary memory the copy is staged at once: it neither waits for the device nor races with numpy.
     return torch.from_numpy(np.concatenate(parts, axis=1)).to(device, non_blocking=True)
 
 
@@ -51,6 +54,11 @@ def whitening(scale, rotation, n, live):
     return (
         w00 / s0, w01 / s0, w02 / s0, w10 / s1, w11 / s1, w12 / s1, w20 / s2, w21 / s2, w22 / s2, s0, s1, s2,
     )  # fmt: skip
+
+
+@triton.jit
+def _apply(w00, w01, w02, w10, w11, w12, w20, w21, w22, x, y, z):
+    return dot(w00, w01, w02, x, y, z), dot(w10, w11, w12, x, y, z), dot(w20, w21, w22, x, y, z)
 
 
 @triton.jit
@@ -76,13 +84,14 @@ def chain(position, n, live, view, w00, w01, w02, w10, w11, w12, w20, w21, w22, 
         r2 = kappa * tl.load(view + 20)
     u0, u1, u2 = tl.load(view + 12), tl.load(view + 15), tl.load(view + 18)
     v0, v1, v2 = tl.load(view + 13), tl.load(view + 16), tl.load(view + 19)
-    w0, w1, w2 = dot(w00, w01, w02, r0, r1, r2), dot(w10, w11, w12, r0, r1, r2), dot(w20, w21, w22, r0, r1, r2)
-    a0, a1, a2 = dot(w00, w01, w02, u0, u1, u2), dot(w10, w11, w12, u0, u1, u2), dot(w20, w21, w22, u0, u1, u2)
-    b0, b1, b2 = dot(w00, w01, w02, v0, v1, v2), dot(w10, w11, w12, v0, v1, v2), dot(w20, w21, w22, v0, v1, v2)
+    w0, w1, w2 = _apply(w00, w01, w02, w10, w11, w12, w20, w21, w22, r0, r1, r2)
+    a0, a1, a2 = _apply(w00, w01, w02, w10, w11, w12, w20, w21, w22, u0, u1, u2)
+    b0, b1, b2 = _apply(w00, w01, w02, w10, w11, w12, w20, w21, w22, v0, v1, v2)
     nu0, nu1, nu2 = cross(w0, w1, w2, a0, a1, a2)
     nv0, nv1, nv2 = cross(w0, w1, w2, b0, b1, b2)
     return (
-        depth, kappa, column, row, r0, r1, r2, w0, w1, w2, a0, a1, a2, b0, b1, b2, nu0, nu1, nu2, nv0, nv1, nv2,
+        depth, kappa, column, row, r0, r1, r2, w0, w1, w2, a0, a1, a2, b0, b1, b2,
+        nu0, nu1, nu2, nv0, nv1, nv2,
     )  # fmt: skip
 
 
@@ -98,8 +107,8 @@ def _turned(w0, w1, w2, c0, c1, c2, s):
 def _outline(cut, r11, r12, r22, lc, lx, ly, lxx, lxy, lyy, PLANAR: tl.constexpr):
     """yc, ry, xc, m, hx relative to the projected centre, and where they exist.
 
-    Along a row the cut is where a x^2 + 2 b x + c = 0 with b linear and c quadratic in y, so its middle is linear
-    in y and the square of its half-width is a parabola.
+    Along a row the cut is where a x^2 + 2 b x + c = 0 with b linear and c quadratic in y, so its middle is
+    linear in y and the square of its half-width is a parabola.
     """
     a = r11 * r11 - cut * lxx
     b0, b1 = -cut * lx, r11 * r12 - cut * lxy
@@ -145,16 +154,18 @@ def _store_outline(ellipse, boxes, view, n, live, count, groups, yc, ry, xc, m, 
 @triton.jit
 def _footprint_kernel(
     position, scale, rotation, weight, views, record, ellipse, boxes, skipped, count, groups, cutoff,
-    CHANNELS: tl.constexpr, CONE: tl.constexpr, PLANAR: tl.constexpr, BLOCK: tl.constexpr, GROUP: tl.constexpr,
+    CHANNELS: tl.constexpr, CONE: tl.constexpr, PLANAR: tl.constexpr, BLOCK: tl.constexpr,
+    GROUP: tl.constexpr,
 ):  # fmt: skip
     n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     view = tl.program_id(1).to(tl.int64)
     live = n < count
     at = views + view * VIEW
     w00, w01, w02, w10, w11, w12, w20, w21, w22, s0, s1, s2 = whitening(scale, rotation, n, live)
-    (depth, kappa, column, row, r0, r1, r2, w0, w1, w2, a0, a1, a2, b0, b1, b2, nu0, nu1, nu2, nv0, nv1, nv2) = chain(
-        position, n, live, at, w00, w01, w02, w10, w11, w12, w20, w21, w22, CONE
-    )
+    (
+        depth, kappa, column, row, r0, r1, r2, w0, w1, w2, a0, a1, a2, b0, b1, b2,
+        nu0, nu1, nu2, nv0, nv1, nv2,
+    ) = chain(position, n, live, at, w00, w01, w02, w10, w11, w12, w20, w21, w22, CONE)  # fmt: skip
     valid = live
     if CONE:
         # The cut Gaussian must lie in front of the source plane: its half-width in depth is |S R^T c_row|.
@@ -207,7 +218,7 @@ def _footprint_kernel(
 
 
 def footprints(position, scale, rotation, weight, views: DetectorViews, table: torch.Tensor, cutoff: float):
-    """``record``, ``ellipse``, ``boxes`` of the module docstring and the number of skipped pairs (0-dim int64)."""
+    """``record``, ``ellipse``, ``boxes`` of the module docstring; number of skipped pairs, 0-dim int64."""
     count, groups, many = len(position), triton.cdiv(len(position), GROUP), len(views)
     record = position.new_empty((many, count, RECORD.value))
     ellipse = position.new_empty((many, 5, count))
@@ -216,7 +227,8 @@ def footprints(position, scale, rotation, weight, views: DetectorViews, table: t
     if count and many:
         with on_device(position):
             _footprint_kernel[(triton.cdiv(count, _BLOCK), many)](
-                position, scale, rotation, weight, table, record, ellipse, boxes, skipped, count, groups, cutoff,
-                CHANNELS=len(weight), CONE=views.cone, PLANAR=views.planar, BLOCK=_BLOCK, GROUP=GROUP, num_warps=4,
+                position, scale, rotation, weight, table, record, ellipse, boxes, skipped, count, groups,
+                cutoff, CHANNELS=len(weight), CONE=views.cone, PLANAR=views.planar, BLOCK=_BLOCK, GROUP=GROUP,
+                num_warps=4,
             )  # fmt: skip
     return record, ellipse, boxes, skipped

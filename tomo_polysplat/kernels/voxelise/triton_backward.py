@@ -1,7 +1,7 @@
 """The adjoint of voxelising on CUDA: every Gaussian gathers the gradients of its voxels, without atomics.
 
-One warp sums over the voxels of a Gaussian (``moments``); a second kernel, with one lane a Gaussian, takes these sums
-back to position, scale and rotation.
+One warp sums over the voxels of a Gaussian (``moments``); a second kernel, with one lane a Gaussian, takes
+these sums back to position, scale and rotation.
 """
 
 from __future__ import annotations
@@ -32,12 +32,11 @@ def _indices(centre, half, length):
 
 @triton.jit
 def _moments_kernel(
-    record, grad, moments, count, nz, ny, nx, cut,
+    record, grad, moments, count, nz, ny, nx, stride, cut,
     CHANNELS: tl.constexpr, BLOCK_H: tl.constexpr, BLOCK_W: tl.constexpr, RUN: tl.constexpr,
 ):  # fmt: skip
     down, across = tl.arange(0, BLOCK_H)[:, None], tl.arange(0, BLOCK_W)[None, :]
     zero = tl.zeros([BLOCK_H, BLOCK_W], tl.float32)
-    stride = nz.to(tl.int64) * ny * nx
     w1, w2, w3 = 0.0, 0.0, 0.0
     at = record + tl.program_id(0).to(tl.int64) * RUN * RECORD
     to = moments + tl.program_id(0).to(tl.int64) * RUN * _MOMENTS
@@ -67,7 +66,8 @@ def _moments_kernel(
             spread = tl.sqrt(tl.maximum(cut - rest, 0.0)) / r11 + 0.01
             start = tl.minimum(tl.maximum(xc - shift / r11 - spread, 0.0), nx + 0.0)
             start = tl.math.ceil(start).to(tl.int32)
-            widest = tl.max(tl.max(tl.where(known & (rest <= cut), tl.minimum(2 * spread, nx - 1.0), -1.0), 1), 0)
+            wide = tl.where(known & (rest <= cut), tl.minimum(2 * spread, nx - 1.0), -1.0)
+            widest = tl.max(tl.max(wide, 1), 0)
             at_line = grad + (iz.to(tl.int64) * ny + iy) * nx
             h0, h1, h2 = zero, zero, zero
             for step in range(0, tl.math.floor(widest).to(tl.int32) + 1, BLOCK_W):
@@ -85,11 +85,11 @@ def _moments_kernel(
                     total += w1 * g
                     c1 += g * value
                 if CHANNELS > 2:
-                    g = tl.load(at_line + 2 * stride + j, mask=inside, other=0.0)
+                    g = tl.load(at_line + stride + stride + j, mask=inside, other=0.0)
                     total += w2 * g
                     c2 += g * value
                 if CHANNELS > 3:
-                    g = tl.load(at_line + 3 * stride + j, mask=inside, other=0.0)
+                    g = tl.load(at_line + stride + stride + stride + j, mask=inside, other=0.0)
                     total += w3 * g
                     c3 += g * value
                 h = total * value
@@ -127,13 +127,17 @@ def _moments_kernel(
 
 
 def sum_moments(record, grad_volume: torch.Tensor, box: VoxelBox, cutoff: float) -> torch.Tensor:
-    """(count, 16) sums over each ellipsoid's voxels: of h times (x, y, z, xx, xy, xz, yy, yz, zz) from the centre, in
-    voxels, with h = -2 dL/d(distance^2), and from 12 on of f dL/df by channel."""
+    """(count, 16) sums over the voxels of each ellipsoid, with x, y, z from its centre in voxels.
+
+    First of h (x, y, z, x^2, xy, xz, y^2, yz, z^2) with dL/d(distance^2) = -h / 2, from 12 of f dL/df by
+    channel.
+    """
     moments = record.new_empty((len(record), _MOMENTS.value))
+    grad = grad_volume.contiguous()
     with on_device(record):
         _moments_kernel[(triton.cdiv(len(record), _RUN),)](
-            record, grad_volume.contiguous(), moments, len(record), *box.shape, cutoff * cutoff * HALF_LOG2E,
-            CHANNELS=len(grad_volume), BLOCK_H=BLOCK[0], BLOCK_W=BLOCK[1], RUN=_RUN, num_warps=1, num_stages=1,
+            record, grad, moments, len(record), *box.shape, grad.stride(0), cutoff * cutoff * HALF_LOG2E,
+            CHANNELS=len(grad), BLOCK_H=BLOCK[0], BLOCK_W=BLOCK[1], RUN=_RUN, num_warps=1, num_stages=1,
         )  # fmt: skip
     return moments
 
@@ -143,7 +147,9 @@ def _row_gradient(a0, a1, a2, x, y, z, xx, xy, xz, yy, yz, zz, t0, t1, t2, s, sx
     """One row of dL/dW, and what the row of W adds to dL/dposition."""
     ahead = dot(a0, a1, a2, x, y, z)
     return (
-        -dot(a0, a1, a2, xx, xy, xz) * sx, -dot(a0, a1, a2, xy, yy, yz) * sy, -dot(a0, a1, a2, xz, yz, zz) * sz,
+        -dot(a0, a1, a2, xx, xy, xz) * sx,
+        -dot(a0, a1, a2, xy, yy, yz) * sy,
+        -dot(a0, a1, a2, xz, yz, zz) * sz,
         ahead * t0 / s, ahead * t1 / s, ahead * t2 / s,
     )  # fmt: skip
 
@@ -186,8 +192,9 @@ def _pull_back_kernel(
     for k in tl.static_range(CHANNELS):
         tl.store(grad_weight + k * count + n, tl.load(at + 12 + k, mask=live, other=0.0), mask=live)
     whitening_adjoint(
-        scale, rotation, n, live, t00 / s0, t01 / s0, t02 / s0, t10 / s1, t11 / s1, t12 / s1, t20 / s2, t21 / s2,
-        t22 / s2, g00, g01, g02, g10, g11, g12, g20, g21, g22, grad_scale, grad_rotation,
+        scale, rotation, n, live,
+        t00 / s0, t01 / s0, t02 / s0, t10 / s1, t11 / s1, t12 / s1, t20 / s2, t21 / s2, t22 / s2,
+        g00, g01, g02, g10, g11, g12, g20, g21, g22, grad_scale, grad_rotation,
     )  # fmt: skip
 
 

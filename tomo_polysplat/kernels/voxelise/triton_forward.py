@@ -1,7 +1,7 @@
 """Voxelising on CUDA: every brick of voxels gathers the Gaussians that reach it.
 
-As in the projection, a brick finds them through the bounding boxes of groups of neighbours in the list, so there are
-no atomics and every run gives the same bits.
+As in the projection, a brick finds them through the bounding boxes of groups of neighbours in the list, so
+there are no atomics and every run gives the same bits.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ BRICK = (4, 4, 8)  # slices, rows and columns of a brick, handled by one warp
 def _reaches(shape, n, count, x, y, z, cut, WIDE: tl.constexpr, HIGH: tl.constexpr, DEEP: tl.constexpr):
     """Whether the ellipsoids of the Gaussians ``n`` can meet the brick centred at (x, y, z).
 
-    Seen along the line from the ellipsoid's centre to the brick's, in units where the ellipsoid is a ball of radius
-    sqrt(cut), they do not when the ball ends before the brick begins.
+    Seen along the line from the ellipsoid's centre to the brick's, in units where the ellipsoid is a ball of
+    radius sqrt(cut), they do not when the ball ends before the brick begins.
     """
     live = n < count
     x -= tl.load(shape + n, mask=live, other=0.0)
@@ -46,7 +46,7 @@ def _reaches(shape, n, count, x, y, z, cut, WIDE: tl.constexpr, HIGH: tl.constex
 
 @triton.jit
 def _gather_kernel(
-    record, shape, boxes, volume, count, groups, nz, ny, nx, cut,
+    record, shape, boxes, volume, count, groups, nz, ny, nx, stride, cut,
     CHANNELS: tl.constexpr, DEEP: tl.constexpr, HIGH: tl.constexpr, WIDE: tl.constexpr, GROUP: tl.constexpr,
 ):  # fmt: skip
     across, down = tl.cdiv(nx, WIDE), tl.cdiv(ny, HIGH)
@@ -91,14 +91,16 @@ def _gather_kernel(
                     sum3 += tl.load(at + 15) * value
     inside = ((iz < nz) & (iy < ny))[:, None] & (ix < nx)[None, :]
     voxel = volume + ((iz.to(tl.int64) * ny + iy) * nx)[:, None] + ix[None, :]
-    stride = nz.to(tl.int64) * ny * nx
     tl.store(voxel, sum0, mask=inside)
     if CHANNELS > 1:
-        tl.store(voxel + stride, sum1, mask=inside)
+        voxel += stride
+        tl.store(voxel, sum1, mask=inside)
     if CHANNELS > 2:
-        tl.store(voxel + 2 * stride, sum2, mask=inside)
+        voxel += stride
+        tl.store(voxel, sum2, mask=inside)
     if CHANNELS > 3:
-        tl.store(voxel + 3 * stride, sum3, mask=inside)
+        voxel += stride
+        tl.store(voxel, sum3, mask=inside)
 
 
 def gather_volume(record, shape, boxes, channels: int, box: VoxelBox, cutoff: float) -> torch.Tensor:
@@ -111,7 +113,8 @@ def gather_volume(record, shape, boxes, channels: int, box: VoxelBox, cutoff: fl
     if bricks:
         with on_device(record):
             _gather_kernel[(bricks,)](
-                record, shape, boxes, volume, count, boxes.shape[1], nz, ny, nx, cutoff * cutoff * HALF_LOG2E,
-                CHANNELS=channels, DEEP=BRICK[0], HIGH=BRICK[1], WIDE=BRICK[2], GROUP=GROUP, num_warps=1, num_stages=1,
+                record, shape, boxes, volume, count, boxes.shape[1], nz, ny, nx, volume.stride(0),
+                cutoff * cutoff * HALF_LOG2E, CHANNELS=channels, DEEP=BRICK[0], HIGH=BRICK[1], WIDE=BRICK[2],
+                GROUP=GROUP, num_warps=1, num_stages=1,
             )  # fmt: skip
     return volume

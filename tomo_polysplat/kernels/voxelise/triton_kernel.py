@@ -1,7 +1,7 @@
-"""Gaussians sampled at voxel centres on CUDA, as a differentiable torch operation. README.md derives the formulas.
+"""Gaussians sampled at voxel centres on CUDA, as a differentiable torch operation.
 
-Forward and backward are deterministic. Gaussians that are near in space should be near in the list
-(``kernels.spatial_order``): that changes the speed, not the result.
+README.md derives the formulas. Forward and backward are deterministic. Gaussians that are near in space
+should be near in the list (``kernels.spatial_order``): that changes the speed, not the result.
 """
 
 from __future__ import annotations
@@ -43,17 +43,19 @@ def voxelise(
 class _Voxelise(torch.autograd.Function):
     @staticmethod
     def forward(ctx, position, scale, rotation, weight, box, cutoff):
-        scene = tuple(t.detach().contiguous() for t in (position, scale, rotation, weight))
+        position, scale, rotation, weight = (
+            t.detach().contiguous() for t in (position, scale, rotation, weight)
+        )
         table = box_table(box, position.device)
-        record, shape, boxes = ellipsoids(*scene, table, cutoff)
-        ctx.save_for_backward(*scene, table, record)
+        record, shape, boxes = ellipsoids(position, scale, rotation, weight, table, cutoff)
+        ctx.save_for_backward(position, scale, rotation, weight, table, record)
         ctx.box, ctx.cutoff = box, cutoff
         return gather_volume(record, shape, boxes, len(weight), box, cutoff)
 
     @staticmethod
     def backward(ctx, grad_volume):
-        *scene, table, record = ctx.saved_tensors
+        position, scale, rotation, weight, table, record = ctx.saved_tensors
         if not (len(record) and grad_volume.numel()):
-            return (*map(torch.zeros_like, scene), None, None)
+            return (*map(torch.zeros_like, (position, scale, rotation, weight)), None, None)
         moments = sum_moments(record, grad_volume, ctx.box, ctx.cutoff)
-        return (*pull_back(*scene, table, moments), None, None)
+        return (*pull_back(position, scale, rotation, weight, table, moments), None, None)

@@ -1,11 +1,14 @@
-"""Ellipsoids: what the Triton kernels need of a Gaussian in a grid of voxels, computed once. README.md has the formulas.
+"""Ellipsoids: what the Triton kernels need of a Gaussian in a grid of voxels, computed once.
+
+README.md has the formulas.
 
 With x, y, z counted in voxels from the Gaussian's centre, q = HALF_LOG2E times the squared distance is
 (r11 x + r12 y + r13 z)^2 + (r22 y + r23 z)^2 + (r33 z)^2.
 
-``record`` (count, 16): 0-2 the centre (x, y, z) in voxels; 3-8 r11, r12, r13, r22, r23, r33; 9-11 the half-widths of
-the bounding box along x, y, z; 12-15 the weights. ``shape`` (9, count): its first nine, for many Gaussians at a time.
-``boxes`` (6, groups): lower and upper x, y, z of the bounding boxes of GROUP neighbours in the list.
+``record`` (count, 16): 0-2 the centre (x, y, z) in voxels; 3-8 r11, r12, r13, r22, r23, r33; 9-11 the
+half-widths of the bounding box along x, y, z; 12-15 the weights. ``shape`` (9, count): its first nine, for
+many Gaussians at a time. ``boxes`` (6, groups): lower and upper x, y, z of the bounding boxes of GROUP
+neighbours in the list.
 """
 
 from __future__ import annotations
@@ -27,7 +30,7 @@ _BLOCK = 128
 
 
 def box_table(box: VoxelBox, device: torch.device) -> torch.Tensor:
-    """(6,) float64 first centre and spacing. A pageable copy this small does not wait for the device."""
+    """(6,) float64 first centre and spacing; copied without waiting for the device."""
     table = np.concatenate([box.first, box.spacing]).astype(np.float64)
     return torch.from_numpy(table).to(device, non_blocking=True)
 
@@ -67,12 +70,12 @@ def _store_axis(record, shape, boxes, n, live, count, groups, axis, centre, half
     tl.store(record + n * RECORD + axis, centre.to(tl.float32), mask=live)
     tl.store(record + n * RECORD + 9 + axis, half.to(tl.float32), mask=live)
     tl.store(shape + axis * count + n, centre.to(tl.float32), mask=live)
-    low = tl.where(live, centre - half, float("inf"))
-    high = tl.where(live, centre + half, -float("inf"))
-    g = tl.program_id(0) * (BLOCK // GROUP) + tl.arange(0, BLOCK // GROUP)
     split: tl.constexpr = [BLOCK // GROUP, GROUP]
-    tl.store(boxes + axis * groups + g, tl.min(tl.reshape(low, split), 1).to(tl.float32), mask=g < groups)
-    tl.store(boxes + (3 + axis) * groups + g, tl.max(tl.reshape(high, split), 1).to(tl.float32), mask=g < groups)
+    low = tl.min(tl.reshape(tl.where(live, centre - half, float("inf")), split), 1)
+    high = tl.max(tl.reshape(tl.where(live, centre + half, -float("inf")), split), 1)
+    g = tl.program_id(0) * (BLOCK // GROUP) + tl.arange(0, BLOCK // GROUP)
+    tl.store(boxes + axis * groups + g, low.to(tl.float32), mask=g < groups)
+    tl.store(boxes + (3 + axis) * groups + g, high.to(tl.float32), mask=g < groups)
 
 
 @triton.jit
@@ -111,14 +114,14 @@ def _ellipsoid_kernel(
     x = cutoff * _reach(t00, t10, t20, s0, s1, s2) / tl.load(table + 3) + _SLACK
     y = cutoff * _reach(t01, t11, t21, s0, s1, s2) / tl.load(table + 4) + _SLACK
     z = cutoff * _reach(t02, t12, t22, s0, s1, s2) / tl.load(table + 5) + _SLACK
-    cx, cy, cz = (
-        _centre(position, table, n, live, 0), _centre(position, table, n, live, 1), _centre(position, table, n, live, 2),
-    )  # fmt: skip
+    cx, cy = _centre(position, table, n, live, 0), _centre(position, table, n, live, 1)
     _store_axis(record, shape, boxes, n, live, count, groups, 0, cx, x, BLOCK, GROUP)
     _store_axis(record, shape, boxes, n, live, count, groups, 1, cy, y, BLOCK, GROUP)
+    cz = _centre(position, table, n, live, 2)
     _store_axis(record, shape, boxes, n, live, count, groups, 2, cz, z, BLOCK, GROUP)
     for k in tl.static_range(CHANNELS):
-        tl.store(record + n * RECORD + 12 + k, tl.load(weight + k * count + n, mask=live, other=0.0), mask=live)
+        height = tl.load(weight + k * count + n, mask=live, other=0.0)
+        tl.store(record + n * RECORD + 12 + k, height, mask=live)
 
 
 def ellipsoids(position, scale, rotation, weight, table: torch.Tensor, cutoff: float):

@@ -1,0 +1,85 @@
+"""The Triton kernels: their logic in Triton's interpreter on the CPU, the kernels themselves on a GPU."""
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from triton_cases import CASES
+
+from tomo_polysplat.kernels.spatial_order import spatial_order
+from tomo_polysplat.kernels.views import DetectorViews
+
+
+@pytest.fixture(scope="module")
+def interpreted() -> dict[str, str]:
+    """Traceback by name of every case that fails in the interpreter.
+
+    Triton decides when it is imported whether it interprets, so that is done in a process of its own.
+    """
+    if importlib.util.find_spec("triton") is None:
+        pytest.skip("triton is not installed")
+    environment = {**os.environ, "TRITON_INTERPRET": "1", "CUDA_VISIBLE_DEVICES": ""}
+    script = Path(__file__).with_name("triton_cases.py")
+    command = [sys.executable, script]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_in_the_interpreter(name, interpreted):
+    assert name not in interpreted, interpreted[name]
+
+
+def test_spatial_order_keeps_neighbours_together():
+    """Groups of 32 along the curve span a small part of the volume; one Gaussian or none is no matter."""
+    position = torch.rand((32 * 64, 3), generator=torch.Generator().manual_seed(0)) - 0.5
+    order = spatial_order(position)
+    assert torch.equal(order.sort().values, torch.arange(len(position)))
+    groups = position[order].reshape(64, 32, 3)
+    # 64 groups of a unit cube in cells of side 1/4 each.
+    assert (groups.amax(1) - groups.amin(1)).mean() < 0.35
+    assert spatial_order(position[:0]).tolist() == []
+    assert spatial_order(position[:1]).tolist() == [0]
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", CASES)
+def test_on_the_gpu(name):
+    CASES[name]("cuda")
+
+
+@pytest.mark.gpu
+def test_more_pixels_than_32_bits_count():
+    """The last of three views lies beyond 2^31 pixels; alone it does not."""
+    from tomo_polysplat.kernels.project.triton_kernel import project
+
+    if torch.cuda.mem_get_info()[0] < 60e9:
+        pytest.skip("needs 60 GB of GPU memory")
+    size = 28000
+    step_u, step_v, ahead = np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), np.array([0, 1.0, 0])
+    matrix = np.stack([step_u, step_v, ahead], axis=1)
+    views = DetectorViews(False, np.zeros((3, 3)), np.stack([matrix] * 3), size, size)
+    results = []
+    for some in (views, views.select([2])):
+        scene = [
+            torch.tensor([[size - 9.0, 0, size - 7.0]], device="cuda"),
+            torch.full((1, 3), 2.0, device="cuda"),
+            torch.tensor([[1.0, 0, 0, 0]], device="cuda"),
+            torch.ones((1, 1), device="cuda"),
+        ]
+        scene = [t.requires_grad_() for t in scene]
+        image, _ = project(*scene, some, 3.0)
+        last = image[:, -1]
+        corner = last[:, -20:, -20:].detach().cpu()
+        (last[:, -20:, -20:] * torch.arange(20.0, device="cuda")).sum().backward()
+        results.append([corner, *(t.grad.cpu() for t in scene)])
+        del image, last
+    assert results[0][0].max() > 0.4
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
