@@ -18,7 +18,9 @@ _PUBLIC = {
     "Scan": "tomo_polysplat.scan.scan",
     "Spectrum": "tomo_polysplat.physics.spectrum",
     "load_scan": "tomo_polysplat.scan.io",
-    "reconstruct": "tomo_polysplat.reconstruct",
+    "polysplat": "tomo_polysplat.plugins.tomopy_plugin",
+    "reconstruct": "tomo_polysplat.reconstruction",
+    "register": "tomo_polysplat.plugins.hosts",
     "simulate_scan": "tomo_polysplat.simulate.scenes",
 }
 

@@ -20,8 +20,8 @@ class Settings:
 
     passes: float = 16.0
     """Times every view is used, unless the held-out rays or a time budget end the run before."""
-    views_per_step: int = 4
-    """Views whose gradients make one step of the optimiser."""
+    views_per_step: int = 0
+    """Views whose gradients make one step of the optimiser; 0 leaves it to the plan."""
     max_gaussians: int = 0
     """Upper bound of the number of Gaussians; 0 leaves it to the plan."""
     seed_spacing: float = 0.0
@@ -41,20 +41,24 @@ class Settings:
     soft_u: float = 0.002
     """Material number that soft matter starts from, and keeps away from dense matter."""
     bone_u: float = 0.35
-    metal_u: float = 0.9
+    metal_u: float = 0.8
     free_radius: float = 6.0
     """Material numbers are free within this many voxels of bone-like or denser matter."""
-    learning_rate_position: float = 0.02
+    learning_rate_position: float = 0.05
     """Per step, in seed spacings."""
     learning_rate_scale: float = 1.5e-2
     """Per step, relative."""
     learning_rate_rotation: float = 3e-3
-    learning_rate_density: float = 1e-2
-    learning_rate_material: float = 3e-3
+    learning_rate_attenuation: float = 1e-2
+    learning_rate_material: float = 2e-2
     final_rate: float = 0.1
     """Learning rates fall exponentially to this share of their start."""
-    loss: str = "weighted-l1"
-    """"weighted-l1" (photon statistics) or "l1" (the paper's)."""
+    loss: str = "huber"
+    """"huber" or "weighted-l1", both weighted by photon statistics, or "l1" (the paper's)."""
+    model_error: float = 0.01
+    """Error of -log(I/I0) that the model is allowed besides the noise."""
+    huber_corner: float = 1.345
+    """Deviations beyond which a residual counts absolutely (95 % efficient for Gaussian noise: Huber 1964)."""
     ssim_weight: float = 0.0
     """Weight of 1 - SSIM of the projections (the paper uses 0.25)."""
     tv_weight: float = 0.02
@@ -63,12 +67,16 @@ class Settings:
     """Attenuation above this many soft references does not count as variation, which would erode metal."""
     tv_box: int = 32
     """Edge in voxels of the random box whose total variation is taken."""
+    tv_box_planar: int = 128
+    """The same for a single slice."""
     held_out: float = 0.01
     """Share of the rays kept from the fit to tell when it stops improving."""
     patience: int = 4
     """Checks without improvement of the held-out rays that end the run."""
     cutoff: float = 3.0
     """Standard deviations at which a projected Gaussian ends."""
+    spectral_nodes: int = 0
+    """Nodes of the spectrum; 0 takes as few as keep the error of P small."""
     kernel: str = "auto"
     """"auto", "triton", "numba" or "reference"."""
 

@@ -2,14 +2,59 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
-__all__ = ["total_variation", "weighted_l1"]
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.render.renderer import VOXEL_CUTOFF
+from tomo_polysplat.settings import Settings
+
+__all__ = ["misfit", "roughness", "total_variation", "weighted_huber", "weighted_l1"]
+
+
+def misfit(
+    predicted: torch.Tensor, measured: torch.Tensor, weight: torch.Tensor, settings: Settings
+) -> torch.Tensor:
+    """The loss of the rays that the settings name."""
+    if settings.loss == "huber":
+        return weighted_huber(predicted, measured, weight, settings.huber_corner * settings.model_error)
+    return weighted_l1(predicted, measured, weight)
 
 
 def weighted_l1(predicted: torch.Tensor, measured: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
     r"""Weighted mean of the absolute residuals, ``sum w |p - m| / sum w``; 0 when every weight is 0."""
     return ((predicted - measured).abs() * weight).sum() / weight.sum().clamp(min=1e-12)
+
+
+def weighted_huber(
+    predicted: torch.Tensor, measured: torch.Tensor, weight: torch.Tensor, width: float
+) -> torch.Tensor:
+    """Weighted mean of residuals that count squared where noise explains them and absolute beyond.
+
+    Huber's function (1964, doi:10.1214/aoms/1177703732) with its corner at ``width / weight``, so at the same
+    multiple of each ray's deviation.
+    """
+    scaled = (predicted - measured).abs() * weight
+    value = torch.where(scaled < width, scaled.square() / (2 * width), scaled - 0.5 * width)
+    return value.sum() / weight.sum().clamp(min=1e-12)
+
+
+def roughness(
+    gaussians: Gaussians, scene: FitScene, settings: Settings, rng: np.random.Generator
+) -> torch.Tensor:
+    """Total variation of the volume in a random box of ``settings.tv_box`` voxels an edge."""
+    edges = [settings.tv_box] * 3 if scene.box.shape[0] > 1 else [1, *[settings.tv_box_planar] * 2]
+    shape = tuple(min(edge, n) for edge, n in zip(edges, scene.box.shape))
+    start = tuple(int(rng.integers(0, n - m + 1)) for n, m in zip(scene.box.shape, shape))
+    box = scene.box.part(start, shape)
+    like = {"dtype": torch.float32, "device": gaussians.position.device}
+    lower = torch.as_tensor(box.first, **like)
+    upper = torch.as_tensor(box.first + (np.array(shape[::-1]) - 1) * box.spacing, **like)
+    with torch.no_grad():
+        reach = VOXEL_CUTOFF * gaussians.log_scale.amax(dim=1, keepdim=True).exp()
+        near = ((gaussians.position + reach >= lower) & (gaussians.position - reach <= upper)).all(dim=1)
+    return total_variation(scene.attenuation(gaussians.select(near.nonzero()[:, 0]), box), settings.tv_clip)
 
 
 def total_variation(volume: torch.Tensor, ceiling: float) -> torch.Tensor:

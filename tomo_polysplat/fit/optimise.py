@@ -5,22 +5,57 @@ from __future__ import annotations
 import logging
 import math
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.loss import total_variation, weighted_l1
+from tomo_polysplat.fit.loss import misfit, roughness
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.model.seed import Seeding
 from tomo_polysplat.settings import Settings
 
-__all__ = ["FitOutcome", "fit"]
+__all__ = ["FitOutcome", "FitState", "fit"]
 
 logger = logging.getLogger(__name__)
+
+# A held-out error that falls by less than this share in a pass over the views has stopped falling.
+_IMPROVEMENT = 2e-3
+
+
+@dataclass
+class FitState:
+    """What a callback sees, once a pass over the views.
+
+    Attributes
+    ----------
+    seconds : float
+        Since the reconstruction began.
+    iteration, gaussians : int
+    loss, held_out : float
+        Mean misfit of the fitted and of the held-out rays over the pass.
+    share : float
+        Of the run that is done, 0 to 1.
+    volume : callable
+        Returns the current volume, (z, y, x) in 1/unit.
+    """
+
+    seconds: float
+    iteration: int
+    gaussians: int
+    loss: float
+    held_out: float
+    share: float
+    volume: Callable[[], np.ndarray]
+
+    def record(self) -> dict[str, Any]:
+        """The numbers, for the history."""
+        names = ("seconds", "iteration", "loss", "held_out", "gaussians")
+        return {name: getattr(self, name) for name in names} | {"stage": "fit"}
 
 
 @dataclass
@@ -29,8 +64,70 @@ class FitOutcome:
 
     gaussians: Gaussians
     history: list[dict[str, Any]] = field(default_factory=list)
-    counts: dict[str, int] = field(default_factory=dict)
+    skipped_pairs: int = 0
     reason: str = ""
+
+
+class _Fitter:
+    """One run: parameters, optimiser, order of the views."""
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        seeding: Seeding,
+        rays: Rays,
+        scene: FitScene,
+        settings: Settings,
+        rng: np.random.Generator,
+    ) -> None:
+        self.gaussians, self.rays, self.scene, self.settings, self.rng = gaussians, rays, scene, settings, rng
+        rates = {
+            "position": settings.learning_rate_position * seeding.spacing,
+            "log_scale": settings.learning_rate_scale,
+            "rotation": settings.learning_rate_rotation,
+            "attenuation": settings.learning_rate_attenuation,
+            "material": settings.learning_rate_material,
+        }
+        parameters = gaussians.tensors()
+        groups = [{"params": [parameters[k].requires_grad_()], "lr": v, "rate": v} for k, v in rates.items()]
+        self.optimiser = torch.optim.Adam(groups, eps=1e-15, fused=True)
+        voxel = float(scene.box.spacing[: 2 if gaussians.planar else 3].min())
+        self.bounds = (
+            math.log(settings.smallest_scale * voxel),
+            math.log(settings.largest_scale * seeding.spacing),
+        )
+        self.frozen = torch.as_tensor(~seeding.material_free, device=gaussians.position.device)
+        self.order = np.empty(0, int)
+
+    def step(self, share: float, batch: int) -> tuple[torch.Tensor, torch.Tensor, int | torch.Tensor]:
+        """One step of the optimiser; misfit of the fitted and the held-out rays, and pairs skipped."""
+        for group in self.optimiser.param_groups:
+            group["lr"] = group["rate"] * self.settings.final_rate**share
+        views, measured, weight, aside = self.rays.batch(self._next_views(batch))
+        predicted, skipped = self.scene.projections(self.gaussians, views)
+        fitted = misfit(predicted, measured, weight, self.settings)
+        loss = fitted
+        if self.settings.tv_weight:
+            loss = loss + self.settings.tv_weight * roughness(
+                self.gaussians, self.scene, self.settings, self.rng
+            )
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        if self.scene.polychromatic:
+            self.gaussians.material.grad[self.frozen] = 0.0
+        self.optimiser.step()
+        with torch.no_grad():
+            self.gaussians.attenuation.clamp_(min=0.0)
+            self.gaussians.material.clamp_(0.0, 1.0)
+            self.gaussians.log_scale.clamp_(*self.bounds)
+            return fitted.detach(), misfit(predicted, measured, aside, self.settings), skipped
+
+    def _next_views(self, batch: int) -> np.ndarray:
+        """The next views of an order that uses each once before any again."""
+        while len(self.order) < batch:
+            self.order = np.concatenate([self.order, self.rng.permutation(len(self.rays.views))])
+        chosen, self.order = self.order[:batch], self.order[batch:]
+        return chosen
 
 
 def fit(
@@ -39,88 +136,87 @@ def fit(
     rays: Rays,
     scene: FitScene,
     settings: Settings,
-    seed: int,
-    time_budget: float | None = None,
-    monitor=None,
+    *,
+    views_per_step: int,
+    rng: np.random.Generator,
+    started: float,
+    deadline: float | None = None,
+    volume: Callable[[Gaussians], np.ndarray],
+    callbacks: Sequence[Callable[[FitState], Any]] = (),
 ) -> FitOutcome:
-    """Fit Gaussians to rays."""
-    started = time.perf_counter()
-    rng = np.random.default_rng(seed)
-    parameters = gaussians.tensors()
-    rates = {
-        "position": settings.learning_rate_position * seeding.spacing,
-        "log_scale": settings.learning_rate_scale,
-        "rotation": settings.learning_rate_rotation,
-        "density": settings.learning_rate_density,
-        "material": settings.learning_rate_material,
-    }
-    for tensor in parameters.values():
-        tensor.requires_grad_()
-    optimiser = torch.optim.Adam(
-        [{"params": [parameters[name]], "lr": rate, "rate": rate} for name, rate in rates.items()], eps=1e-15, fused=True
-    )
-    voxel = float(scene.box.spacing[: 2 if gaussians.planar else 3].min())
-    low, high = math.log(settings.smallest_scale * voxel), math.log(settings.largest_scale * seeding.spacing)
-    frozen = torch.as_tensor(~seeding.material_free, device=gaussians.position.device)
+    """Fit Gaussians to rays.
+
+    Stops after ``settings.passes`` over the views, at ``deadline`` (``time.perf_counter`` seconds), when the
+    held-out rays have not improved for ``settings.patience`` passes, when a callback returns True, or on
+    KeyboardInterrupt; returns the Gaussians of the pass whose held-out rays fitted best.
+    """
+    fitter = _Fitter(gaussians, seeding, rays, scene, settings, rng)
     count = len(rays.views)
-    batch = min(settings.views_per_step, count)
+    batch = min(views_per_step, count)
+    per_pass = max(1, round(count / batch))
     steps = max(1, math.ceil(settings.passes * count / batch))
-    outcome = FitOutcome(gaussians)
-    order = np.empty(0, int)
-    check_every = max(1, count // batch)
-    running = [0.0, 0.0, 0]
-    for step in range(steps):
-        elapsed = time.perf_counter() - started
-        progress = step / steps if time_budget is None else max(step / steps, elapsed / time_budget)
-        if progress >= 1:
-            break
-        for group in optimiser.param_groups:
-            group["lr"] = group["rate"] * settings.final_rate**progress
-        if len(order) < batch:
-            order = np.concatenate([order, rng.permutation(count)])
-        chosen, order = order[:batch], order[batch:]
-        views, measured, weight, aside = rays.batch(chosen)
-        predicted, skipped = scene.projections(gaussians, views)
-        misfit = weighted_l1(predicted, measured, weight)
-        loss = misfit
-        if settings.tv_weight:
-            loss = loss + settings.tv_weight * _roughness(gaussians, scene, settings, rng)
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        if scene.polychromatic:
-            gaussians.material.grad[frozen] = 0.0
-        optimiser.step()
-        with torch.no_grad():
-            gaussians.density.clamp_(min=0.0)
-            gaussians.material.clamp_(0.0, 1.0)
-            gaussians.log_scale.clamp_(low, high)
-            running[0] += float(misfit)
-            running[1] += float(weighted_l1(predicted, measured, aside))
-            running[2] += 1
-        if (step + 1) % check_every == 0:
-            entry = {
-                "seconds": time.perf_counter() - started,
-                "iteration": step + 1,
-                "loss": running[0] / running[2],
-                "held_out": running[1] / running[2],
-                "gaussians": len(gaussians),
-            }
-            running = [0.0, 0.0, 0]
-            outcome.history.append(entry)
-            if monitor is not None:
-                monitor(entry, gaussians)
+    outcome = FitOutcome(gaussians.copy())
+    begun = time.perf_counter()
+    watch = _Watch(settings)
+    sums: list[tuple] = []
+    try:
+        for step in range(steps):
+            share = step / steps
+            if deadline is not None:
+                share = max(share, (time.perf_counter() - begun) / max(deadline - begun, 1e-9))
+            if share >= 1:
+                outcome.reason = "the time budget was used"
+                break
+            sums.append(fitter.step(share, batch))
+            if len(sums) < per_pass and step + 1 < steps:
+                continue
+            loss, held_out, skipped = (float(sum(values)) / len(sums) for values in zip(*sums))
+            outcome.skipped_pairs += round(skipped * len(sums))
+            sums = []
+            state = FitState(
+                time.perf_counter() - started,
+                step + 1,
+                len(gaussians),
+                loss,
+                held_out,
+                share,
+                lambda: volume(gaussians),
+            )
+            outcome.history.append(state.record())
+            outcome.reason = watch.judge(state, gaussians)
+            if any([callback(state) is True for callback in callbacks]):
+                outcome.reason = "a callback ended it"
+            if outcome.reason:
+                break
+    except KeyboardInterrupt:
+        logger.warning("Interrupted after %d steps; the best state so far is returned.", step)
+        outcome.reason = "interrupted"
+    outcome.reason = outcome.reason or f"{settings.passes:g} passes over the views were made"
+    outcome.gaussians = watch.best or gaussians.copy()
     return outcome
 
 
-def _roughness(gaussians: Gaussians, scene: FitScene, settings: Settings, rng: np.random.Generator) -> torch.Tensor:
-    """Total variation in a random box."""
-    shape = tuple(min(settings.tv_box, n) for n in scene.box.shape)
-    start = tuple(int(rng.integers(0, n - m + 1)) for n, m in zip(scene.box.shape, shape))
-    box = scene.box.part(start, shape)
-    lower = torch.as_tensor(box.first, dtype=torch.float32, device=gaussians.position.device)
-    upper = lower + torch.as_tensor((np.array(shape[::-1]) - 1) * box.spacing, dtype=torch.float32, device=lower.device)
-    with torch.no_grad():
-        reach = 3.4 * gaussians.log_scale.max(dim=1).values.exp()[:, None]
-        near = ((gaussians.position + reach >= lower) & (gaussians.position - reach <= upper)).all(dim=1)
-        index = near.nonzero()[:, 0]
-    return total_variation(scene.attenuation(gaussians.select(index), box), settings.tv_clip)
+class _Watch:
+    """Keeps the best state and says when to stop."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.best: Gaussians | None = None
+        self.lowest = math.inf
+        self.waited = 0
+
+    def judge(self, state: FitState, gaussians: Gaussians) -> str:
+        """The reason to stop, or nothing."""
+        if not math.isfinite(state.loss):
+            if self.best is None:
+                raise FloatingPointError(
+                    "the fit diverged in its first pass; see the log for rays out of range"
+                )
+            return "the misfit stopped being finite"
+        score = state.held_out if self.settings.held_out else state.loss
+        self.waited = 0 if score < (1 - _IMPROVEMENT) * self.lowest else self.waited + 1
+        if score <= self.lowest:
+            self.lowest, self.best = score, gaussians.copy()
+        if self.settings.held_out and self.waited >= self.settings.patience:
+            return f"the held-out rays had not improved for {self.waited} passes"
+        return ""

@@ -22,29 +22,31 @@ class Rays:
         -log(I/I0); NaN where a ray is not to be used.
     views : DetectorViews
         In the solver's coordinates.
-    weighted : bool
-        Weigh rays by photon statistics instead of alike.
+    photons : float
+        Photons of an unattenuated ray; infinity weighs all rays alike.
+    model_error : float
+        Error of P that the model itself is allowed, which keeps quiet rays from outweighing the rest.
     held_out : float
         Share of the rays kept from the fit.
     """
 
     projections: torch.Tensor
     views: DetectorViews
-    weighted: bool
+    photons: float
+    model_error: float
     held_out: float
 
     def batch(self, chosen: np.ndarray) -> tuple[DetectorViews, torch.Tensor, torch.Tensor, torch.Tensor]:
         """Views, values (0 where unusable), fit weights and held-out weights of the chosen views.
 
-        The variance of -log(I/I0) is exp(P)/I0 for Poisson counts, so a weight exp(-P/2) makes all residuals
-        alike. Negative values are noise in air and weigh as air.
+        The variance of -log(I/I0) is exp(P)/I0 for Poisson counts, to which that of the model is added; the
+        weight is the inverse deviation, 1 for a ray without noise.
         """
         values = self.projections[torch.as_tensor(chosen, device=self.projections.device)]
         usable = torch.isfinite(values)
         values = torch.where(usable, values, torch.zeros_like(values))
         weight = usable.to(values.dtype)
-        if self.weighted:
-            weight = weight * torch.exp(-0.5 * values.clamp(min=0))
+        weight = weight * torch.rsqrt(1 + torch.exp(values) / (self.photons * self.model_error**2))
         aside = self._aside(chosen, values.shape[1:])
         return self.views.select(chosen), values, weight * ~aside, weight * aside
 

@@ -29,8 +29,9 @@ class FitScene:
     areal_scale : float
         Line integral in the solver's units (length times density) to g/cm2, or to -log(I/I0) when
         monochromatic.
-    curve : (3,) or (1,) tensor
-        Mass attenuation of the curves at the effective energy over that of the first.
+    reference_curve, output_curve : (3,) tensor or None
+        Mass attenuation of the curves over that of the first, at the reference energy of the Gaussians and at
+        the energy of the volume; None for a monochromatic model.
     kernel : str
     cutoff : float
     """
@@ -38,7 +39,8 @@ class FitScene:
     box: VoxelBox
     quadrature: Quadrature | None
     areal_scale: float
-    curve: torch.Tensor
+    reference_curve: torch.Tensor | None
+    output_curve: torch.Tensor | None
     kernel: str
     cutoff: float
 
@@ -49,7 +51,7 @@ class FitScene:
 
     def projections(self, gaussians: Gaussians, views: DetectorViews) -> tuple[torch.Tensor, int]:
         """(views, rows, columns) predicted -log(I/I0), and the pairs skipped at the source plane."""
-        weights = gaussians.weights(self.polychromatic)
+        weights = gaussians.weights(self.reference_curve)
         areal, skipped = project_gaussians(gaussians, weights, views, self.kernel, self.cutoff)
         areal = areal * self.areal_scale
         if self.quadrature is None:
@@ -58,9 +60,11 @@ class FitScene:
 
     def attenuation(self, gaussians: Gaussians, box: VoxelBox) -> torch.Tensor:
         """(nz, ny, nx) attenuation at the effective energy in soft references."""
-        height = (self.curve[:, None] * gaussians.weights(self.polychromatic)).sum(dim=0, keepdim=True)
-        return voxelise_gaussians(gaussians, height, box, self.kernel)[0]
+        weights = gaussians.weights(self.reference_curve)
+        if self.output_curve is not None:
+            weights = self.output_curve[None] @ weights
+        return voxelise_gaussians(gaussians, weights, box, self.kernel)[0]
 
     def basis(self, gaussians: Gaussians) -> torch.Tensor:
         """(channels, nz, ny, nx) densities of the curves in soft references."""
-        return voxelise_gaussians(gaussians, gaussians.weights(self.polychromatic), self.box, self.kernel)
+        return voxelise_gaussians(gaussians, gaussians.weights(self.reference_curve), self.box, self.kernel)

@@ -67,13 +67,22 @@ def whitening_adjoint(scale, rotation, n, white, grad, grad_scale, grad_rotation
     g = grad
     gw = 2 * (z * (g[0, 1] - g[1, 0]) + y * (g[2, 0] - g[0, 2]) + x * (g[1, 2] - g[2, 1]))
     gx = 2 * (
-        y * (g[0, 1] + g[1, 0]) + z * (g[0, 2] + g[2, 0]) + w * (g[1, 2] - g[2, 1]) - 2 * x * (g[1, 1] + g[2, 2])
+        y * (g[0, 1] + g[1, 0])
+        + z * (g[0, 2] + g[2, 0])
+        + w * (g[1, 2] - g[2, 1])
+        - 2 * x * (g[1, 1] + g[2, 2])
     )
     gy = 2 * (
-        x * (g[0, 1] + g[1, 0]) + z * (g[1, 2] + g[2, 1]) + w * (g[2, 0] - g[0, 2]) - 2 * y * (g[0, 0] + g[2, 2])
+        x * (g[0, 1] + g[1, 0])
+        + z * (g[1, 2] + g[2, 1])
+        + w * (g[2, 0] - g[0, 2])
+        - 2 * y * (g[0, 0] + g[2, 2])
     )
     gz = 2 * (
-        x * (g[0, 2] + g[2, 0]) + y * (g[1, 2] + g[2, 1]) + w * (g[0, 1] - g[1, 0]) - 2 * z * (g[0, 0] + g[1, 1])
+        x * (g[0, 2] + g[2, 0])
+        + y * (g[1, 2] + g[2, 1])
+        + w * (g[0, 1] - g[1, 0])
+        - 2 * z * (g[0, 0] + g[1, 1])
     )
     # Only the part across the quaternion counts: its length is normalised away.
     along = gw * w + gx * x + gy * y + gz * z

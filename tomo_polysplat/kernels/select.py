@@ -35,7 +35,9 @@ def choose(device: torch.device, requested: str = "auto") -> tuple[str, str]:
     if requested != "auto":
         usable, reason = availability(requested, device.type)
         if not usable:
-            raise fail("kernel", f"a kernel that runs on {device}", f"{requested!r} ({reason})", "use kernel='auto'")
+            raise fail(
+                "kernel", f"a kernel that runs on {device}", f"{requested!r} ({reason})", "use kernel='auto'"
+            )
         return requested, "asked for"
     refused = []
     for name in KERNELS:
@@ -52,7 +54,7 @@ def describe() -> list[tuple[str, str, bool, str]]:
     return [(name, device, *availability(name, device)) for name, device in pairs]
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def availability(name: str, device_type: str) -> tuple[bool, str]:
     """Whether a kernel runs on a kind of device ("cpu", "cuda"), found by running it, and why (not)."""
     if device_type == "cuda" and not torch.cuda.is_available():

@@ -1,7 +1,8 @@
-"""The unknowns: a cloud of Gaussians with a density and a material number each.
+"""The unknowns: a cloud of Gaussians with an attenuation and a material number each.
 
-Coordinates are relative to the volume's centre in units of half its longest side; densities are in units of
-the scan's soft reference.
+Coordinates are relative to the volume's centre in units of half its longest side. What a Gaussian holds is
+stated as its attenuation at one reference energy, in units of the scan's soft reference, not as its density:
+a change of the material number then leaves what most rays see as it was, which lets both be fitted at once.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ class Gaussians:
         Natural logarithm of the standard deviations; (n, 2) for the endless Gaussians of a planar scan.
     rotation : (n, 4) tensor
         Quaternions (w, x, y, z) of any length.
-    density : (n,) tensor
-        At the centre, not negative.
+    attenuation : (n,) tensor
+        At the centre and the reference energy, not negative.
     material : (n,) tensor
         The number u in [0, 1].
     """
@@ -34,7 +35,7 @@ class Gaussians:
     position: torch.Tensor
     log_scale: torch.Tensor
     rotation: torch.Tensor
-    density: torch.Tensor
+    attenuation: torch.Tensor
     material: torch.Tensor
 
     def __len__(self) -> int:
@@ -64,9 +65,13 @@ class Gaussians:
             scale = torch.cat([scale, scale.new_full((len(scale), 1), math.inf)], dim=1)
         return scale
 
-    def weights(self, polychromatic: bool) -> torch.Tensor:
-        """(3, n) densities of the soft, middle and dense curve, or (1, n) densities."""
-        if not polychromatic:
-            return self.density[None]
+    def weights(self, curve: torch.Tensor | None) -> torch.Tensor:
+        """(3, n) densities of the soft, middle and dense curve, or the (1, n) attenuation without a ``curve``.
+
+        ``curve`` (3,) is the mass attenuation of the curves at the reference energy over that of the first.
+        """
+        if curve is None:
+            return self.attenuation[None]
         u = self.material
-        return self.density * torch.stack([(1 - u).square(), 2 * u * (1 - u), u.square()])
+        mixture = torch.stack([(1 - u).square(), 2 * u * (1 - u), u.square()])
+        return mixture * (self.attenuation / (curve @ mixture))

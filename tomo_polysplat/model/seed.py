@@ -1,4 +1,7 @@
-"""Gaussians to start from: a regular grid over the support of a first reconstruction."""
+"""Gaussians to start from: a regular grid over the support of a first reconstruction.
+
+The grid is twice as fine at metal, whose edges are where an error of position costs most.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,9 @@ from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.settings import Settings
 
 __all__ = ["Seeding", "seed_gaussians"]
+
+# Attenuation, in soft references, that a seed in what looks like air starts from: from zero it would not grow.
+_LEAST = 0.02
 
 
 @dataclass(frozen=True)
@@ -33,7 +39,6 @@ class Seeding:
 
 def seed_gaussians(
     start: np.ndarray,
-    curve: np.ndarray,
     grid: VolumeGrid,
     spacing: float,
     settings: Settings,
@@ -46,30 +51,31 @@ def seed_gaussians(
     ----------
     start : (nz, ny, nx) array
         First reconstruction in soft references.
-    curve : (3,) array
-        Mass attenuation of the three curves at the energy of ``start``, over that of the first.
     grid : VolumeGrid
         In the solver's coordinates.
     spacing : float
         Distance of the seeds in the grid's unit.
     """
-    planar = grid.planar and grid.shape[0] == 1
-    dims = 2 if planar else 3
+    dims = 2 if grid.planar else 3
     points = _lattice(grid, spacing, dims)
+    fine = _reaches(start, points, grid, settings.metal_level, spacing)
+    points = np.concatenate([points[~fine], _split(points[fine], spacing, dims)])
+    size = np.full(len(points), spacing)
+    size[np.count_nonzero(~fine) :] /= 2
     value, nearby = _sample(start, points, grid, spacing, dims)
     keep = nearby > settings.support_level
-    points, value = points[keep], np.maximum(value[keep], 0.02)
+    points, size, value = points[keep], size[keep], np.maximum(value[keep], _LEAST)
     u = np.full(len(points), settings.soft_u)
     free = np.zeros(len(points), bool)
     if polychromatic:
         u[value > settings.bone_level] = settings.bone_u
         u[value > settings.metal_level] = settings.metal_u
-        free = _near_dense(start, points, grid, settings)
-    mixture = np.stack([(1 - u) ** 2, 2 * u * (1 - u), u**2], 1)
-    attenuation = mixture @ curve if polychromatic else np.ones(len(points))
-    # A lattice of Gaussians of this height averages to the wanted value: mass per cell over mass per Gaussian.
+        reach = settings.free_radius * float(grid.voxel_size[:dims].min())
+        free = _reaches(start, points, grid, settings.bone_level, reach)
+    # A lattice of Gaussians of this height averages to the wanted value: the cell's integral over the
+    # Gaussian's.
     width = settings.seed_width
-    density = value / attenuation / (math.sqrt(2 * math.pi) * width) ** dims
+    attenuation = value / (math.sqrt(2 * math.pi) * width) ** dims
 
     def tensor(array: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32, device=device)
@@ -78,9 +84,9 @@ def seed_gaussians(
     rotation[:, 0] = 1.0
     gaussians = Gaussians(
         tensor(points),
-        tensor(np.full((len(points), dims), math.log(width * spacing))),
+        tensor(np.repeat(np.log(width * size)[:, None], dims, axis=1)),
         tensor(rotation),
-        tensor(density),
+        tensor(attenuation),
         tensor(u),
     )
     return gaussians, Seeding(spacing, free)
@@ -109,15 +115,23 @@ def _sample(start: np.ndarray, points: np.ndarray, grid: VolumeGrid, spacing: fl
     return mean[index].astype(np.float64), around[index]
 
 
-def _near_dense(start: np.ndarray, points: np.ndarray, grid: VolumeGrid, settings: Settings) -> np.ndarray:
-    """Seeds within ``free_radius`` voxels of bone-like or denser matter."""
+def _split(points: np.ndarray, spacing: float, dims: int) -> np.ndarray:
+    """Every lattice point replaced by the 2^dims points of a lattice of half the spacing in its cell."""
+    corners = np.stack(np.meshgrid(*[[-0.25, 0.25]] * dims, indexing="ij"), -1).reshape(-1, dims)
+    offsets = np.zeros((len(corners), 3))
+    offsets[:, :dims] = corners * spacing
+    return (points[:, None] + offsets).reshape(-1, 3)
+
+
+def _reaches(start: np.ndarray, points: np.ndarray, grid: VolumeGrid, level: float, reach: float) -> np.ndarray:
+    """Points within a distance of a voxel above a level."""
     from scipy import ndimage
 
-    dense = start > settings.bone_level
-    if not dense.any():
+    above = start > level
+    if not above.any():
         return np.zeros(len(points), bool)
-    distance = ndimage.distance_transform_edt(~dense)
-    return distance[_voxel_of(points, grid)] <= settings.free_radius
+    distance = ndimage.distance_transform_edt(~above, sampling=grid.voxel_size[::-1])
+    return distance[_voxel_of(points, grid)] <= reach
 
 
 def _voxel_of(points: np.ndarray, grid: VolumeGrid) -> tuple[np.ndarray, ...]:

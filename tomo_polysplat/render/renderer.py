@@ -38,7 +38,13 @@ def project_gaussians(
 ) -> tuple[torch.Tensor, int]:
     """(channels, views, rows, columns) line integrals, and the pairs skipped at the source plane."""
     return project(
-        gaussians.position, gaussians.scale(), gaussians.rotation, weights, views, kernel=kernel, cutoff=cutoff
+        gaussians.position,
+        gaussians.scale(),
+        gaussians.rotation,
+        weights,
+        views,
+        kernel=kernel,
+        cutoff=cutoff,
     )
 
 

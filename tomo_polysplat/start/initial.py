@@ -70,7 +70,9 @@ def initial_volume(
     method, invalid = ("fdk" if fits else "sirt"), int((~usable).sum())
     _log.info("Start from %s: %s; %d invalid pixels.", method.upper(), reason, invalid)
     if fits:
-        volume = fdk(fill_invalid(projections, usable), geometry, grid, device=device)
+        # Smooth: the noise of a sharp filter would be seeded as if it were matter.
+        filled = fill_invalid(projections, usable)
+        volume = fdk(filled, geometry, grid, filter_name="hann", device=device)
     else:
         volume = _sirt_start(np.where(usable, projections, np.nan), geometry, grid)
     return volume, {"method": method, "reason": reason, "invalid_pixels": invalid}

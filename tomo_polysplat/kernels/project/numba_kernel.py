@@ -41,8 +41,12 @@ def _chain(position, cone, origin, inverse, matrix, white, n, v, vec):
     vec[7, 1] = beta * vec[7, 2]
     for a in range(3):
         vec[1, a] = white[a, 0] * vec[0, 0] + white[a, 1] * vec[0, 1] + white[a, 2] * vec[0, 2]
-        vec[2, a] = white[a, 0] * matrix[v, 0, 0] + white[a, 1] * matrix[v, 1, 0] + white[a, 2] * matrix[v, 2, 0]
-        vec[3, a] = white[a, 0] * matrix[v, 0, 1] + white[a, 1] * matrix[v, 1, 1] + white[a, 2] * matrix[v, 2, 1]
+        vec[2, a] = (
+            white[a, 0] * matrix[v, 0, 0] + white[a, 1] * matrix[v, 1, 0] + white[a, 2] * matrix[v, 2, 0]
+        )
+        vec[3, a] = (
+            white[a, 0] * matrix[v, 0, 1] + white[a, 1] * matrix[v, 1, 1] + white[a, 2] * matrix[v, 2, 1]
+        )
     for a in range(3):
         b, c = (a + 1) % 3, (a + 2) % 3
         vec[4, a] = vec[1, b] * vec[2, c] - vec[1, c] * vec[2, b]
@@ -119,7 +123,9 @@ def _columns(rec, y, cut, columns):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _set_up(start, stop, position, scale, rotation, cone, planar, origin, inverse, matrix, cutoff, rows, record, span):
+def _set_up(
+    start, stop, position, scale, rotation, cone, planar, origin, inverse, matrix, cutoff, rows, record, span
+):
     """Footprints of the Gaussians start..stop in every view; returns how many reach a source plane."""
     white, vec, rec = np.empty((3, 3)), np.empty((8, 3)), np.empty(_RECORD)
     skipped = 0
@@ -138,7 +144,7 @@ def _set_up(start, stop, position, scale, rotation, cone, planar, origin, invers
                     )
                     if turned != 0.0:
                         reach += (turned * scale[n, a] * scale[n, a]) ** 2
-                ahead = 1.0 > 1.001 * cutoff * math.sqrt(reach) * vec[7, 2]
+                ahead = 1.001 * cutoff * math.sqrt(reach) * vec[7, 2] < 1.0
             if not ahead:
                 skipped += 1
                 continue
@@ -264,7 +270,13 @@ def _pull_back(v, cone, planar, vec, inverse, matrix, white, moments, g, grad_po
             g[5, a] += 2 * (vec[2, a] * k[1] + vec[3, a] * ky)
             g[1, a] = 2 * (vec[6, a] * k[1] + vec[2, a] * k[3] + vec[3, a] * kxy)
             g[2, a] = 2 * (vec[6, a] * ky + vec[2, a] * kxy + vec[3, a] * kyy)
-        uu, uv, vv, eu, ev = _dot(vec, 2, 2), _dot(vec, 2, 3), _dot(vec, 3, 3), _dot(vec, 6, 2), _dot(vec, 6, 3)
+        uu, uv, vv, eu, ev = (
+            _dot(vec, 2, 2),
+            _dot(vec, 2, 3),
+            _dot(vec, 3, 3),
+            _dot(vec, 6, 2),
+            _dot(vec, 6, 3),
+        )
         g_column -= 2 * (eu * k[0] + uu * k[1] + uv * ky)
         g_row -= 2 * (ev * k[0] + uv * k[1] + vv * ky)
     if planar:
@@ -286,7 +298,9 @@ def _pull_back(v, cone, planar, vec, inverse, matrix, white, moments, g, grad_po
                 grad_point[b] += white[a, b] * g[0, a]
     g_depth = -kappa * (g_column * vec[7, 0] + g_row * vec[7, 1] + g_kappa * kappa) if cone else 0.0
     for b in range(3):
-        grad_point[b] += kappa * (g_column * inverse[v, 0, b] + g_row * inverse[v, 1, b]) + g_depth * inverse[v, 2, b]
+        grad_point[b] += (
+            kappa * (g_column * inverse[v, 0, b] + g_row * inverse[v, 1, b]) + g_depth * inverse[v, 2, b]
+        )
 
 
 @njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")

@@ -71,7 +71,9 @@ def project(
             image = image + torch.einsum("kn,nij->kij", weight[:, part], kernel)
             skipped += left_out
         images.append(image)
-    image = torch.stack(images, 1) if images else position.new_zeros((len(weight), 0, views.rows, views.columns))
+    image = (
+        torch.stack(images, 1) if images else position.new_zeros((len(weight), 0, views.rows, views.columns))
+    )
     return image * (math.sqrt(2 * math.pi) * views.ray_lengths(position.device, position.dtype)), skipped
 
 
@@ -110,4 +112,3 @@ def _one_view(
     distance = torch.where(inside, distance, torch.zeros_like(distance))
     value = torch.exp(-0.5 * distance / length2) / length2.sqrt()
     return torch.where(inside, value, torch.zeros_like(value)), int((~ahead).sum())
-

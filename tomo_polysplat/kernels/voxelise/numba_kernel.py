@@ -188,7 +188,11 @@ def _gather_range(
             ahead = scaled[a, 0] * m[0] + scaled[a, 1] * m[1] + scaled[a, 2] * m[2]
             for b in range(3):
                 grad_position[n, b] -= 2 * ahead * white[a, b]
-                row = scaled[a, 0] * m[order[0, b]] + scaled[a, 1] * m[order[1, b]] + scaled[a, 2] * m[order[2, b]]
+                row = (
+                    scaled[a, 0] * m[order[0, b]]
+                    + scaled[a, 1] * m[order[1, b]]
+                    + scaled[a, 2] * m[order[2, b]]
+                )
                 grad_white[a, b] = 2 * row * spacing[b]
         whitening_adjoint(scale, rotation, n, white, grad_white, grad_scale, grad_rotation)
 
@@ -212,5 +216,7 @@ def backward(position, scale, rotation, weight, box: VoxelBox, cutoff: float, gr
     padded[..., :nx] = grad_volume.transpose(1, 2, 0, 3)
     grads = tuple(np.zeros_like(a) for a in (position, scale, rotation, weight))
     scene = (position, scale, rotation, weight, box.first, box.spacing, cutoff, nx, padded)
-    run_tasks(lambda a, b: _gather_range(a, b, *scene, *grads), split_range(len(position), 16 * cpu_threads()))
+    run_tasks(
+        lambda a, b: _gather_range(a, b, *scene, *grads), split_range(len(position), 16 * cpu_threads())
+    )
     return grads
