@@ -1,0 +1,150 @@
+"""TomoPy: ``tomopy.recon(tomo, theta, center=c, algorithm=tomo_polysplat.polysplat, options={...})``.
+
+A parallel beam, unless the options give an ASTRA geometry. Slices come back as from TomoPy's own algorithms:
+image row 0 at the largest y, attenuation in 1/pixel, or in 1/unit once the size of a pixel is known.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+
+import tomo_polysplat
+from tomo_polysplat.checks import fail, require_choice, require_shape
+from tomo_polysplat.plugins.host_options import solver_options
+from tomo_polysplat.plugins.tomopy_chunks import ChunkCollector
+
+__all__ = ["polysplat"]
+
+logger = logging.getLogger(__name__)
+
+_chunks = ChunkCollector()
+
+OWN_OPTIONS = ("pixel_size", "proj_geom", "vol_geom", "input", "energy_kev", "on_result")
+
+
+def polysplat(
+    tomo: np.ndarray, center: np.ndarray, recon: np.ndarray, theta: np.ndarray, **keywords: Any
+) -> None:
+    """Reconstruct for ``tomopy.recon``, which calls this; a user passes it as ``algorithm``.
+
+    Parameters
+    ----------
+    tomo : float32 array, shape (slices, views, columns)
+        Sinograms, -log(I/I0). Not modified. Values that are not finite, and zeros in the middle of the
+        object, are left out and counted in ``Result.counts``.
+    center : float32 array, shape (slices,)
+        Rotation axis in columns from the detector's edge; neighbours that share it are solved together.
+    recon : float32 array, shape (slices, num_gridx, num_gridy)
+        Receives the slices. What `init_recon` puts there is not used as a start.
+    theta : float32 array, shape (views,)
+        Angles in radians.
+    **keywords
+        ``num_gridx``, ``num_gridy`` and ``options``, a dict that is not modified:
+
+        - ``spectrum``, or ``kvp`` with ``filters`` (cm), ``anode`` and ``detector``; ``materials``;
+        - ``pixel_size`` in ``unit`` (default cm), which a spectrum needs; then values are in 1/unit;
+        - ``proj_geom`` and ``vol_geom``, ASTRA's in `unit`, with one slice per detector row;
+        - ``quality``, ``time_budget`` (seconds), ``seed``, ``device``, ``settings``, ``callbacks`` and
+          ``progress`` as for :func:`tomo_polysplat.reconstruct`;
+        - ``input="transmission"`` when no logarithm was taken; ``energy_kev`` of the slices;
+        - ``on_result``: called with the :class:`~tomo_polysplat.Result` of each group of slices.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For an unknown keyword or option, or one that contradicts another. TomoPy raises it in the caller.
+
+    Notes
+    -----
+    The whole volume is solved once, however TomoPy cuts it (`ncore`, `nchunk`).
+    """
+    options = keywords.pop("options", None)
+    options = {} if options is None else np.asarray(options, dtype=object).item()
+    for name in set(keywords) - {"num_gridx", "num_gridy"}:
+        raise fail(name, "no such keyword", repr(keywords[name]), "see options of tomo_polysplat.polysplat")
+    own, solver = solver_options(options, OWN_OPTIONS)
+    _require_one_geometry(own, solver)
+    whole = _chunks.add(tomo, center, recon)
+    if whole is None:
+        return
+    tomo, center, recon = whole
+    if own.get("proj_geom") is not None:
+        if not np.allclose(center, tomo.shape[2] / 2):
+            raise fail("center", "None beside proj_geom", f"{center[0]:g}", "proj_geom places the axis")
+        _solve(tomo, recon, own["proj_geom"], own["vol_geom"], own, solver)
+        return
+    start = 0
+    for centre, group in groupby(center.tolist()):
+        part = slice(start, start := start + len(list(group)))
+        geometry = _parallel_beam(tomo[part], recon[part], theta, centre, own.get("pixel_size"))
+        shared = dict(solver)
+        if shared.get("time_budget") is not None:
+            shared["time_budget"] *= (part.stop - part.start) / len(tomo)
+        _solve(tomo[part], recon[part], *geometry, own, shared)
+
+
+def _require_one_geometry(own: dict[str, Any], solver: dict[str, Any]) -> None:
+    """Refuse a geometry that is stated in part or twice, and fill in the unit that goes with it."""
+    stated = own.get("proj_geom") is not None
+    if stated != (own.get("vol_geom") is not None):
+        raise fail("options", "both of proj_geom and vol_geom", "one of them")
+    if stated and own.get("pixel_size") is not None:
+        raise fail("options['pixel_size']", "none beside proj_geom", "both", "the geometry has its size")
+    if stated or own.get("pixel_size") is not None:
+        solver.setdefault("unit", "cm")
+    elif solver.setdefault("unit", "pixel") != "pixel":
+        raise fail("options['pixel_size']", f"the size of a pixel in {solver['unit']}", "none")
+
+
+def _parallel_beam(
+    tomo: np.ndarray, recon: np.ndarray, theta: np.ndarray, centre: float, pixel_size: float | None
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    from tomo_polysplat.scan.layout import parallel_geometry, volume_geometry
+
+    size = 1.0 if pixel_size is None else pixel_size
+    proj_geom, _ = parallel_geometry(theta, len(tomo), tomo.shape[2], centre, size)
+    window = np.repeat(0.5 * size * np.array(recon.shape[::-1]), 2) * np.tile([-1, 1], 3)
+    return proj_geom, volume_geometry(np.array(recon.shape), window)
+
+
+def _solve(
+    tomo: np.ndarray,
+    recon: np.ndarray,
+    proj_geom: Mapping[str, Any],
+    vol_geom: Mapping[str, Any],
+    own: dict[str, Any],
+    solver: dict[str, Any],
+) -> None:
+    """Reconstruct slices that share a geometry, into `recon`."""
+    from tomo_polysplat.scan.geometry import from_astra
+
+    remedy = "TomoPy makes one slice per detector row, of num_gridx x num_gridy pixels"
+    shape = from_astra(proj_geom, vol_geom)[1].shape
+    require_shape("recon", recon, shape, "of vol_geom (slices, rows, columns)", remedy)
+    projections, valid = _line_integrals(tomo, own.get("input", "attenuation"))
+    result = tomo_polysplat.reconstruct(projections, proj_geom, vol_geom, valid=valid, **solver)
+    energy = own.get("energy_kev")
+    recon[...] = (result.volume if energy is None else result.attenuation(energy))[:, ::-1]
+    if own.get("on_result") is not None:
+        own["on_result"](result)
+
+
+def _line_integrals(tomo: np.ndarray, kind: str) -> tuple[np.ndarray, np.ndarray | None]:
+    """Projections (rows, views, columns), TomoPy's order of sinograms, and which of them to use."""
+    from tomo_polysplat.scan.defects import attenuation
+    from tomo_polysplat.scan.dropouts import dropped_rays
+
+    require_choice("options['input']", kind, ("attenuation", "transmission"))
+    projections, valid, _ = attenuation(tomo, kind)
+    valid &= ~dropped_rays(np.where(valid, projections, np.nan))
+    lost = int(valid.size - np.count_nonzero(valid))
+    if lost:
+        logger.warning(
+            "%d of %d rays of tomo are left out: not finite, or zero in the object", lost, valid.size
+        )
+    return projections, valid if lost else None
