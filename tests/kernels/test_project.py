@@ -142,7 +142,8 @@ def test_views_together_are_the_views_one_by_one(fast):
     together, _ = run_project(scene, views, *fast)
     cotangent = random_like(together[0])
     parts = [
-        run_project(scene, views.select([v]), *fast, cotangent=cotangent[:, v : v + 1])[0] for v in range(len(views))
+        run_project(scene, views.select([v]), *fast, cotangent=cotangent[:, v : v + 1])[0]
+        for v in range(len(views))
     ]
     images = torch.cat([part[0] for part in parts], dim=1)
     torch.testing.assert_close(together[0], images, rtol=1e-6, atol=1e-6 * float(images.max()))

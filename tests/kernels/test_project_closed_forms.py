@@ -24,7 +24,9 @@ def _rays(views, view):
     steps = column * u + row * v
     if views.cone:
         ray = d + steps
-        return np.broadcast_to(views.origin[view], ray.shape), ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+        return np.broadcast_to(views.origin[view], ray.shape), ray / np.linalg.norm(
+            ray, axis=-1, keepdims=True
+        )
     return views.origin[view] + steps, np.broadcast_to(d / np.linalg.norm(d), steps.shape)
 
 
@@ -71,7 +73,9 @@ def test_a_far_source_gives_parallel_rays():
     direction = parallel.matrix[:, :, 2] / np.linalg.norm(parallel.matrix[:, :, 2], axis=1, keepdims=True)
     matrix = parallel.matrix.copy()
     matrix[:, :, 2] = distance * direction
-    cone = DetectorViews(True, parallel.origin - distance * direction, matrix, parallel.rows, parallel.columns)
+    cone = DetectorViews(
+        True, parallel.origin - distance * direction, matrix, parallel.rows, parallel.columns
+    )
     # Cut beyond what matters, so that no pixel is in one image and cut from the other.
     expected = reference.project(*scene, parallel, cutoff=9.0)[0]
     image, skipped = reference.project(*scene, cone, cutoff=9.0)
@@ -145,12 +149,18 @@ def test_moving_scanner_and_gaussians_together_changes_nothing(make_views):
         scene[3],
     ]
     expected = reference.project(*scene, views, cutoff=3.0)[0]
-    np.testing.assert_allclose(reference.project(*other, moved, cutoff=3.0)[0], expected, rtol=1e-8, atol=1e-14)
+    np.testing.assert_allclose(
+        reference.project(*other, moved, cutoff=3.0)[0], expected, rtol=1e-8, atol=1e-14
+    )
 
 
 @pytest.mark.parametrize(
     "views",
-    [cone_views(2, 3, 5, pixel=(0.5, 0.4)), parallel_views(2, 3, 5, pixel=(0.4, 0.3)), planar_views(True, 2, 9)],
+    [
+        cone_views(2, 3, 5, pixel=(0.5, 0.4)),
+        parallel_views(2, 3, 5, pixel=(0.4, 0.3)),
+        planar_views(True, 2, 9),
+    ],
     ids=["cone", "parallel", "fan"],
 )
 def test_derivatives_of_the_reference(views):

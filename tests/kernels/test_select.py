@@ -28,7 +28,9 @@ def test_a_kernel_asked_for_by_name():
 
 
 def test_unknown_kernel():
-    with pytest.raises(ValueError, match="kernel: expected auto or one of triton, numba, reference, got 'opencl'"):
+    with pytest.raises(
+        ValueError, match="kernel: expected auto or one of triton, numba, reference, got 'opencl'"
+    ):
         select.choose(CPU, "opencl")
 
 

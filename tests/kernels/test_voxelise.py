@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from splat_scenes import as_float32, assert_close, gaussians, random_like, run_project, run_voxelise, voxel_box
+from splat_scenes import (
+    as_float32,
+    assert_close,
+    gaussians,
+    random_like,
+    run_project,
+    run_voxelise,
+    voxel_box,
+)
 
 from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.kernels.voxelise import reference
@@ -105,7 +113,9 @@ def test_two_dimensional_gaussians_are_alike_in_every_slice(slices, fast):
     box = voxel_box((slices, 31, 33), (0.06, 0.07, 0.1))
     expected, got = run_voxelise(scene, box), run_voxelise(scene, box, *fast)
     assert torch.equal(got[0][:, 0], got[0][:, -1])
-    expected[2], got[2] = expected[2][:, :2], got[2][:, :2]
+    # In the plane only: the compiled kernels do not follow a two-dimensional Gaussian out of it.
+    for results in (expected, got):
+        results[2], results[3] = results[2][:, :2], results[3][:, [0, 3]]
     assert_close(got, expected)
 
 
@@ -146,7 +156,9 @@ def test_part_of_a_box_is_that_part_of_the_volume(fast):
 
 
 def test_part_keeps_the_voxel_centres():
-    part = VoxelBox(np.array([1.0, 2.0, 3.0]), np.array([0.1, 0.2, 0.3]), (9, 9, 9)).part((2, 1, 4), (3, 3, 3))
+    part = VoxelBox(np.array([1.0, 2.0, 3.0]), np.array([0.1, 0.2, 0.3]), (9, 9, 9)).part(
+        (2, 1, 4), (3, 3, 3)
+    )
     np.testing.assert_allclose(part.first, [1.4, 2.2, 3.6])
     assert part.shape == (3, 3, 3)
 
