@@ -6,6 +6,8 @@ No index is checked: the caller keeps every block inside its array.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from llvmlite import ir
 from numba import njit, types
@@ -18,6 +20,9 @@ LANES = 16
 _VECTOR = ir.VectorType(ir.FloatType(), LANES)
 _FLAGS = ("contract",)
 
+# Its type hints count the typing context among the arguments of a call.
+_intrinsic: Any = intrinsic
+
 
 def _pointer(context, builder, array_type, array, start):
     data = context.make_array(array_type)(context, builder, array).data
@@ -29,7 +34,7 @@ def _accumulate(builder, target, a, b):
     builder.store(builder.fadd(builder.load(target, align=4), product, flags=_FLAGS), target, align=4)
 
 
-@intrinsic
+@_intrinsic
 def add_scaled(typing, target, target_start, factor, source, source_start):
     """``target[t : t + LANES] += factor * source[s : s + LANES]`` of the flattened, C-contiguous arrays."""
 
@@ -43,7 +48,7 @@ def add_scaled(typing, target, target_start, factor, source, source_start):
     return types.void(target, types.intp, types.float32, source, types.intp), generate
 
 
-@intrinsic
+@_intrinsic
 def add_product(typing, target, target_start, a, a_start, b, b_start):
     """``target[t : t + LANES] += a[i : i + LANES] * b[j : j + LANES]``, likewise."""
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import logging
+from typing import Any
 
 import numpy as np
 import torch
@@ -39,7 +40,7 @@ def choose(device: torch.device, requested: str = "auto") -> tuple[str, str]:
                 "kernel", f"a kernel that runs on {device}", f"{requested!r} ({reason})", "use kernel='auto'"
             )
         return requested, "asked for"
-    refused = []
+    refused: list[str] = []
     for name in KERNELS:
         usable, reason = availability(name, device.type)
         if usable:
@@ -92,7 +93,7 @@ def _self_check(name: str, device_type: str) -> float:
     target = torch.rand((3, 1, 9, 13), generator=generator)
     outcomes = []
     for kernel, device, dtype in (("reference", "cpu", torch.float64), (name, device_type, torch.float32)):
-        inputs = [t.to(device, dtype).requires_grad_() for t in scene]
+        inputs: Any = [t.to(device, dtype).requires_grad_() for t in scene]
         image, _ = project(*inputs, views, kernel=kernel, cutoff=3.0)
         (image * target.to(device, dtype)).sum().backward()
         outcomes.append([t.detach().cpu().double() for t in (image, *(t.grad for t in inputs))])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 
@@ -43,7 +44,7 @@ class _NumbaProject(torch.autograd.Function):
     def forward(ctx, position, scale, rotation, weight, views, cutoff):
         from tomo_polysplat.kernels.project import numba_kernel
 
-        arrays = [t.detach().contiguous().numpy() for t in (position, scale, rotation, weight)]
+        arrays: Any = [t.detach().contiguous().numpy() for t in (position, scale, rotation, weight)]
         image, skipped, state = numba_kernel.forward(*arrays, views, cutoff)
         ctx.arrays, ctx.views, ctx.cutoff, ctx.state = arrays, views, cutoff, state
         return torch.from_numpy(image), skipped

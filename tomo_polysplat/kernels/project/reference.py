@@ -7,6 +7,7 @@ derives the formula.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 
@@ -58,7 +59,7 @@ def project(
         Pairs of a Gaussian and a view left out because the Gaussian reaches the source plane.
     """
     whiten = whitening_matrices(scale, rotation)
-    like = {"device": position.device, "dtype": position.dtype}
+    like: dict[str, Any] = {"device": position.device, "dtype": position.dtype}
     pixels = views.rows * views.columns
     chunk = max(1, _PAIRS_AT_ONCE // pixels)
     images, skipped = [], 0
@@ -81,7 +82,7 @@ def _one_view(
     position: torch.Tensor, whiten: torch.Tensor, scale: torch.Tensor, view: DetectorViews, cutoff: float
 ) -> tuple[torch.Tensor, int]:
     """``exp(-distance^2 / 2) / |e|`` of shape (n, rows, columns) and the number of Gaussians left out."""
-    like = {"device": position.device, "dtype": position.dtype}
+    like: dict[str, Any] = {"device": position.device, "dtype": position.dtype}
     origin = torch.as_tensor(view.origin[0], **like)
     inverse = torch.as_tensor(view.inverse[0], **like)
     step_u, step_v, direction = torch.as_tensor(view.matrix[0], **like).unbind(1)

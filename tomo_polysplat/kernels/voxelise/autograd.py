@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 
 from tomo_polysplat.kernels.voxelise import reference
@@ -38,7 +40,7 @@ class _NumbaVoxelise(torch.autograd.Function):
     def forward(ctx, position, scale, rotation, weight, box, cutoff):
         from tomo_polysplat.kernels.voxelise import numba_kernel
 
-        arrays = [t.detach().contiguous().numpy() for t in (position, scale, rotation, weight)]
+        arrays: Any = [t.detach().contiguous().numpy() for t in (position, scale, rotation, weight)]
         ctx.arrays, ctx.box, ctx.cutoff = arrays, box, cutoff
         return torch.from_numpy(numba_kernel.forward(*arrays, box, cutoff))
 

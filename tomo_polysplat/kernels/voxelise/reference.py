@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 
 from tomo_polysplat.kernels.project.reference import whitening_matrices
@@ -24,7 +26,7 @@ def voxelise(
 
     Parameters as for ``kernels.project.reference.project``. Returns a (channels, nz, ny, nx) tensor.
     """
-    like = {"device": position.device, "dtype": position.dtype}
+    like: dict[str, Any] = {"device": position.device, "dtype": position.dtype}
     axes = [box.first[k] + torch.arange(box.shape[2 - k], **like) * box.spacing[k] for k in range(3)]
     z, y, x = torch.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
     centres = torch.stack([x, y, z], -1).reshape(-1, 3)
