@@ -16,6 +16,7 @@ from __future__ import annotations
 import logging
 import threading
 import weakref
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -69,7 +70,7 @@ class ChunkCollector:
         Raises
         ------
         ValueError
-            If shapes disagree, or a slice comes twice.
+            If shapes disagree, a slice comes twice, or the number of slices cannot be known.
         """
         roots = [_root(tomo), _root(recon)]
         # A number, or one number repeated, has no memory that would tell the number of slices.
@@ -83,7 +84,10 @@ class ChunkCollector:
         require_shape("recon", recon, (len(tomo), *recon.shape[1:]), "(slices, y, x)", "check init_recon")
         require_shape("center", centres, (len(tomo),), "(slices,)")
         sizes = (tomo[0].nbytes, recon[0].nbytes, centres.itemsize)
-        slices = min(root.nbytes // size for root, size in zip(roots, sizes))
+        counts = [root.nbytes // size for root, size in zip(roots, sizes)]
+        slices = min(counts)
+        if len(roots) == 2 and counts[0] != counts[1]:
+            raise fail("nchunk", "a number > 0 for parts of larger arrays", "0", "nchunk=1 does the same")
         if slices == len(tomo):
             return tomo, centres, recon
         with self._lock:
@@ -96,15 +100,11 @@ class ChunkCollector:
             del self._calls[_key(roots)]
             for finalizer in call.finalizers:
                 finalizer.detach()
-        images = sorted(call.pieces)
-        sinograms = [call.pieces[image][0] for image in images]
-        all_centres = [call.pieces[image][1] for image in images]
-        counts = [len(part) for part in all_centres]
-        return (
-            _whole(tomo, roots[0], sinograms, counts),
-            np.concatenate(all_centres),
-            _whole(recon, roots[1], images, counts),
-        )
+        images, pieces = zip(*sorted(call.pieces.items()))
+        sinograms, parts = zip(*pieces)
+        lengths = [len(part) for part in parts]
+        volume = _whole(recon, roots[1], images, lengths)
+        return _whole(tomo, roots[0], sinograms, lengths), np.concatenate(parts), volume
 
     def _call_of(self, roots: list[np.ndarray], slices: int) -> _Call:
         key = _key(roots)
@@ -118,8 +118,7 @@ class ChunkCollector:
         with self._lock:
             call = self._calls.pop(key, None)
         if call is not None:
-            message = "TomoPy handed over %d of %d slices only: nothing was reconstructed"
-            logger.warning(message, call.arrived, call.slices)
+            logger.warning("%d of %d slices came: nothing was reconstructed", call.arrived, call.slices)
 
 
 def _root(array: np.ndarray) -> np.ndarray:
@@ -137,13 +136,13 @@ def _address(array: np.ndarray) -> int:
     return array.__array_interface__["data"][0]
 
 
-def _whole(chunk: np.ndarray, root: np.ndarray, addresses: list[int], counts: list[int]) -> np.ndarray:
+def _whole(chunk: np.ndarray, root: np.ndarray, addresses: Sequence[int], lengths: list[int]) -> np.ndarray:
     """All slices as one view of the memory of `root`, given where the pieces start and how long they are."""
     size = chunk[0].nbytes
-    expected = addresses[0] + size * np.cumsum([0, *counts])
+    expected = addresses[0] + size * np.cumsum([0, *lengths])
     memory = root.ravel(order="K").view(np.uint8)
     if not np.array_equal(addresses, expected[:-1]) or not np.may_share_memory(memory, root):
         raise fail("tomo, recon", "slices one after the other in memory", "others", "pass ncore=1")
     start = addresses[0] - _address(memory)
-    whole = memory[start : start + size * sum(counts)].view(chunk.dtype)
-    return whole.reshape(sum(counts), *chunk.shape[1:])
+    whole = memory[start : start + size * sum(lengths)].view(chunk.dtype)
+    return whole.reshape(sum(lengths), *chunk.shape[1:])

@@ -30,7 +30,7 @@ OWN_OPTIONS = ("pixel_size", "proj_geom", "vol_geom", "input", "energy_kev", "on
 def polysplat(
     tomo: np.ndarray, center: np.ndarray, recon: np.ndarray, theta: np.ndarray, **keywords: Any
 ) -> None:
-    """Reconstruct for ``tomopy.recon``, which calls this; a user passes it as ``algorithm``.
+    """The ``algorithm`` for ``tomopy.recon``: one solve, however TomoPy cuts the slices into chunks.
 
     Parameters
     ----------
@@ -59,14 +59,13 @@ def polysplat(
     ValueError, TypeError
         For an unknown keyword or option, or one that contradicts another. TomoPy raises it in the caller.
 
-    Notes
-    -----
-    The whole volume is solved once, however TomoPy cuts it (`ncore`, `nchunk`).
     """
     options = keywords.pop("options", None)
     options = {} if options is None else np.asarray(options, dtype=object).item()
-    for name in set(keywords) - {"num_gridx", "num_gridy"}:
-        raise fail(name, "no such keyword", repr(keywords[name]), "see options of tomo_polysplat.polysplat")
+    grid = tuple(int(keywords.pop(f"num_grid{axis}", size)) for axis, size in zip("xy", recon.shape[-2:]))
+    require_shape("init_recon", recon, (*recon.shape[:-2], *grid), "(..., num_gridx, num_gridy)")
+    for name, value in keywords.items():
+        raise fail(name, "no such keyword", repr(value), "see options of tomo_polysplat.polysplat")
     own, solver = solver_options(options, OWN_OPTIONS)
     _require_one_geometry(own, solver)
     whole = _chunks.add(tomo, center, recon)
