@@ -104,7 +104,7 @@ def test_aspect_ratio_of_a_thousand(thin, fast):
     scene[0][:9] = torch.as_tensor(box.first + box.spacing * np.array([8, 7, 5]))
     scene = as_float32(scene)
     expected, got = run_voxelise(scene, box, cutoff=5.0), run_voxelise(scene, box, *fast, cutoff=5.0)
-    assert_close(got, expected, image=1e-3, gradient=3e-3)
+    assert_close(got, expected, image=3e-4, gradient=1e-3)
 
 
 @pytest.mark.parametrize("slices", [1, 3])
