@@ -19,11 +19,11 @@ from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.kernels import select
 from tomo_polysplat.model.gaussians import Gaussians
-from tomo_polysplat.model.seed import Seeding, seed_gaussians
+from tomo_polysplat.model.seed import seed_gaussians
 from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.quadrature import fit_quadrature
 from tomo_polysplat.physics.spectrum import Spectrum
-from tomo_polysplat.physics.water import water_equivalent
+from tomo_polysplat.physics.water import transmitted_energy, water_equivalent
 from tomo_polysplat.render.renderer import detector_views, voxel_box
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import (
@@ -122,7 +122,7 @@ def reconstruct(
         )
         plan = make_plan(start, geometry, grid, chosen, polychromatic, target.type)
         plan.reasons["start"] = f"{about['method'].upper()}: {about['reason']}"
-        scene, gaussians, seeding, rays = _set_up(
+        scene, gaussians, spacing, rays = _set_up(
             values,
             geometry,
             grid,
@@ -138,7 +138,7 @@ def reconstruct(
             to_volume = _volume_of(scene, plan, curves, spectrum, unit)
             outcome = fit(
                 gaussians,
-                seeding,
+                spacing,
                 rays,
                 scene,
                 chosen,
@@ -239,34 +239,44 @@ def _set_up(
     unit: str,
     settings: Settings,
     device: torch.device,
-) -> tuple[FitScene, Gaussians, Seeding, Rays]:
+) -> tuple[FitScene, Gaussians, float, Rays]:
     """The forward model, the seeds and the rays, in the solver's coordinates."""
     planar = geometry.planar and grid.planar
     length = 0.5 * float(grid.extent[: 2 if planar else 3].max())
     inside, outside = grid.normalised(grid.centre, length), geometry.normalised(grid.centre, length)
     kernel, why = select.choose(device, settings.kernel)
     plan.reasons["kernel"] = f"{kernel}: {why}"
-    curve, quadrature, scale = None, None, length * plan.reference
+    quadrature, reference_curve, output_curve, scale = None, None, None, length * plan.reference
     if spectrum is not None and curves is not None:
         largest = float(np.clip(np.nanmax(values), 1.0, _LARGEST_PROJECTION))
         quadrature = fit_quadrature(spectrum, curves, max_path=largest, nodes=settings.spectral_nodes or None)
         plan.reasons["spectrum"] = quadrature.describe()
-        attenuation = curves.mass_attenuation([spectrum.effective_energy])[:, 0]
-        curve = torch.as_tensor(attenuation / attenuation[0], dtype=torch.float32, device=device)
+        energy = transmitted_energy(values, spectrum)
+        plan.reasons["reference_energy"] = f"{energy:.1f} keV: the mean of what a typical ray transmits"
+        reference_curve = _relative(curves, energy, device)
+        output_curve = _relative(curves, spectrum.effective_energy, device)
         scale *= cm_per(unit)
-    scene = FitScene(voxel_box(inside), quadrature, scale, curve, curve, kernel, settings.cutoff)
+    scene = FitScene(
+        voxel_box(inside), quadrature, scale, reference_curve, output_curve, kernel, settings.cutoff
+    )
     spacing = plan.spacing * float(inside.voxel_size[: 2 if planar else 3].min())
-    gaussians, seeding = seed_gaussians(
+    gaussians = seed_gaussians(
         start / plan.reference, inside, spacing, settings, spectrum is not None, device
     )
     plan.reasons["gaussians"] = (
-        f"{len(gaussians)}, the material number free for {int(seeding.material_free.sum())}"
+        f"{len(gaussians)}, the material number free for {int((gaussians.group < 0).sum())}"
     )
     photons = float("inf") if settings.loss == "l1" else photons_per_ray(values)
     plan.reasons["photons_per_ray"] = f"{photons:.3g}, from the scatter of neighbouring pixels"
     views = detector_views(outside, planar)
     rays = Rays(torch.from_numpy(values).to(device), views, photons, settings.model_error, settings.held_out)
-    return scene, gaussians, seeding, rays
+    return scene, gaussians, spacing, rays
+
+
+def _relative(curves: Materials, energy: float, device: torch.device) -> torch.Tensor:
+    """(3,) mass attenuation of the curves over that of the first."""
+    attenuation = curves.mass_attenuation([energy])[:, 0]
+    return torch.as_tensor(attenuation / attenuation[0], dtype=torch.float32, device=device)
 
 
 def _volume_of(
@@ -316,7 +326,7 @@ def _result(
             "scale": gaussians.scale().cpu().numpy() * length,
             "rotation": torch.nn.functional.normalize(gaussians.rotation, dim=1).cpu().numpy(),
             "density": heights.cpu().numpy() * plan.reference,
-            "u": gaussians.material.cpu().numpy(),
+            "u": gaussians.material().cpu().numpy(),
         }
     return Result(
         basis,

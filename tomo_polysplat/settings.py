@@ -26,11 +26,11 @@ class Settings:
     """Upper bound of the number of Gaussians; 0 leaves it to the plan."""
     seed_spacing: float = 0.0
     """Distance of the seeds in voxels; 0 leaves it to the plan."""
-    seed_width: float = 0.6
+    seed_width: float = 0.5
     """Standard deviation of a seed in units of the spacing."""
     support_level: float = 0.1
     """Voxels of the start below this share of the soft reference get no Gaussian."""
-    smallest_scale: float = 0.35
+    smallest_scale: float = 0.2
     """Smallest standard deviation in voxels."""
     largest_scale: float = 8.0
     """Largest standard deviation in seed spacings."""
@@ -38,19 +38,23 @@ class Settings:
     """Start attenuation, in soft references, above which a Gaussian starts as bone-like."""
     metal_level: float = 6.0
     """The same for metal."""
-    soft_u: float = 0.002
-    """Material number that soft matter starts from, and keeps away from dense matter."""
+    soft_u: float = 0.0
+    """Material number of soft matter; near dense matter a start, elsewhere it stays."""
     bone_u: float = 0.35
     metal_u: float = 0.8
     free_radius: float = 6.0
-    """Material numbers are free within this many voxels of bone-like or denser matter."""
-    learning_rate_position: float = 0.05
+    """Gaussians have a material number of their own within this many voxels of bone-like or denser matter."""
+    learning_rate_position: float = 0.03
     """Per step, in seed spacings."""
-    learning_rate_scale: float = 1.5e-2
+    learning_rate_scale: float = 4e-2
     """Per step, relative."""
     learning_rate_rotation: float = 3e-3
     learning_rate_attenuation: float = 1e-2
-    learning_rate_material: float = 2e-2
+    learning_rate_material: float = 1e-2
+    learning_rate_shared: float = 5e-3
+    """Of each piece of metal's one number."""
+    material_from: float = 0.4
+    """Share of the run after which the metals' numbers are fitted: before, they would explain blur."""
     final_rate: float = 0.1
     """Learning rates fall exponentially to this share of their start."""
     loss: str = "huber"

@@ -16,13 +16,14 @@ from tomo_polysplat.fit.loss import misfit, roughness
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
-from tomo_polysplat.model.seed import Seeding
 from tomo_polysplat.settings import Settings
 
 __all__ = ["FitOutcome", "FitState", "fit"]
 
 logger = logging.getLogger(__name__)
 
+# Fat and plastics harden a beam less than water does: their curve is the mixture's continued a little below 0.
+LEAST_U = -0.1
 # A held-out error that falls by less than this share in a pass over the views has stopped falling.
 _IMPROVEMENT = 2e-3
 
@@ -74,7 +75,7 @@ class _Fitter:
     def __init__(
         self,
         gaussians: Gaussians,
-        seeding: Seeding,
+        spacing: float,
         rays: Rays,
         scene: FitScene,
         settings: Settings,
@@ -82,21 +83,21 @@ class _Fitter:
     ) -> None:
         self.gaussians, self.rays, self.scene, self.settings, self.rng = gaussians, rays, scene, settings, rng
         rates = {
-            "position": settings.learning_rate_position * seeding.spacing,
+            "position": settings.learning_rate_position * spacing,
             "log_scale": settings.learning_rate_scale,
             "rotation": settings.learning_rate_rotation,
             "attenuation": settings.learning_rate_attenuation,
-            "material": settings.learning_rate_material,
+            "own_material": settings.learning_rate_material,
+            "shared_material": settings.learning_rate_shared,
         }
-        parameters = gaussians.tensors()
+        parameters = gaussians.parameters()
         groups = [{"params": [parameters[k].requires_grad_()], "lr": v, "rate": v} for k, v in rates.items()]
         self.optimiser = torch.optim.Adam(groups, eps=1e-15, fused=True)
         voxel = float(scene.box.spacing[: 2 if gaussians.planar else 3].min())
         self.bounds = (
             math.log(settings.smallest_scale * voxel),
-            math.log(settings.largest_scale * seeding.spacing),
+            math.log(settings.largest_scale * spacing),
         )
-        self.frozen = torch.as_tensor(~seeding.material_free, device=gaussians.position.device)
         self.order = np.empty(0, int)
 
     def step(self, share: float, batch: int) -> tuple[torch.Tensor, torch.Tensor, int | torch.Tensor]:
@@ -113,14 +114,24 @@ class _Fitter:
             )
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        if self.scene.polychromatic:
-            self.gaussians.material.grad[self.frozen] = 0.0
+        self._hold_materials(share)
         self.optimiser.step()
         with torch.no_grad():
             self.gaussians.attenuation.clamp_(min=0.0)
-            self.gaussians.material.clamp_(0.0, 1.0)
+            self.gaussians.own_material.clamp_(LEAST_U, 1.0)
+            self.gaussians.shared_material.clamp_(LEAST_U, 1.0)
             self.gaussians.log_scale.clamp_(*self.bounds)
             return fitted.detach(), misfit(predicted, measured, aside, self.settings), skipped
+
+    def _hold_materials(self, share: float) -> None:
+        """Keep the soft matter's number, and for a while the metals': while edges are blurred they would drift.
+
+        A little cupping and a little hardening look alike, so a soft number that is free trades one for the
+        other; held at the first curve the two stay apart.
+        """
+        gradient = self.gaussians.shared_material.grad
+        if gradient is not None:
+            gradient[: 1 if share >= self.settings.material_from else None] = 0.0
 
     def _next_views(self, batch: int) -> np.ndarray:
         """The next views of an order that uses each once before any again."""
@@ -132,7 +143,7 @@ class _Fitter:
 
 def fit(
     gaussians: Gaussians,
-    seeding: Seeding,
+    spacing: float,
     rays: Rays,
     scene: FitScene,
     settings: Settings,
@@ -150,7 +161,7 @@ def fit(
     held-out rays have not improved for ``settings.patience`` passes, when a callback returns True, or on
     KeyboardInterrupt; returns the Gaussians of the pass whose held-out rays fitted best.
     """
-    fitter = _Fitter(gaussians, seeding, rays, scene, settings, rng)
+    fitter = _Fitter(gaussians, spacing, rays, scene, settings, rng)
     count = len(rays.views)
     batch = min(views_per_step, count)
     per_pass = max(1, round(count / batch))

@@ -28,30 +28,43 @@ class Gaussians:
         Quaternions (w, x, y, z) of any length.
     attenuation : (n,) tensor
         At the centre and the reference energy, not negative.
-    material : (n,) tensor
-        The number u in [0, 1].
+    own_material : (n,) tensor
+        Material number u of the Gaussians that have one to themselves.
+    shared_material : (groups,) tensor
+        Material number of each group.
+    group : (n,) int64 tensor
+        The group whose material number a Gaussian shares, or -1 for its own. What the rays cannot tell apart
+        Gaussian by Gaussian, such as the plastic around a pin, they tell very well for all of it together.
     """
 
     position: torch.Tensor
     log_scale: torch.Tensor
     rotation: torch.Tensor
     attenuation: torch.Tensor
-    material: torch.Tensor
+    own_material: torch.Tensor
+    shared_material: torch.Tensor
+    group: torch.Tensor
 
     def __len__(self) -> int:
         return len(self.position)
 
-    def tensors(self) -> dict[str, torch.Tensor]:
-        """The parameters by name."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+    def parameters(self) -> dict[str, torch.Tensor]:
+        """What is fitted, by name."""
+        return {field.name: getattr(self, field.name) for field in fields(self) if field.name != "group"}
 
     def copy(self) -> Gaussians:
-        """Detached copies of the parameters."""
-        return Gaussians(**{name: t.detach().clone() for name, t in self.tensors().items()})
+        """Detached copies of everything."""
+        return Gaussians(
+            **{k: t.detach().clone() for k, t in self.parameters().items()}, group=self.group.clone()
+        )
 
     def select(self, chosen: torch.Tensor) -> Gaussians:
         """The Gaussians of an index or mask, still attached to the graph."""
-        return Gaussians(**{name: t[chosen] for name, t in self.tensors().items()})
+        whole = {"shared_material": self.shared_material}
+        own = {
+            field.name: getattr(self, field.name)[chosen] for field in fields(self) if field.name not in whole
+        }
+        return Gaussians(**own, **whole)
 
     @property
     def planar(self) -> bool:
@@ -65,13 +78,17 @@ class Gaussians:
             scale = torch.cat([scale, scale.new_full((len(scale), 1), math.inf)], dim=1)
         return scale
 
+    def material(self) -> torch.Tensor:
+        """(n,) material numbers u."""
+        return torch.where(self.group < 0, self.own_material, self.shared_material[self.group.clamp(min=0)])
+
     def weights(self, curve: torch.Tensor | None) -> torch.Tensor:
-        """(3, n) densities of the soft, middle and dense curve, or the (1, n) attenuation without a ``curve``.
+        """(3, n) densities of the soft, middle and dense curve, or the (1, n) attenuation without a curve.
 
         ``curve`` (3,) is the mass attenuation of the curves at the reference energy over that of the first.
         """
         if curve is None:
             return self.attenuation[None]
-        u = self.material
+        u = self.material()
         mixture = torch.stack([(1 - u).square(), 2 * u * (1 - u), u.square()])
         return mixture * (self.attenuation / (curve @ mixture))

@@ -6,35 +6,19 @@ The grid is twice as fine at metal, whose edges are where an error of position c
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 
+from tomo_polysplat.kernels.spatial_order import spatial_order
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.settings import Settings
 
-__all__ = ["Seeding", "seed_gaussians"]
+__all__ = ["seed_gaussians"]
 
 # Attenuation, in soft references, that a seed in what looks like air starts from: from zero it would not grow.
 _LEAST = 0.02
-
-
-@dataclass(frozen=True)
-class Seeding:
-    """What a cloud of seeds was made with.
-
-    Attributes
-    ----------
-    spacing : float
-        Distance of neighbouring seeds, in the grid's unit of length.
-    material_free : (n,) bool array
-        Gaussians near dense matter, whose material number is worth fitting.
-    """
-
-    spacing: float
-    material_free: np.ndarray
 
 
 def seed_gaussians(
@@ -44,7 +28,7 @@ def seed_gaussians(
     settings: Settings,
     polychromatic: bool,
     device: torch.device,
-) -> tuple[Gaussians, Seeding]:
+) -> Gaussians:
     """Seed the support of a start volume.
 
     Parameters
@@ -65,13 +49,7 @@ def seed_gaussians(
     value, nearby = _sample(start, points, grid, spacing, dims)
     keep = nearby > settings.support_level
     points, size, value = points[keep], size[keep], np.maximum(value[keep], _LEAST)
-    u = np.full(len(points), settings.soft_u)
-    free = np.zeros(len(points), bool)
-    if polychromatic:
-        u[value > settings.bone_level] = settings.bone_u
-        u[value > settings.metal_level] = settings.metal_u
-        reach = settings.free_radius * float(grid.voxel_size[:dims].min())
-        free = _reaches(start, points, grid, settings.bone_level, reach)
+    own, shared, group = _materials(start, points, value, grid, settings, polychromatic)
     # A lattice of Gaussians of this height averages to the wanted value: the cell's integral over the
     # Gaussian's.
     width = settings.seed_width
@@ -87,9 +65,13 @@ def seed_gaussians(
         tensor(np.repeat(np.log(width * size)[:, None], dims, axis=1)),
         tensor(rotation),
         tensor(attenuation),
-        tensor(u),
+        tensor(own),
+        tensor(shared),
+        torch.as_tensor(group, device=device),
     )
-    return gaussians, Seeding(spacing, free)
+    # Neighbours in space beside each other in memory, which the kernels use.
+    order = spatial_order(gaussians.position)
+    return gaussians.select(order)
 
 
 def _lattice(grid: VolumeGrid, spacing: float, dims: int) -> np.ndarray:
@@ -123,7 +105,9 @@ def _split(points: np.ndarray, spacing: float, dims: int) -> np.ndarray:
     return (points[:, None] + offsets).reshape(-1, 3)
 
 
-def _reaches(start: np.ndarray, points: np.ndarray, grid: VolumeGrid, level: float, reach: float) -> np.ndarray:
+def _reaches(
+    start: np.ndarray, points: np.ndarray, grid: VolumeGrid, level: float, reach: float
+) -> np.ndarray:
     """Points within a distance of a voxel above a level."""
     from scipy import ndimage
 
@@ -132,6 +116,34 @@ def _reaches(start: np.ndarray, points: np.ndarray, grid: VolumeGrid, level: flo
         return np.zeros(len(points), bool)
     distance = ndimage.distance_transform_edt(~above, sampling=grid.voxel_size[::-1])
     return distance[_voxel_of(points, grid)] <= reach
+
+
+def _materials(
+    start: np.ndarray,
+    points: np.ndarray,
+    value: np.ndarray,
+    grid: VolumeGrid,
+    settings: Settings,
+    polychromatic: bool,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Material numbers of their own, of the groups, and the group of every seed.
+
+    Group 0 is the soft matter away from anything dense; then comes one for every separate piece of metal. In
+    between, where the start cannot be trusted to tell what is what, every Gaussian has its own.
+    """
+    from scipy import ndimage
+
+    group = np.zeros(len(points), np.int64)
+    own = np.full(len(points), settings.soft_u)
+    if not polychromatic:
+        return own, np.array([settings.soft_u]), group
+    reach = settings.free_radius * float(grid.voxel_size[: 2 if grid.planar else 3].min())
+    group[_reaches(start, points, grid, settings.bone_level, reach)] = -1
+    own[value > settings.bone_level] = settings.bone_u
+    pieces, number = ndimage.label(start > settings.metal_level)
+    piece = pieces[_voxel_of(points, grid)]
+    group[piece > 0] = piece[piece > 0]
+    return own, np.r_[settings.soft_u, np.full(number, settings.metal_u)], group
 
 
 def _voxel_of(points: np.ndarray, grid: VolumeGrid) -> tuple[np.ndarray, ...]:

@@ -11,7 +11,7 @@ from tomo_polysplat.physics.beer_lambert import projection
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.physics.spectrum import Spectrum
 
-__all__ = ["water_equivalent", "water_linearised"]
+__all__ = ["transmitted_energy", "water_equivalent", "water_linearised"]
 
 _TABLE = 8192
 
@@ -57,3 +57,18 @@ def water_linearised(projections: Any, spectrum: Spectrum) -> np.ndarray:
     return float(mass_attenuation("water", spectrum.effective_energy)) * water_equivalent(
         projections, spectrum
     )
+
+
+def transmitted_energy(projections: Any, spectrum: Spectrum) -> float:
+    """Mean energy (keV) of what a typical ray through the object transmits, were the object water.
+
+    Typical is the median of the values above a tenth of the largest.
+    """
+    values = require_array("projections", projections)
+    values = values[np.isfinite(values)]
+    inside = values[values > 0.1 * values.max(initial=0.0)]
+    if not len(inside):
+        return spectrum.effective_energy
+    path = water_equivalent(np.median(inside), spectrum)
+    through = spectrum.weights * np.exp(-path * mass_attenuation("water", spectrum.energies))
+    return float(through @ spectrum.energies / through.sum())
