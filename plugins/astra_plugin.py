@@ -121,8 +121,9 @@ def _write(target: Any, volume: np.ndarray) -> None:
     if hasattr(target, "detach"):
         import torch
 
-        volume = torch.from_numpy(np.ascontiguousarray(volume))
-    target[...] = volume
+        target[...] = torch.from_numpy(np.ascontiguousarray(volume))
+    else:
+        target[...] = volume
 
 
 def guarded_create(create: Callable[[Mapping[str, Any]], int]) -> Callable[[Mapping[str, Any]], int]:

@@ -51,5 +51,5 @@ def _tell_tomopy() -> None:
 
     # `tomopy.recon` is the function, which hides the package of that name.
     algorithms = importlib.import_module("tomopy.recon.algorithm")
-    importlib.import_module("tomopy.util.extern").c_polysplat = polysplat
+    vars(importlib.import_module("tomopy.util.extern"))["c_polysplat"] = polysplat
     algorithms.allowed_recon_kwargs["polysplat"] = ["num_gridx", "num_gridy", "options"]

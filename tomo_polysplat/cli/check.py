@@ -1,4 +1,4 @@
-"""``tomo-polysplat check``: what a scan file says, before time is spent on it."""
+"""``tomo-polysplat check``: what a scan file says and what is wrong with it, before time is spent on it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ import argparse
 from tomo_polysplat.cli.options import add_scan_options
 
 NAME = "check"
-HELP = "read a scan and say what is in it and what is missing"
+HELP = "say what is in a scan and what is wrong with it, and how to mend that"
+DEFECT_STATUS = 3
+SIGNS = {"ok": "ok", "defect": "MEND", "unknown": "?"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -16,10 +18,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Read and describe."""
+    """Read, describe and examine; the exit status is 3 when something should be mended."""
     import numpy as np
 
     from tomo_polysplat.cli.options import scan_from
+    from tomo_polysplat.scan.check import check_scan
     from tomo_polysplat.scan.geometry import from_astra
 
     scan = scan_from(arguments)
@@ -44,4 +47,11 @@ def run(arguments: argparse.Namespace) -> int:
     width = max(map(len, lines))
     for name, text in lines.items():
         print(f"{name:{width}}  {text}")
-    return 0
+    findings = check_scan(scan)
+    print()
+    width = max(len(finding.probe) for finding in findings)
+    for finding in findings:
+        print(f"{SIGNS[finding.verdict]:4}  {finding.probe:{width}}  {finding.text}")
+        if finding.remedy:
+            print(f"{'':4}  {'':{width}}  -> {finding.remedy}")
+    return DEFECT_STATUS if any(finding.verdict == "defect" for finding in findings) else 0

@@ -1,0 +1,54 @@
+"""What is wrong with a scan, found in seconds, before minutes are spent on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from tomo_polysplat.scan.probes.axes import probe_axes
+from tomo_polysplat.scan.probes.logarithm import probe_logarithm
+from tomo_polysplat.scan.probes.measured import Finding, Measured
+from tomo_polysplat.scan.probes.opposite import CENTRE, DIRECTION, probe_centre_and_direction
+from tomo_polysplat.scan.probes.order import probe_order
+from tomo_polysplat.scan.probes.rays import DEAD, bad_rays, probe_rays
+from tomo_polysplat.scan.probes.truncation import probe_truncation
+from tomo_polysplat.scan.scan import Scan
+
+__all__ = ["Finding", "check_scan"]
+
+LATER: tuple[tuple[tuple[str, ...], Callable[[Measured], list[Finding]]], ...] = (
+    (("order of views",), lambda measured: [probe_order(measured)]),
+    (("truncation",), lambda measured: [probe_truncation(measured)]),
+    ((CENTRE, DIRECTION), probe_centre_and_direction),
+)
+
+
+def check_scan(scan: Scan) -> list[Finding]:
+    """Look for the defects that scans usually have.
+
+    Parameters
+    ----------
+    scan : Scan
+        Nothing of its truth, spectrum or volume is used.
+
+    Returns
+    -------
+    list of Finding
+        On the logarithm, the order of the axes and of the views, bad rays, truncation, the centre and the
+        direction of the angles. A defect that would mislead a later probe makes that one "unknown".
+    """
+    measured = Measured(scan)
+    kinds = bad_rays(measured)
+    rays = probe_rays(measured, kinds)
+    # The other probes look at what is left.
+    measured = Measured(scan, dead_pixels=np.asarray(kinds[DEAD].any(axis=1)))
+    findings = [rays, probe_logarithm(measured), probe_axes(measured)]
+    for names, probe in LATER:
+        misleading = [finding.probe for finding in findings[1:] if finding.misleading]
+        if misleading:
+            text = f"looked for once this is mended: {', '.join(misleading)}"
+            findings += [Finding(name, "unknown", text) for name in names]
+        else:
+            findings += probe(measured)
+    return findings

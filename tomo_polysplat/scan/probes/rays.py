@@ -1,0 +1,118 @@
+"""Which rays hold no measurement?"""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+
+from tomo_polysplat.scan.dropouts import dropped_rays
+from tomo_polysplat.scan.probes.measured import Finding, Measured
+
+__all__ = ["DEAD", "bad_rays", "probe_rays"]
+
+# Shares of rays, and of the views of a pixel, from which they count as a defect of the detector.
+_TOLERATED, _MOSTLY = 0.002, 0.5
+# Deviation of a pixel from all its neighbours, as a share of the scan's large values.
+_STANDS_OUT = 0.1
+# Around rays without light there is almost none: their neighbours' share of the scan's large values.
+_OPAQUE = 0.6
+# Share of the scan's large values that a ray through the object has.
+_THROUGH = 0.1
+
+
+DEAD, ZERO = "of dead pixels", "zero in the middle of the object"
+STARVED = "without light behind dense matter"
+# Rays looked at.
+_MOST_RAYS = 8_000_000
+
+
+def bad_rays(measured: Measured) -> dict[str, np.ndarray]:
+    """Bad rays by kind, each ray under one kind, as masks (rows, some of the views, columns)."""
+    views = _some_views(measured)
+    valid, projections = measured.valid[:, views], measured.scan.projections[:, views]
+    starved = _starved(projections, valid, measured.level)
+    zero = dropped_rays(np.where(valid, projections, np.nan))
+    pixels = _dead_pixels(projections, valid, measured.level) | ((~valid & ~starved).mean(axis=1) > _MOSTLY)
+    dead = np.broadcast_to(pixels[:, None], valid.shape)
+    return {
+        DEAD: dead,
+        ZERO: zero & ~dead,
+        "marked as bad": ~valid & ~starved & ~dead,
+        "at the limit of the scale": _at_a_limit(projections, valid) & ~dead,
+        STARVED: starved,
+    }
+
+
+def _some_views(measured: Measured) -> np.ndarray:
+    """Evenly spread views, as many as keep the probe within seconds."""
+    scan = measured.scan
+    number = min(scan.views, max(24, _MOST_RAYS // (scan.rows * scan.columns)))
+    return np.linspace(0, scan.views - 1, number).round().astype(int)
+
+
+def probe_rays(measured: Measured, kinds: dict[str, np.ndarray]) -> Finding:
+    """Tell whether there are more bad rays of the `kinds` from :func:`bad_rays` than any scan has."""
+    counts = {name: int(np.count_nonzero(mask)) for name, mask in kinds.items()}
+    size = next(iter(kinds.values())).size
+    shares = {name: count / size for name, count in counts.items()}
+    # Zeros are recognised within the object only, so they are compared with the rays through it.
+    shares[ZERO] /= max(float(np.mean(measured.filled > _THROUGH * measured.level)), shares[ZERO], 1e-9)
+    listed = ", ".join(f"{100 * share:.2g} % {name}" for name, share in shares.items() if share)
+    if sum(share for name, share in shares.items() if name != STARVED) > _TOLERATED:
+        remedy = (
+            "mark them in valid= (False is not used); correct flat fields, or saturation=, mend many of them"
+        )
+        return Finding("bad rays", "defect", listed, remedy, shares)
+    return Finding("bad rays", "ok", listed or "none", "", shares)
+
+
+def _starved(projections: np.ndarray, valid: np.ndarray, level: float) -> np.ndarray:
+    """Invalid rays next to which hardly any light comes through either."""
+    values = np.where(valid, projections, -np.inf)
+    around = values.copy()
+    for shift in (1, 2, 3):
+        around[..., shift:] = np.maximum(around[..., shift:], values[..., :-shift])
+        around[..., :-shift] = np.maximum(around[..., :-shift], values[..., shift:])
+    alone = ~np.isfinite(around)
+    lit = np.asarray(valid.any(axis=1))[:, None]
+    return ~valid & ((around > _OPAQUE * level) | alone & lit)
+
+
+def _dead_pixels(projections: np.ndarray, valid: np.ndarray, level: float) -> np.ndarray:
+    """Pixels above or below all their neighbours in most views, or that never change, (rows, columns).
+
+    What turns with the object does not stay in one pixel; what is round about the axis goes on into the next
+    rows. A detector of one or two rows has no such neighbours, and its pixels must stand out by more.
+    """
+    rows, views, columns = projections.shape
+    if columns < 5 or views < 5:
+        return np.zeros((rows, columns), bool)
+    values = np.where(valid, projections, np.nan)
+    near = np.stack(_neighbours(values))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # about pixels without a single neighbour
+        highest, lowest = np.nanmax(near, axis=0), np.nanmin(near, axis=0)
+    off = np.nan_to_num(np.fmax(values - highest, 0) - np.fmax(lowest - values, 0))
+    limit = (_STANDS_OUT if rows > 2 else 3 * _STANDS_OUT) * level
+    stands_out = np.abs(np.median(off, axis=1)) > limit
+    frozen = np.nan_to_num(np.ptp(values, axis=1), nan=1.0) == 0
+    lively = np.nan_to_num(np.ptp(near, axis=2)).min(axis=0) > 0
+    return stands_out | frozen & lively
+
+
+def _neighbours(values: np.ndarray) -> list[np.ndarray]:
+    """The values one row and one column further, NaN beyond the detector."""
+    rows, _, columns = values.shape
+    padded = np.pad(values, ((1, 1), (0, 0), (1, 1)), constant_values=np.nan)
+    steps = [(r, c) for r in (0, 1, 2) for c in (0, 1, 2) if (r, c) != (1, 1) and (rows > 1 or r == 1)]
+    return [padded[r : r + rows, :, c : c + columns] for r, c in steps]
+
+
+def _at_a_limit(projections: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Rays that share the very largest, or the very smallest but for zero, value with many others."""
+    values = projections[valid]
+    limits = [] if not values.size else [values.max(), values.min()]
+    masks = [valid & (projections == limit) for limit in limits if limit != 0]
+    many = [mask for mask in masks if np.count_nonzero(mask) > max(10, _TOLERATED * values.size)]
+    return np.logical_or.reduce(many) if many else np.zeros(valid.shape, bool)
