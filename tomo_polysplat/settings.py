@@ -18,7 +18,7 @@ class Settings:
     units of the scan's soft reference (water, for most objects).
     """
 
-    passes: float = 16.0
+    passes: float = 10.0
     """Times every view is used, unless the held-out rays or a time budget end the run before."""
     views_per_step: int = 0
     """Views whose gradients make one step of the optimiser; 0 leaves it to the plan."""
@@ -59,7 +59,7 @@ class Settings:
     """Learning rates fall exponentially to this share of their start."""
     loss: str = "huber"
     """"huber" or "weighted-l1", both weighted by photon statistics, or "l1" (the paper's)."""
-    model_error: float = 0.01
+    model_error: float = 0.015
     """Error of -log(I/I0) that the model is allowed besides the noise."""
     huber_corner: float = 1.345
     """Deviations beyond which a residual counts absolutely (95 % efficient for Gaussian noise: Huber 1964)."""
@@ -71,7 +71,7 @@ class Settings:
     """Attenuation above this many soft references does not count as variation, which would erode metal."""
     tv_box: int = 32
     """Edge in voxels of the random box whose total variation is taken."""
-    tv_box_planar: int = 128
+    tv_box_planar: int = 256
     """The same for a single slice."""
     held_out: float = 0.01
     """Share of the rays kept from the fit to tell when it stops improving."""
@@ -90,9 +90,9 @@ class Settings:
 
 
 PRESETS: dict[str, dict[str, Any]] = {
-    "fast": {"passes": 8.0},
+    "fast": {"passes": 5.0},
     "balanced": {},
-    "best": {"passes": 40.0},
+    "best": {"passes": 30.0},
 }
 
 

@@ -135,4 +135,4 @@ def _finest_spacing(geometry: Geometry, grid: VolumeGrid, planar: bool) -> tuple
 
 def _views_per_step(geometry: Geometry, planar: bool) -> int:
     """A step costs little more in two dimensions, where a view is a line."""
-    return min(geometry.views, 6 if planar else 4)
+    return min(geometry.views, 4 if planar else 2)
