@@ -1,6 +1,7 @@
 """Data Exchange HDF5: ``/exchange/data`` (views, rows, columns), ``data_white``, ``data_dark``, ``theta``.
 
-Read with h5py alone. What the layout has no place for is kept in a group of our own, ``/polysplat``:
+Arrays go through dxchange where it is installed, the rest through h5py. What the layout has no place for is kept
+in a group of our own, ``/polysplat``:
 
 - ``geometry``: attributes ``astra_type`` (``cone_vec``, ``parallel3d_vec`` or ``cyl_cone_vec``) and ``unit``;
   datasets ``vectors`` (views, 12 or 13), ``volume_shape`` (nz, ny, nx) and ``volume_window`` (xmin, xmax,
@@ -24,6 +25,7 @@ from tomo_polysplat.checks import fail, require_array, require_choice, require_s
 from tomo_polysplat.files import replacing
 from tomo_polysplat.scan.centre import estimate_centre
 from tomo_polysplat.scan.defects import attenuation, fill_invalid, flat_and_dark
+from tomo_polysplat.scan.dxchange_host import read_block, write_first_array
 from tomo_polysplat.scan.hdf5 import (
     find_array,
     opened,
@@ -54,15 +56,8 @@ BLOCK_BYTES = 2**27
 # Where APS tomography files keep the size of a pixel in the plane of the object. The size of a camera's own
 # pixel is not used: without the magnification it is off by the objective's factor.
 PIXEL_SIZE_PATHS = ("measurement/instrument/detection_system/objective/resolution",)
-LENGTH_NAMES = {
-    "um": "um",
-    "micron": "um",
-    "microns": "um",
-    "micrometers": "um",
-    "mm": "mm",
-    "cm": "cm",
-    "m": "m",
-}
+LENGTH_NAMES = {name: name for name in ("um", "mm", "cm", "m")}
+LENGTH_NAMES |= dict.fromkeys(("micron", "microns", "micrometers"), "um")
 
 
 def scan_from_hdf5(path: Path, options: ReadOptions) -> Scan:
@@ -106,14 +101,17 @@ def _line_integrals(
                 "none",
                 "or pass input='transmission' or 'attenuation'",
             )
-        flat, background = flat_and_dark(white[()], None if dark is None else dark[()], (rows, columns))
+        no_light = None if dark is None else read_block(dark)
+        flat, background = flat_and_dark(read_block(white), no_light, (rows, columns))
     projections = np.empty((rows, views, columns), np.float32)
     valid = np.empty((rows, views, columns), bool)
     rays: dict[str, int] = {}
     block = max(1, BLOCK_BYTES // (rows * columns * 8))
     for first in range(0, views, block):
         part = slice(first, min(first + block, views))
-        values, usable, counts = attenuation(data[part], kind, flat, background, options.saturation)
+        values, usable, counts = attenuation(
+            read_block(data, part), kind, flat, background, options.saturation
+        )
         projections[:, part], valid[:, part] = values.transpose(1, 0, 2), usable.transpose(1, 0, 2)
         rays = {name: rays.get(name, 0) + count for name, count in counts.items()}
     return projections, valid, {"input": kind, "rays": rays}
@@ -199,7 +197,7 @@ def _angles(file: h5py.File, views: int, given: Any) -> np.ndarray:
         if dataset is None:
             raise _missing_theta(views)
         in_radians = str(dataset.attrs.get("units", "")).strip("b'\"").lower().startswith("rad")
-        given = dataset[()]
+        given = read_block(dataset)
     theta = require_array("theta", given, 1).astype(np.float64)
     require_shape("theta", theta, (views,), "(views,)")
     if not np.isfinite(theta).all():
@@ -258,22 +256,28 @@ def write_hdf5(scan: Scan, path: str | Path, *, overwrite: bool = False) -> None
     needed = sum(
         a.nbytes for a in (scan.projections, scan.truth, scan.metal_mask, scan.valid) if a is not None
     )
-    with (
-        replacing(path, overwrite=overwrite, needed_bytes=needed) as temporary,
-        h5py.File(temporary, "w") as file,
-    ):
-        file["implements"] = "exchange:measurement:polysplat"
-        file["measurement/sample/name"] = scan.name
-        data = file.create_dataset("exchange/data", data=scan.projections.transpose(1, 0, 2))
-        data.attrs.update(input="attenuation", description="attenuation", axes="theta:y:x", units="1")
-        geometry = vector_form(scan.proj_geom)
-        theta = file.create_dataset("exchange/theta", data=_theta_degrees(geometry["Vectors"]))
-        theta.attrs["units"] = "degrees"
-        group = file.create_group("polysplat/geometry")
-        group.attrs.update(astra_type=geometry["type"], unit=scan.unit)
-        group["vectors"] = geometry["Vectors"]
-        group["volume_shape"], group["volume_window"] = np.array(scan.volume_shape), window_of(scan.vol_geom)
-        _write_knowledge(file["polysplat"], scan)
+    with replacing(path, overwrite=overwrite, needed_bytes=needed) as temporary:
+        write_first_array(temporary, "exchange", "data", scan.projections.transpose(1, 0, 2))
+        with h5py.File(temporary, "r+") as file:
+            _describe(file, scan)
+
+
+def _describe(file: h5py.File, scan: Scan) -> None:
+    """Add to a file that holds the projections what else there is to know."""
+    if "implements" in file:
+        del file["implements"]
+    file["implements"] = "exchange:measurement:polysplat"
+    file["measurement/sample/name"] = scan.name
+    description = {"description": "attenuation", "axes": "theta:y:x", "units": "1"}
+    file["exchange/data"].attrs.update(input="attenuation", **description)
+    geometry = vector_form(scan.proj_geom)
+    theta = file.create_dataset("exchange/theta", data=_theta_degrees(geometry["Vectors"]))
+    theta.attrs["units"] = "degrees"
+    group = file.create_group("polysplat/geometry")
+    group.attrs.update(astra_type=geometry["type"], unit=scan.unit)
+    group["vectors"] = geometry["Vectors"]
+    group["volume_shape"], group["volume_window"] = np.array(scan.volume_shape), window_of(scan.vol_geom)
+    _write_knowledge(file["polysplat"], scan)
 
 
 def _write_knowledge(group: h5py.Group, scan: Scan) -> None:

@@ -1,0 +1,63 @@
+"""Arrays of Data Exchange files through dxchange where it is installed, through h5py otherwise.
+
+Only whole arrays and blocks of views go through dxchange. Its readers of complete scans make up the angles 0 to
+180 degrees, end point included, when a file has none, and leave out what they do not find; these choices are
+made in the open by `data_exchange`.
+"""
+
+from __future__ import annotations
+
+import logging
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import h5py
+
+__all__ = ["real_dxchange", "read_block", "write_first_array"]
+
+logger = logging.getLogger(__name__)
+
+# What the tomography package has; another package of the same name is on PyPI.
+OFFERS = ("read_aps_tomoscan_hdf5", "read_hdf5", "write_hdf5")
+
+
+def real_dxchange() -> ModuleType | None:
+    """The tomography package dxchange, or None where it is missing, broken, or the unrelated one of its name."""
+    try:
+        if find_spec("dxchange") is None:
+            return None
+        module = import_module("dxchange")
+    except Exception as error:  # a stranger's module may fail in any way when imported
+        logger.info("dxchange cannot be imported (%s): h5py reads and writes instead", error)
+        return None
+    return module if all(hasattr(module, name) for name in OFFERS) else None
+
+
+def read_block(dataset: h5py.Dataset, part: slice = slice(None)) -> np.ndarray:
+    """A dataset of an open file, or the block `part` along its first axis."""
+    host = real_dxchange()
+    if host is None or dataset.ndim == 0:
+        return dataset[part] if dataset.ndim else dataset[()]
+    array = host.read_hdf5(dataset.file.filename, dataset.name, slc=(part.indices(len(dataset)),))
+    if array is None:
+        raise OSError(f"dxchange did not read {dataset.name} of {dataset.file.filename}")
+    return array
+
+
+def write_first_array(path: Path, group: str, name: str, array: np.ndarray) -> None:
+    """Begin a new file at `path` with one array; what else belongs into the file is added by the caller."""
+    import h5py
+
+    host = real_dxchange()
+    # dxchange adds .h5 to a name that does not end so, and would write another file.
+    if host is not None and path.suffix == ".h5":
+        host.write_hdf5(array, fname=str(path), gname=group, dname=name, overwrite=True)
+        return
+    with h5py.File(path, "w") as file:
+        file[f"{group}/{name}"] = array
