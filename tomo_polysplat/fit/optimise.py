@@ -42,7 +42,7 @@ class FitState:
     share : float
         Of the run that is done, 0 to 1.
     volume : callable
-        Returns the current volume, (z, y, x) in 1/unit.
+        Returns the current volume in 1/unit, shaped like that of the result.
     """
 
     seconds: float
@@ -161,6 +161,9 @@ def fit(
     held-out rays have not improved for ``settings.patience`` passes, when a callback returns True, or on
     KeyboardInterrupt; returns the Gaussians of the pass whose held-out rays fitted best.
     """
+    if not len(gaussians):
+        logger.warning("The start volume is empty: no Gaussians, a volume of zeros.")
+        return FitOutcome(gaussians, reason="nothing to fit: the start volume is empty")
     fitter = _Fitter(gaussians, spacing, rays, scene, settings, rng)
     count = len(rays.views)
     batch = min(views_per_step, count)

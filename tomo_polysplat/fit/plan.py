@@ -10,19 +10,19 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.settings import Settings
+
+if TYPE_CHECKING:
+    from tomo_polysplat.fit.problem import Problem
 
 __all__ = ["Plan", "make_plan", "mass_level"]
 
 logger = logging.getLogger(__name__)
 
-# Soft references between which lengths are believed; beyond, they are off by a power of 1000 (mm for um, say).
-_BELIEVABLE = (0.03, 30.0)
 # Gaussians that a laptop and a GPU fit in a time people wait for.
 _MOST_GAUSSIANS = {"cpu": 60_000, "cuda": 300_000}
 
@@ -48,49 +48,38 @@ class Plan:
     reasons: dict[str, Any] = field(default_factory=dict)
 
 
-def make_plan(
-    start: np.ndarray,
-    geometry: Geometry,
-    grid: VolumeGrid,
-    settings: Settings,
-    polychromatic: bool,
-    device: str,
-) -> Plan:
+def make_plan(start: np.ndarray, problem: Problem, settings: Settings, device: str) -> Plan:
     """Decide from the start volume and the geometry.
 
     Parameters
     ----------
     start : (nz, ny, nx) array
-        First reconstruction: water-equivalent g/cm3, or 1/unit when monochromatic.
-    geometry, grid : Geometry, VolumeGrid
+        First reconstruction in the solver's units (``Problem.start_volume``).
+    problem : Problem
     settings : Settings
         Zero stands for "decide", anything else is taken as it is.
     device : "cpu" or "cuda"
     """
-    planar = geometry.planar and grid.planar
-    reference, why = _reference(start, polychromatic)
-    support = int((start > settings.support_level * reference).sum())
-    most = settings.max_gaussians or _MOST_GAUSSIANS[device]
-    finest, because = _finest_spacing(geometry, grid, planar)
-    spacing = settings.seed_spacing
-    if spacing:
-        because = "asked for"
-    else:
-        crowded = (support / most) ** (1 / (2 if planar else 3))
-        spacing = max(finest, crowded)
-        if crowded > finest:
-            because = f"at most {most} Gaussians over {support} voxels of support"
-    views = settings.views_per_step or _views_per_step(geometry, planar)
+    reference, why = _reference(mass_level(start) / problem.depth, problem.polychromatic)
+    support = int((start > settings.support_level * reference * problem.depth).sum())
+    spacing, because = _seed_spacing(support, problem, settings, device)
+    views = settings.views_per_step or _views_per_step(problem)
     plan = Plan(reference, spacing, views)
+    unit = "g/cm3" if problem.polychromatic else "per unit of length"
     plan.reasons = {
         "model": "polychromatic: a spectrum was given"
-        if polychromatic
-        else "monochromatic: no spectrum was given",
-        "dimensions": "2D Gaussians: one row and one slice in one plane" if planar else "3D Gaussians",
-        "soft_reference": f"{reference:.4g} {'g/cm3' if polychromatic else 'per unit of length'}: {why}",
+        if problem.polychromatic
+        else "monochromatic: no spectrum was given, or one of a single energy",
+        "dimensions": "2D Gaussians: one row and one slice in one plane"
+        if problem.planar
+        else "3D Gaussians: several rows or slices, or rays that leave the plane",
+        "soft_reference": f"{reference:.4g} {unit}: {why}",
         "support": f"{support} of {start.size} voxels hold more than {settings.support_level:g} soft references",
         "seed_spacing_voxels": f"{spacing:.2f}: {because}",
-        "views_per_step": f"{views} of {geometry.views}",
+        "views_per_step": f"{views} of {problem.geometry.views}: "
+        + (
+            "asked for" if settings.views_per_step else "a view is a line" if problem.planar else "few, often"
+        ),
     }
     return plan
 
@@ -105,13 +94,13 @@ def mass_level(volume: np.ndarray) -> float:
     return float(values[np.searchsorted(mass, 0.5 * mass[-1])])
 
 
-def _reference(start: np.ndarray, polychromatic: bool) -> tuple[float, str]:
-    level = mass_level(start)
+def _reference(level: float, polychromatic: bool) -> tuple[float, str]:
+    """Soft reference for a start with half its mass below ``level``."""
     if not polychromatic:
         return level or 1.0, "half of the start's mass lies below it"
-    if level == 0 or _BELIEVABLE[0] < level < _BELIEVABLE[1]:
+    factor = 1000.0 ** round(math.log10(level) / 3) if level > 0 else 1.0
+    if factor == 1:
         return 1.0, "water"
-    factor = 1000.0 ** round(math.log10(level) / 3)
     logger.warning(
         "The object is as dense as %.3g g/cm3 of water: the unit of length looks wrong by a factor of %g.",
         level,
@@ -123,16 +112,29 @@ def _reference(start: np.ndarray, polychromatic: bool) -> tuple[float, str]:
     )
 
 
-def _finest_spacing(geometry: Geometry, grid: VolumeGrid, planar: bool) -> tuple[float, str]:
+def _seed_spacing(support: int, problem: Problem, settings: Settings, device: str) -> tuple[float, str]:
+    """Distance of the seeds in voxels (the shortest edge), for a support of as many voxels."""
+    if settings.seed_spacing:
+        return settings.seed_spacing, "asked for"
+    dims = 2 if problem.planar else 3
+    most = settings.max_gaussians or _MOST_GAUSSIANS[device]
+    finest, because = _finest_spacing(problem)
+    cells = support * float(np.prod(problem.grid.voxel_size[:dims] / problem.voxel))
+    crowded = (cells / most) ** (1 / dims)
+    if crowded > finest:
+        return crowded, f"at most {most} Gaussians over {support} voxels of support"
+    return finest, because
+
+
+def _finest_spacing(problem: Problem) -> tuple[float, str]:
     """Seeds no closer than the detector can tell apart, and than the voxels can show."""
-    voxel = float(grid.voxel_size[: 2 if planar else 3].min())
-    width, height = geometry.pixel_size_at(grid.centre)
-    pixel = width if planar else math.sqrt(width * height)
-    if pixel > voxel:
-        return 1.3 * pixel / voxel, "1.3 detector pixels at the object"
+    width, height = problem.geometry.pixel_size_at(problem.grid.centre)
+    pixel = width if problem.planar else math.sqrt(width * height)
+    if pixel > problem.voxel:
+        return 1.3 * pixel / problem.voxel, "1.3 detector pixels at the object"
     return 1.3, "1.3 voxels"
 
 
-def _views_per_step(geometry: Geometry, planar: bool) -> int:
+def _views_per_step(problem: Problem) -> int:
     """A step costs little more in two dimensions, where a view is a line."""
-    return min(geometry.views, 4 if planar else 2)
+    return min(problem.geometry.views, 4 if problem.planar else 2)

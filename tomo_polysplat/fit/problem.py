@@ -1,0 +1,184 @@
+"""One scan as the solver sees it: its own coordinates, rays that cannot be used taken out.
+
+The solver's coordinates are relative to the volume's centre in units of half its longest side. Everything from
+the first reconstruction on happens in them, so that no choice, and not even rounding, depends on the unit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from tomo_polysplat.fit.noise import photons_per_ray
+from tomo_polysplat.fit.plan import Plan
+from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.kernels import select
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.model.seed import seed_gaussians
+from tomo_polysplat.physics.materials import Materials
+from tomo_polysplat.physics.quadrature import Quadrature, fit_quadrature
+from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.physics.water import transmitted_energy, water_equivalent
+from tomo_polysplat.render.renderer import detector_views, voxel_box
+from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.settings import Settings
+from tomo_polysplat.start.initial import initial_volume
+from tomo_polysplat.units import cm_per
+
+__all__ = ["Problem"]
+
+# Beyond this a ray says "opaque", not how opaque: the spectral nodes are fitted up to it at most.
+_LARGEST_PROJECTION = 15.0
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is to be fitted.
+
+    Parameters
+    ----------
+    projections : (views, rows, columns) float32 array
+        -log(I/I0); NaN for rays that are not to be used.
+    geometry, grid : Geometry, VolumeGrid
+        In the solver's coordinates.
+    centre : (3,) float64
+        Origin of the solver's coordinates, in the caller's unit.
+    length : float
+        Their unit of length in the caller's.
+    depth : float
+        The same in cm; in the caller's unit for a monochromatic model. It makes a density in the solver's
+        coordinates, areal density per unit of length, of one in g/cm3, or of an attenuation.
+    planar : bool
+        Two-dimensional: one row and one slice in one plane.
+    spectrum, materials : Spectrum, Materials, or None
+        None for a monochromatic model.
+    """
+
+    projections: np.ndarray
+    geometry: Geometry
+    grid: VolumeGrid
+    centre: np.ndarray
+    length: float
+    depth: float
+    planar: bool
+    spectrum: Spectrum | None = None
+    materials: Materials | None = None
+
+    @classmethod
+    def of(
+        cls,
+        projections: np.ndarray,
+        geometry: Geometry,
+        grid: VolumeGrid,
+        unit: str,
+        spectrum: Spectrum | None,
+        materials: Materials | None,
+    ) -> Problem:
+        """The problem of a scan in the caller's unit."""
+        planar = geometry.planar and grid.planar
+        # A plane beside the slice is another plane.
+        planar = planar and bool(grid.lower[2] <= geometry.corner[0, 2] <= grid.upper[2])
+        length = 0.5 * float(grid.extent[: 2 if planar else 3].max())
+        depth = length if spectrum is None else length * cm_per(unit)
+        inside = _snapped_grid(grid.normalised(grid.centre, length))
+        outside = _snapped_geometry(geometry.normalised(grid.centre, length))
+        return cls(projections, outside, inside, grid.centre, length, depth, planar, spectrum, materials)
+
+    @property
+    def polychromatic(self) -> bool:
+        """Whether energies differ."""
+        return self.spectrum is not None
+
+    @property
+    def voxel(self) -> float:
+        """Shortest edge of a voxel, in the solver's coordinates."""
+        return float(self.grid.voxel_size[: 2 if self.planar else 3].min())
+
+    def start_volume(self, device: torch.device) -> tuple[np.ndarray, dict[str, Any]]:
+        """First reconstruction and what was done: ``depth`` times g/cm3 of water, or times an attenuation."""
+        values = self.projections
+        if self.spectrum is not None:
+            values = water_equivalent(values, self.spectrum).astype(np.float32)
+        return initial_volume(values, self.geometry, self.grid, device=device.type)
+
+    def scene(self, plan: Plan, settings: Settings, device: torch.device) -> FitScene:
+        """The forward model."""
+        kernel, why = select.choose(device, settings.kernel)
+        plan.reasons["kernel"] = f"{kernel}: {why}"
+        quadrature, reference_curve, output_curve = self._physics(plan, settings, device)
+        return FitScene(
+            voxel_box(self.grid),
+            quadrature,
+            self.depth * plan.reference,
+            reference_curve,
+            output_curve,
+            kernel,
+            settings.cutoff,
+        )
+
+    def _physics(
+        self, plan: Plan, settings: Settings, device: torch.device
+    ) -> tuple[Quadrature | None, torch.Tensor | None, torch.Tensor | None]:
+        """Nodes of the spectrum, and the curves at the Gaussians' energy and at the volume's."""
+        spectrum, materials = self.spectrum, self.materials
+        if spectrum is None or materials is None:
+            return None, None, None
+        largest = float(np.clip(np.nanmax(self.projections), 1.0, _LARGEST_PROJECTION))
+        nodes = settings.spectral_nodes or None
+        quadrature = fit_quadrature(spectrum, materials, max_path=largest, nodes=nodes)
+        energy = transmitted_energy(self.projections, spectrum)
+        plan.reasons["spectrum"] = quadrature.describe()
+        plan.reasons["reference_energy"] = f"{energy:.1f} keV: the mean of what a typical ray transmits"
+        output = _relative(materials, spectrum.effective_energy, device)
+        return quadrature, _relative(materials, energy, device), output
+
+    def seeds(self, start: np.ndarray, plan: Plan, settings: Settings, device: torch.device) -> Gaussians:
+        """Gaussians to start from."""
+        relative = start / (self.depth * plan.reference)
+        spacing = plan.spacing * self.voxel
+        gaussians = seed_gaussians(relative, self.grid, spacing, settings, self.polychromatic, device)
+        free = int((gaussians.group < 0).sum())
+        plan.reasons["gaussians"] = f"{len(gaussians)}, the material number free for {free}"
+        return gaussians
+
+    def rays(self, plan: Plan, settings: Settings, device: torch.device) -> Rays:
+        """The measured rays on the device."""
+        photons = float("inf") if settings.loss == "l1" else photons_per_ray(self.projections)
+        plan.reasons["photons_per_ray"] = f"{photons:.3g}, from the scatter of neighbouring pixels"
+        values = torch.from_numpy(self.projections).to(device)
+        views = detector_views(self.geometry, self.planar)
+        return Rays(values, views, photons, settings.model_error, settings.held_out)
+
+
+def _snapped_grid(grid: VolumeGrid) -> VolumeGrid:
+    return VolumeGrid(grid.shape, *_snapped(np.stack([grid.lower, grid.upper])))
+
+
+def _snapped_geometry(geometry: Geometry) -> Geometry:
+    origin = geometry.origin
+    if geometry.beam == "parallel":
+        origin = origin / np.linalg.norm(origin, axis=1, keepdims=True)
+    parts = {"origin": origin, "corner": geometry.corner, "u": geometry.u, "v": geometry.v}
+    return replace(geometry, **{name: _snapped(vectors) for name, vectors in parts.items()})
+
+
+def _snapped(vectors: np.ndarray) -> np.ndarray:
+    """Vectors (n, 3) rounded to 32 bits of their longest coordinate, a millionth of a pixel.
+
+    The coordinates of one scan in two units differ in the last bit. A fit of many steps would make a
+    difference of a thousandth of it; rounded, they are the same.
+    """
+    longest = np.abs(vectors).max(axis=1, keepdims=True)
+    # A little above each power of two, so that a length of 1 and of 1 - 1e-16 are rounded alike.
+    exponent = np.floor(np.log2(longest, where=longest > 0, out=np.zeros_like(longest)) + 1e-6).astype(int)
+    return np.ldexp(np.rint(np.ldexp(vectors, 32 - exponent)), exponent - 32)
+
+
+def _relative(materials: Materials, energy: float, device: torch.device) -> torch.Tensor:
+    """(3,) mass attenuation of the curves over that of the first."""
+    attenuation = materials.mass_attenuation([energy])[:, 0]
+    return torch.as_tensor(attenuation / attenuation[0], dtype=torch.float32, device=device)

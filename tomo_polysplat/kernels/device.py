@@ -1,0 +1,70 @@
+"""The device that does the work, and torch's threads on it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+from tomo_polysplat.checks import fail
+
+__all__ = ["one_torch_thread", "pick_device"]
+
+
+def pick_device(name: str | torch.device) -> torch.device:
+    """The device of a name: ``"auto"``, ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
+
+    Raises
+    ------
+    ValueError
+        For another name, or a GPU that torch does not find.
+    """
+    known = "auto, cpu, cuda or cuda:N"
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+    except (RuntimeError, TypeError):
+        raise fail("device", known, repr(name)) from None
+    if device.type not in ("cpu", "cuda"):
+        raise fail("device", known, repr(name))
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        found = f"torch finds {torch.cuda.device_count()} CUDA devices"
+        raise fail("device", "a device that is there", repr(name), f"{found}: use device='auto'")
+    return device
+
+
+class _Borrowed:
+    """torch's number of threads while someone has lowered it; one for the process, as that number is."""
+
+    def __init__(self) -> None:
+        self.lock, self.users, self.before = threading.Lock(), 0, 1
+
+
+_borrowed = _Borrowed()
+
+
+@contextmanager
+def one_torch_thread(device: torch.device) -> Iterator[None]:
+    """torch on one thread while a fit runs on the CPU.
+
+    The tensors between the kernels are small: sharing them out costs more than it saves (a third of the time
+    of a fit on two idle cores, and several times it on busy ones). Fits may overlap in several threads: each
+    leaves behind the number that the first one found.
+    """
+    if device.type != "cpu":
+        yield
+        return
+    with _borrowed.lock:
+        if not _borrowed.users:
+            _borrowed.before = torch.get_num_threads()
+        _borrowed.users += 1
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        with _borrowed.lock:
+            _borrowed.users -= 1
+            torch.set_num_threads(_borrowed.before)

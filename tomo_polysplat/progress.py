@@ -1,0 +1,37 @@
+"""How far a run is, for people who wait for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+__all__ = ["progress_reports"]
+
+
+@contextmanager
+def progress_reports(
+    wanted: bool | Callable[[float, str], Any] | None,
+) -> Iterator[Callable[[float, str], Any]]:
+    """A function of (share done, words) for the length of a run.
+
+    Parameters
+    ----------
+    wanted : bool, callable or None
+        The function itself, or whether to draw a bar on standard error; None draws it on a terminal only, so
+        that logs stay readable.
+    """
+    if callable(wanted):
+        yield wanted
+        return
+    from tqdm import tqdm
+
+    layout = "{l_bar}{bar:24}| {elapsed}<{remaining} {postfix}"
+    disable = None if wanted is None else not wanted
+    with tqdm(total=1.0, bar_format=layout, disable=disable, leave=False) as bar:
+
+        def report(share: float, words: str = "") -> None:
+            bar.set_postfix_str(words, refresh=False)
+            bar.update(min(share, 1.0) - bar.n)
+
+        yield report
