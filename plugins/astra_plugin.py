@@ -1,7 +1,7 @@
 """ASTRA: the algorithm ``POLYSPLAT``, for ``astra.astra_dict("POLYSPLAT")`` after ``tomo_polysplat.register()``.
 
-Geometries come from the data objects, so no projector is needed. ASTRA passes options through text, which only
-numbers survive: anything else travels in one :class:`AstraOptions`.
+Geometries come from the data objects; no projector is needed. ASTRA passes options as text, which only numbers
+survive: anything else travels in one :class:`AstraOptions`.
 """
 
 from __future__ import annotations
@@ -56,9 +56,9 @@ class AstraOptions:
 
 
 def _options_numbered(number: float) -> dict[str, Any]:
-    if int(number) not in _living:
-        raise fail("Options", "an AstraOptions that is still kept by the caller", f"{number:g}")
-    return _living[int(number)].options
+    if int(number) in _living:
+        return _living[int(number)].options
+    raise fail("Options", "an AstraOptions that is still kept by the caller", f"{number:g}")
 
 
 @cache
@@ -87,11 +87,10 @@ def plugin_class() -> type:
 
         def run(self, iterations):
             options = self.solver | {"valid": self.own.get("valid")}
-            passes = iterations if iterations > 1 else self.passes
-            if passes:
-                stated = options.get("settings") or {}
-                stated = stated.to_dict() if hasattr(stated, "to_dict") else dict(stated)
-                options["settings"] = stated | {"passes": float(passes)}
+            if passes := iterations if iterations > 1 else self.passes:
+                settings = options.get("settings") or {}
+                settings = getattr(settings, "to_dict", lambda known=settings: dict(known))()
+                options["settings"] = settings | {"passes": float(passes)}
             projections, proj_geom = _data(self.data["Projection"], self.own.get("projections"))
             volume, vol_geom = _data(self.data["Reconstruction"], self.own.get("reconstruction"))
             if hasattr(projections, "detach"):
@@ -110,6 +109,9 @@ def _data(number: int, tensor: Any) -> tuple[Any, dict[str, Any]]:
         kind, geometry = astra.data3d, astra.data3d.get_geometry(number)
     except Exception:  # ASTRA numbers 2D and 3D data together and says only by failing which one it is
         kind, geometry = astra.data2d, astra.data2d.get_geometry(number)
+    # ASTRA keeps the window in float32; the shortest decimal is what the caller wrote, unless it was longer.
+    window = geometry.get("options", {})
+    window.update({name: float(str(np.float32(value))) for name, value in window.items()})
     try:
         return kind.get_shared(number) if tensor is None else tensor, geometry
     except Exception as error:
@@ -140,10 +142,8 @@ def guarded_create(create: Callable[[Mapping[str, Any]], int]) -> Callable[[Mapp
 
 def _require_safe_options(options: Mapping[str, Any]) -> None:
     for name, value in options.items():
-        require_choice(
-            "option", name, ("Options", *NUMBERS), "anything else goes into Options: AstraOptions(...)"
-        )
-        if name == "Options" and not isinstance(value, AstraOptions):
-            raise fail("option['Options']", "an AstraOptions", repr(value), error=TypeError)
-        if name != "Options" and not isinstance(value, (int, float, np.integer, np.floating)):
-            raise fail(f"option['{name}']", "a number", repr(value), error=TypeError)
+        require_choice("option", name, ("Options", *NUMBERS), "the rest goes into Options: AstraOptions(...)")
+        wanted = AstraOptions if name == "Options" else (int, float, np.integer, np.floating)
+        if not isinstance(value, wanted):
+            expected = "an AstraOptions" if name == "Options" else "a number"
+            raise fail(f"option['{name}']", expected, repr(value), error=TypeError)

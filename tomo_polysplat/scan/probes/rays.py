@@ -13,6 +13,8 @@ __all__ = ["DEAD", "bad_rays", "probe_rays"]
 
 # Shares of rays, and of the views of a pixel, from which they count as a defect of the detector.
 _TOLERATED, _MOSTLY = 0.002, 0.5
+# Share of the views in which a pixel must stand out.
+_ALMOST_ALL = 0.8
 # Deviation of a pixel from all its neighbours, as a share of the scan's large values.
 _STANDS_OUT = 0.1
 # Around rays without light there is almost none: their neighbours' share of the scan's large values.
@@ -80,7 +82,7 @@ def _starved(projections: np.ndarray, valid: np.ndarray, level: float) -> np.nda
 
 
 def _dead_pixels(projections: np.ndarray, valid: np.ndarray, level: float) -> np.ndarray:
-    """Pixels above or below all their neighbours in most views, or that never change, (rows, columns).
+    """Pixels above or below all their neighbours in four views of five, or that never change, (rows, columns).
 
     What turns with the object does not stay in one pixel; what is round about the axis goes on into the next
     rows. A detector of one or two rows has no such neighbours, and its pixels must stand out by more.
@@ -95,7 +97,8 @@ def _dead_pixels(projections: np.ndarray, valid: np.ndarray, level: float) -> np
         highest, lowest = np.nanmax(near, axis=0), np.nanmin(near, axis=0)
     off = np.nan_to_num(np.fmax(values - highest, 0) - np.fmax(lowest - values, 0))
     limit = (_STANDS_OUT if rows > 2 else 3 * _STANDS_OUT) * level
-    stands_out = np.abs(np.median(off, axis=1)) > limit
+    low, high = np.quantile(off, [1 - _ALMOST_ALL, _ALMOST_ALL], axis=1)
+    stands_out = (low > limit) | (high < -limit)
     frozen = np.nan_to_num(np.ptp(values, axis=1), nan=1.0) == 0
     lively = np.nan_to_num(np.ptp(near, axis=2)).min(axis=0) > 0
     return stands_out | frozen & lively

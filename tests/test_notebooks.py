@@ -1,0 +1,57 @@
+"""The notebooks in examples/: they run at a small size, say what one learns, and carry no output."""
+
+import json
+from pathlib import Path
+
+import matplotlib
+import pytest
+
+FOLDER = Path(__file__).resolve().parents[1] / "examples"
+NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+# Text that is replaced so that a test takes seconds; each must be there.
+SMALL = {
+    "01_quickstart": {"SIZE, VIEWS, QUALITY = 48, 120": "SIZE, VIEWS, QUALITY = 24, 48"},
+    "02_tomopy_pipeline": {
+        "COLUMNS, ROWS, VIEWS, QUALITY = 72, 12, 150": "COLUMNS, ROWS, VIEWS, QUALITY = 40, 4, 60"
+    },
+    "03_astra_cone_geometry": {"SIZE, VIEWS, QUALITY = 40, 120": "SIZE, VIEWS, QUALITY = 20, 48"},
+    "04_spectrum_and_materials": {"SIZE, VIEWS, QUALITY = 40, 120": "SIZE, VIEWS, QUALITY = 32, 60"},
+    "05_speed_against_error": {
+        "SIZE, VIEWS, BUDGETS = 40, 120, (3.0, 10.0)": "SIZE, VIEWS, BUDGETS = 20, 40, (0.5, 1.0)"
+    },
+}
+
+
+def cells(path, kind):
+    notebook = json.loads(path.read_text(encoding="utf-8"))
+    return ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == kind]
+
+
+def test_the_notebooks_are_numbered_and_complete():
+    assert [path.stem for path in NOTEBOOKS] == sorted(SMALL)
+    assert [path.name[:2] for path in NOTEBOOKS] == [f"{k + 1:02}" for k in range(len(SMALL))]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_outputs_are_stripped_and_the_opening_says_what_one_learns(path):
+    notebook = json.loads(path.read_text(encoding="utf-8"))
+    code = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert all(not cell["outputs"] and cell["execution_count"] is None for cell in code)
+    assert "You will learn" in cells(path, "markdown")[0]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_the_notebook_runs(path, tmp_path, monkeypatch):
+    here, temporary = tmp_path / "here", tmp_path / "temporary"
+    here.mkdir()
+    temporary.mkdir()
+    monkeypatch.chdir(here)
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))
+    source = "\n\n".join(cells(path, "code"))
+    for old, new in SMALL[path.stem].items():
+        assert old in source, f"{path.name} does not say {old!r}"
+        source = source.replace(old, new)
+    matplotlib.use("Agg")
+    exec(compile(source, path.name, "exec"), {"__name__": "__main__"})
+    matplotlib.pyplot.close("all")
+    assert not list(here.iterdir()), "a notebook leaves files behind where it is run"
