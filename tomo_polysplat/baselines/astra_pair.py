@@ -1,0 +1,98 @@
+"""ASTRA's 3D projection and backprojection on torch CUDA tensors, without a copy."""
+
+from __future__ import annotations
+
+from types import TracebackType
+
+import numpy as np
+import torch
+
+from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, to_astra
+
+__all__ = ["AstraPair", "astra_has_gpu", "gpu_index"]
+
+
+def astra_has_gpu() -> bool:
+    """Whether ASTRA can compute on a GPU; without one some of its algorithms end the process."""
+    import astra
+
+    return torch.cuda.is_available() and bool(astra.use_cuda())
+
+
+def gpu_index(device: str | torch.device) -> int:
+    """Number of the GPU that a torch device stands for."""
+    index = torch.device(device).index
+    return torch.cuda.current_device() if index is None else index
+
+
+class AstraPair:
+    """Line integrals of a volume of voxels, and the backprojection nearly adjoint to them.
+
+    Parameters
+    ----------
+    geometry, grid : Geometry, VolumeGrid
+    device : torch.device
+        A CUDA device; tensors go in and come out there.
+    """
+
+    def __init__(self, geometry: Geometry, grid: VolumeGrid, device: torch.device) -> None:
+        self.geometry, self.grid = geometry, grid
+        self.index = gpu_index(device)
+        self._projectors: dict[bytes, int] = {}
+
+    def __enter__(self) -> AstraPair:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        import astra
+
+        while self._projectors:
+            astra.projector3d.delete(self._projectors.popitem()[1])
+
+    def forward(self, volume: torch.Tensor, views: np.ndarray) -> torch.Tensor:
+        """(views, rows, columns) line integrals of a volume (nz, ny, nx)."""
+        from astra.experimental import direct_FP3D
+
+        shape = (self.geometry.rows, len(views), self.geometry.columns)
+        projections = self._unwritten(shape, volume)
+        direct_FP3D(self._projector(views), volume.contiguous(), projections)
+        return self._written(projections, "projection").transpose(0, 1)
+
+    def adjoint(self, projections: torch.Tensor, views: np.ndarray) -> torch.Tensor:
+        """(nz, ny, nx) backprojection of projections (views, rows, columns)."""
+        from astra.experimental import direct_BP3D
+
+        ordered = projections.transpose(0, 1).contiguous()
+        volume = self._unwritten(self.grid.shape, projections)
+        direct_BP3D(self._projector(views), volume, ordered)
+        return self._written(volume, "backprojection")
+
+    def _projector(self, views: np.ndarray) -> int:
+        """ASTRA's projector of some views, made once."""
+        import astra
+
+        key = np.asarray(views, np.int64).tobytes()
+        if key not in self._projectors:
+            proj_geom, vol_geom = to_astra(self.geometry.select(views), self.grid)
+            options = {"GPUIndex": self.index}
+            self._projectors[key] = astra.create_projector("cuda3d", proj_geom, vol_geom, options)
+        return self._projectors[key]
+
+    def _unwritten(self, shape: tuple[int, ...], like: torch.Tensor) -> torch.Tensor:
+        """A tensor that shows whether it was written to.
+
+        ASTRA returns normally when it fails here. It also works on streams of its own and asks for none of
+        torch's, so what torch has still to compute must be waited for.
+        """
+        tensor = torch.full(shape, torch.nan, dtype=torch.float32, device=like.device)
+        torch.cuda.current_stream(like.device).synchronize()
+        return tensor
+
+    @staticmethod
+    def _written(tensor: torch.Tensor, name: str) -> torch.Tensor:
+        # One element tells, and costs no pass over the tensor.
+        if bool(tensor.view(-1)[0].isnan()):
+            raise RuntimeError(f"ASTRA's {name} failed; is its GPU out of memory?")
+        return tensor

@@ -1,0 +1,80 @@
+"""Where metal lies in a volume and in its projections, as methods that replace its rays want to know."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from tomo_polysplat.baselines.voxel_projector import projector_pair
+from tomo_polysplat.fit.plan import mass_level
+from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.settings import Settings
+from tomo_polysplat.start.initial import initial_volume
+
+__all__ = ["MetalTrace", "find_metal", "forward_project", "replace_trace"]
+
+
+@dataclass(frozen=True)
+class MetalTrace:
+    """Metal as a threshold finds it.
+
+    Attributes
+    ----------
+    start : (nz, ny, nx) float32
+        The smooth first reconstruction that was thresholded, in 1/unit.
+    soft : float
+        Attenuation of the object's main matter in it.
+    mask : (nz, ny, nx) bool
+        Its voxels of metal.
+    rays : (views, rows, columns) bool
+        Rays that pass through them.
+    """
+
+    start: np.ndarray
+    soft: float
+    mask: np.ndarray
+    rays: np.ndarray
+
+
+def find_metal(
+    projections: np.ndarray,
+    geometry: Geometry,
+    grid: VolumeGrid,
+    *,
+    level: float | None = None,
+    device: str = "cpu",
+) -> MetalTrace:
+    """Threshold a first reconstruction and project what lies above.
+
+    Parameters
+    ----------
+    projections : (views, rows, columns) float32
+        NaN where not measured.
+    geometry, grid : Geometry, VolumeGrid
+    level : float, optional
+        Threshold in multiples of the main matter; None for the level at which our own fit starts metal.
+    device : {"cpu", "cuda", "cuda:N"}
+    """
+    start, _ = initial_volume(projections, geometry, grid, device=device)
+    soft = mass_level(start)
+    mask = start > (Settings().metal_level if level is None else level) * soft
+    path = forward_project(mask.astype(np.float32), geometry, grid, device=device)
+    # Half a voxel: less is the blur of the threshold's edge, and a wider trace loses more than it heals.
+    return MetalTrace(start, soft, mask, path > 0.5 * float(grid.voxel_size.min()))
+
+
+def forward_project(
+    volume: np.ndarray, geometry: Geometry, grid: VolumeGrid, *, device: str = "cpu"
+) -> np.ndarray:
+    """(views, rows, columns) line integrals of a volume (nz, ny, nx)."""
+    target = torch.device(device)
+    tensor = torch.from_numpy(np.ascontiguousarray(volume, dtype=np.float32)).to(target)
+    with projector_pair(geometry, grid, target) as pair:
+        return np.ascontiguousarray(pair.forward(tensor, np.arange(geometry.views)).cpu().numpy())
+
+
+def replace_trace(volume: np.ndarray, metal: MetalTrace) -> np.ndarray:
+    """The volume with the metal put back as the first reconstruction has it."""
+    return np.where(metal.mask, metal.start, volume)

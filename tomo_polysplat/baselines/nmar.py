@@ -1,0 +1,62 @@
+"""NMAR: interpolation of the metal trace after dividing by the projections of a segmented prior."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tomo_polysplat.baselines.fdk import fdk
+from tomo_polysplat.baselines.metal_trace import MetalTrace, find_metal, forward_project, replace_trace
+from tomo_polysplat.baselines.water_bhc import water_corrected
+from tomo_polysplat.fit.plan import mass_level
+from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.settings import Settings
+from tomo_polysplat.start.initial import fill_invalid
+
+__all__ = ["nmar"]
+
+# Attenuation, in multiples of the main matter, between which a voxel of the prior is made all soft matter.
+_AIR, _BONE = 0.4, 1.5
+# Rays whose prior is below this share of the largest are not normalised: they would only amplify noise.
+_THIN = 0.02
+
+
+def nmar(
+    projections: np.ndarray,
+    geometry: Geometry,
+    grid: VolumeGrid,
+    spectrum: Spectrum | None = None,
+    *,
+    metal_level: float | None = None,
+    device: str = "cpu",
+) -> np.ndarray:
+    """Normalised metal artefact reduction (Meyer et al. 2010, doi:10.1118/1.3484090).
+
+    The prior is the interpolated reconstruction with air and soft matter made uniform and bone kept.
+    Parameters and result are those of :func:`tomo_polysplat.baselines.limar.limar`.
+    """
+    corrected = water_corrected(projections, spectrum)
+    metal = find_metal(corrected, geometry, grid, level=metal_level, device=device)
+    kept = np.isfinite(corrected) & ~metal.rays
+    bridged = fill_invalid(corrected, kept)
+    prior = forward_project(
+        _prior(fdk(bridged, geometry, grid, filter_name="hann", device=device), metal),
+        geometry,
+        grid,
+        device=device,
+    )
+    thick = prior > _THIN * prior.max(initial=0.0)
+    divisor = np.where(thick, prior, 1)
+    normalised = fill_invalid(np.where(thick, corrected / divisor, 0).astype(np.float32), kept | ~thick)
+    bridged = np.where(kept | ~thick, bridged, normalised * divisor)
+    return replace_trace(fdk(bridged, geometry, grid, device=device), metal)
+
+
+def _prior(volume: np.ndarray, metal: MetalTrace) -> np.ndarray:
+    """Air, soft matter and bone; metal stands for soft matter, so that the trace is bridged as if it were."""
+    soft = mass_level(np.where(metal.mask, 0, volume))
+    bone = np.minimum(volume, Settings().metal_level * soft)
+    prior = np.where(volume > _BONE * soft, bone, soft)
+    prior[volume < _AIR * soft] = 0
+    prior[metal.mask] = soft
+    return prior.astype(np.float32)

@@ -1,0 +1,79 @@
+"""SIRT: the least-squares volume that the measured line integrals allow, with nothing known of energies."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tomo_polysplat.baselines.astra_pair import astra_has_gpu, gpu_index
+from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, to_astra
+from tomo_polysplat.start import sirt as start
+
+__all__ = ["sirt"]
+
+
+def sirt(
+    projections: np.ndarray,
+    geometry: Geometry,
+    grid: VolumeGrid,
+    *,
+    iterations: int = 50,
+    subsets: int = 1,
+    device: str = "cpu",
+) -> np.ndarray:
+    """Non-negative SIRT from zero (Gregor and Benson 2008, doi:10.1109/TMI.2008.923696).
+
+    Parameters
+    ----------
+    projections : (views, rows, columns) float32
+        ``-log(I / I0)``; NaN is left out.
+    geometry, grid : Geometry, VolumeGrid
+    iterations : int
+        Times that every view is used.
+    subsets : int
+        Groups of views that are each followed by an update; ASTRA's takes all views at once.
+    device : {"cpu", "cuda", "cuda:N"}
+        On a GPU, ASTRA's SIRT3D_CUDA.
+
+    Returns
+    -------
+    (nz, ny, nx) float32
+        Attenuation in 1/unit.
+    """
+    if device.startswith("cuda") and subsets == 1 and astra_has_gpu():
+        return _sirt_cuda(projections, geometry, grid, iterations, gpu_index(device))
+    return start.sirt(projections, geometry, grid, passes=iterations, subsets=subsets)
+
+
+def _sirt_cuda(
+    projections: np.ndarray, geometry: Geometry, grid: VolumeGrid, iterations: int, index: int
+) -> np.ndarray:
+    import astra
+
+    proj_geom, vol_geom = to_astra(geometry, grid)
+    ordered = np.ascontiguousarray(projections.swapaxes(0, 1), dtype=np.float32)
+    usable = np.isfinite(ordered)
+    volume = np.zeros(grid.shape, np.float32)
+    data, algorithm = [], None
+
+    def link(kind: str, array: np.ndarray) -> int:
+        # This algorithm wants its data in host memory, and copies it once; the arrays are shared with it.
+        data.append(astra.data3d.link(kind, vol_geom if kind == "-vol" else proj_geom, array))
+        return data[-1]
+
+    try:
+        config = astra.astra_dict("SIRT3D_CUDA")
+        measured = np.where(usable, ordered, np.float32(0))
+        config["ProjectionDataId"] = link("-sino", measured)
+        config["ReconstructionDataId"] = link("-vol", volume)
+        config["option"] = {"MinConstraint": 0.0, "GPUindex": index}
+        if not usable.all():
+            mask = usable.astype(np.float32)
+            config["option"]["SinogramMaskId"] = link("-sino", mask)
+        algorithm = astra.algorithm.create(config)
+        astra.algorithm.run(algorithm, iterations)
+    finally:
+        if algorithm is not None:
+            astra.algorithm.delete(algorithm)
+        for identifier in data:
+            astra.data3d.delete(identifier)
+    return volume

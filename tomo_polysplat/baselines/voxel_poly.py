@@ -1,0 +1,196 @@
+"""The polychromatic voxel grid: our physics, weights, loss, total variation and stopping rule, without Gaussians.
+
+It is the rival that tells what the Gaussians themselves are worth.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from tomo_polysplat.baselines.voxel_model import VoxelModel, start_voxels
+from tomo_polysplat.baselines.voxel_projector import ProjectorPair, project_voxels, projector_pair
+from tomo_polysplat.fit.loss import misfit, total_variation
+from tomo_polysplat.fit.noise import photons_per_ray
+from tomo_polysplat.fit.optimise import FitState
+from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.physics.materials import Materials
+from tomo_polysplat.physics.quadrature import fit_quadrature
+from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.physics.transmission import polychromatic_projection
+from tomo_polysplat.physics.water import transmitted_energy, water_equivalent
+from tomo_polysplat.render.renderer import detector_views
+from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.settings import Settings, make_settings
+from tomo_polysplat.start.initial import initial_volume
+from tomo_polysplat.units import cm_per
+
+__all__ = ["voxel_poly"]
+
+VIEWS_PER_STEP = 4
+RATE_ATTENUATION, RATE_MATERIAL = 3e-2, 3e-3  # per step of Adam, falling like those of the Gaussians
+_LARGEST_PROJECTION = 15.0
+_IMPROVEMENT = 2e-3
+
+
+def voxel_poly(
+    projections: np.ndarray,
+    geometry: Geometry,
+    grid: VolumeGrid,
+    spectrum: Spectrum,
+    *,
+    unit: str = "cm",
+    materials: Materials | None = None,
+    settings: Settings | Mapping[str, Any] | None = None,
+    time_budget: float | None = None,
+    seed: int = 0,
+    callbacks: Sequence[Callable[[FitState], Any]] = (),
+    device: str = "cpu",
+) -> np.ndarray:
+    """Fit a density and, near dense matter, a material number to every voxel.
+
+    Parameters
+    ----------
+    projections : (views, rows, columns) float32
+        ``-log(I / I0)``, NaN where not measured.
+    geometry, grid : Geometry, VolumeGrid
+        Lengths in ``unit``.
+    spectrum : Spectrum
+    unit : str
+    materials : Materials, optional
+    settings : Settings or mapping, optional
+        Of the fit with Gaussians; what is said of rays, materials, loss and length of the run holds here too.
+    time_budget : float, optional
+        Seconds, the first reconstruction included.
+    seed : int
+        Of the order of the views.
+    callbacks : sequence of callables
+        Get a `FitState` once a pass over the views; returning True ends the fit.
+    device : {"cpu", "cuda", "cuda:N"}
+
+    Returns
+    -------
+    (nz, ny, nx) float32
+        Attenuation in 1/unit at the effective energy, of the pass whose held-out rays fitted best.
+    """
+    started = time.perf_counter()
+    chosen = settings if isinstance(settings, Settings) else make_settings(changes=dict(settings or {}))
+    target = torch.device(device)
+    start, _ = initial_volume(
+        (water_equivalent(projections, spectrum) / cm_per(unit)).astype(np.float32),
+        geometry,
+        grid,
+        device=device,
+    )
+    model = start_voxels(start, grid, chosen, target)
+    with projector_pair(geometry, grid, target) as pair:
+        fit = _Fit(projections, geometry, spectrum, materials or Materials(), unit, model, pair, chosen)
+        deadline = None if time_budget is None else started + time_budget
+        best = fit.run(np.random.default_rng(seed), started, deadline, callbacks)
+        return fit.volume(best)
+
+
+class _Fit:
+    """Rays, physics and optimiser of one run."""
+
+    def __init__(
+        self,
+        projections: np.ndarray,
+        geometry: Geometry,
+        spectrum: Spectrum,
+        materials: Materials,
+        unit: str,
+        model: VoxelModel,
+        pair: ProjectorPair,
+        settings: Settings,
+    ) -> None:
+        self.model, self.pair, self.settings, self.cm = model, pair, settings, cm_per(unit)
+        values = np.where(np.isfinite(projections), projections, np.float32(np.nan))
+        largest = float(np.clip(np.nanmax(values), 1.0, _LARGEST_PROJECTION))
+        self.quadrature = fit_quadrature(spectrum, materials, largest, settings.spectral_nodes or None)
+        target = model.relative.device
+        energies = [transmitted_energy(values, spectrum), spectrum.effective_energy]
+        curves = materials.mass_attenuation(energies)
+        self.water = float(curves[0, 1]) * self.cm
+        relative = torch.as_tensor(curves / curves[:1], dtype=torch.float32, device=target)
+        self.reference_curve, self.output_curve = relative[:, 0], relative[:, 1]
+        self.rays = Rays(
+            torch.from_numpy(values).to(target),
+            detector_views(geometry, geometry.planar),
+            photons_per_ray(values),
+            settings.model_error,
+            settings.held_out,
+        )
+        self.parameters = [model.relative.requires_grad_(), model.own.requires_grad_()]
+        rates = (RATE_ATTENUATION, RATE_MATERIAL)
+        groups = [{"params": [p], "lr": r, "rate": r} for p, r in zip(self.parameters, rates)]
+        self.optimiser = torch.optim.Adam(groups, eps=1e-15, fused=True)
+
+    def run(
+        self,
+        rng: np.random.Generator,
+        started: float,
+        deadline: float | None,
+        callbacks: Sequence[Callable[[FitState], Any]],
+    ) -> VoxelModel:
+        """The model of the best pass."""
+        views = len(self.rays.views)
+        groups = [
+            np.arange(first, views, -(-views // VIEWS_PER_STEP))
+            for first in range(-(-views // VIEWS_PER_STEP))
+        ]
+        steps = math.ceil(self.settings.passes * len(groups))
+        begun, step, lowest, waited = time.perf_counter(), 0, math.inf, 0
+        best = self.model.copy()
+        while step < steps and waited < self.settings.patience:
+            sums = []
+            for group in rng.permutation(len(groups))[: steps - step]:
+                share = step / steps
+                if deadline is not None:
+                    share = max(share, (time.perf_counter() - begun) / max(deadline - begun, 1e-9))
+                if share >= 1:
+                    break
+                sums.append(self._step(groups[group], share))
+                step += 1
+            if not sums:
+                break
+            loss, held_out = torch.stack(sums).mean(dim=0).tolist()
+            waited = 0 if held_out < (1 - _IMPROVEMENT) * lowest else waited + 1
+            if held_out <= lowest:
+                lowest, best = held_out, self.model.copy()
+            seconds = time.perf_counter() - started
+            state = FitState(seconds, step, 0, loss, held_out, step / steps, lambda: self.volume(self.model))
+            if any([callback(state) is True for callback in callbacks]) or not math.isfinite(loss):
+                break
+        return best
+
+    def _step(self, views: np.ndarray, share: float) -> torch.Tensor:
+        """One step of Adam; misfit of the fitted and of the held-out rays."""
+        for group in self.optimiser.param_groups:
+            group["lr"] = group["rate"] * self.settings.final_rate**share
+        _, measured, weight, aside = self.rays.batch(views)
+        weights = self.model.weights(self.reference_curve)
+        areal = project_voxels(weights, self.pair, views) * self.cm
+        predicted = polychromatic_projection(areal, self.quadrature)
+        fitted = misfit(predicted, measured, weight, self.settings)
+        rough = total_variation(self._output(weights), self.settings.tv_clip)
+        self.optimiser.zero_grad(set_to_none=True)
+        (fitted + self.settings.tv_weight * rough).backward()
+        self.optimiser.step()
+        self.model.hold()
+        with torch.no_grad():
+            return torch.stack([fitted.detach(), misfit(predicted, measured, aside, self.settings)])
+
+    def _output(self, weights: torch.Tensor) -> torch.Tensor:
+        """(nz, ny, nx) attenuation at the effective energy in soft references."""
+        return torch.einsum("k,kzyx->zyx", self.output_curve, weights)
+
+    @torch.no_grad()
+    def volume(self, model: VoxelModel) -> np.ndarray:
+        """(nz, ny, nx) attenuation in 1/unit."""
+        return self._output(model.weights(self.reference_curve)).cpu().numpy() * np.float32(self.water)

@@ -1,0 +1,166 @@
+"""The methods that a benchmark can compare, by name, behind one signature."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from tomo_polysplat.baselines.fdk import fdk
+from tomo_polysplat.baselines.limar import limar
+from tomo_polysplat.baselines.mono_splat import mono_splat
+from tomo_polysplat.baselines.nmar import nmar
+from tomo_polysplat.baselines.sirt import sirt
+from tomo_polysplat.baselines.voxel_poly import voxel_poly
+from tomo_polysplat.baselines.water_bhc import water_bhc
+from tomo_polysplat.fit.optimise import FitState
+from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.reconstruction import reconstruct
+from tomo_polysplat.result.result import Result
+from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, from_astra, projections_from_astra
+from tomo_polysplat.scan.scan import Scan
+
+__all__ = ["METHODS", "Method", "Options", "Task"]
+
+
+@dataclass(frozen=True)
+class Task:
+    """A scan as methods take it.
+
+    Attributes
+    ----------
+    scan : Scan
+    projections : (views, rows, columns) float32
+        NaN where not measured.
+    geometry, grid : Geometry, VolumeGrid
+    device : str
+    seed : int
+    """
+
+    scan: Scan
+    projections: np.ndarray
+    geometry: Geometry
+    grid: VolumeGrid
+    device: str
+    seed: int = 0
+
+    @classmethod
+    def of(cls, scan: Scan, device: str, seed: int = 0) -> Task:
+        """The task that a scan sets."""
+        geometry, grid = from_astra(scan.proj_geom, scan.vol_geom)
+        values = scan.projections if scan.valid is None else np.where(scan.valid, scan.projections, np.nan)
+        return cls(scan, projections_from_astra(values, scan.proj_geom), geometry, grid, device, seed)
+
+    @property
+    def spectrum(self) -> Spectrum:
+        """The scan's; benchmarks have one."""
+        assert self.scan.spectrum is not None
+        return self.scan.spectrum
+
+
+@dataclass
+class Options:
+    """What a run may be told.
+
+    Attributes
+    ----------
+    time_budget : float or None
+        Seconds, for methods that improve with time.
+    settings : dict
+        Changes of the solver's settings.
+    callbacks : list
+        Called once a pass over the views.
+    """
+
+    time_budget: float | None = None
+    settings: dict[str, Any] = field(default_factory=dict)
+    callbacks: list[Callable[[FitState], Any]] = field(default_factory=list)
+
+
+Outcome = tuple[np.ndarray, dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Method:
+    """One way to reconstruct.
+
+    Attributes
+    ----------
+    label : str
+        Its name in figures.
+    run : callable
+        From a Task and Options to the volume and what there is to say about the run.
+    improves : bool
+        Whether it takes a time budget and callbacks.
+    """
+
+    label: str
+    run: Callable[[Task, Options], Outcome]
+    improves: bool = False
+
+
+def _direct(function: Callable[..., np.ndarray], *, spectrum: bool = False, **fixed: Any) -> Any:
+    """A method that runs to its end: ``function(projections, geometry, grid[, spectrum], device=...)``."""
+
+    def run(task: Task, _: Options) -> Outcome:
+        energies = (task.spectrum,) if spectrum else ()
+        data = (task.projections, task.geometry, task.grid, *energies)
+        return function(*data, device=task.device, **fixed), dict(fixed)
+
+    return run
+
+
+def _fit_options(task: Task, options: Options) -> dict[str, Any]:
+    return {
+        "unit": task.scan.unit,
+        "seed": task.seed,
+        "device": task.device,
+        "settings": options.settings,
+        "time_budget": options.time_budget,
+        "callbacks": options.callbacks,
+    }
+
+
+def _voxel_poly(task: Task, options: Options) -> Outcome:
+    data = (task.projections, task.geometry, task.grid, task.spectrum)
+    return voxel_poly(*data, **_fit_options(task, options)), {}
+
+
+def _mono(task: Task, options: Options) -> Outcome:
+    data = (task.projections, task.geometry, task.grid)
+    return _told(mono_splat(*data, progress=False, **_fit_options(task, options)))
+
+
+def _polysplat(task: Task, options: Options) -> Outcome:
+    scan = task.scan
+    return _told(
+        reconstruct(
+            scan.projections,
+            scan.proj_geom,
+            scan.vol_geom,
+            spectrum=scan.spectrum,
+            valid=scan.valid,
+            progress=False,
+            **_fit_options(task, options),
+        )
+    )
+
+
+def _told(result: Result) -> Outcome:
+    about = {key: result.plan.get(key) for key in ("kernel", "stop")}
+    return result.volume, {"gaussians": result.counts.get("gaussians"), **about}
+
+
+METHODS = {
+    "fdk": Method("FDK", _direct(fdk)),
+    "fdk-water": Method("FDK after water correction", _direct(water_bhc, spectrum=True)),
+    "sirt": Method("SIRT, 50 iterations", _direct(sirt, iterations=50)),
+    "sirt-200": Method("SIRT, 200 iterations", _direct(sirt, iterations=200)),
+    "limar": Method("LIMAR after water correction", _direct(limar, spectrum=True)),
+    "nmar": Method("NMAR after water correction", _direct(nmar, spectrum=True)),
+    "voxel-poly": Method("polychromatic voxels", _voxel_poly, improves=True),
+    "mono": Method("Gaussians, one energy", _mono, improves=True),
+    "polysplat": Method("tomo-polysplat", _polysplat, improves=True),
+}
