@@ -14,7 +14,8 @@ logger = logging.getLogger(__name__)
 def register() -> tuple[str, ...]:
     """Make ``algorithm="polysplat"`` known to TomoPy and ``astra.astra_dict("POLYSPLAT")`` to ASTRA.
 
-    It lasts as long as the process and may be repeated. Whichever host is missing is left out.
+    It lasts as long as the process and may be repeated. Whichever host is missing is left out; one that is there
+    but cannot be imported is left out with a warning.
 
     Returns
     -------
@@ -31,7 +32,11 @@ def register() -> tuple[str, ...]:
         if find_spec(name) is None:
             logger.info("%s is not installed", name)
             continue
-        tell()
+        try:
+            tell()
+        except (ImportError, OSError) as error:
+            logger.warning("%s is installed but cannot be imported: %s", name, error)
+            continue
         known.append(name)
     return tuple(known)
 

@@ -103,6 +103,10 @@ def _packages() -> Lines:
 def _tomopy() -> str:
     if find_spec("tomopy") is None:
         return f"not installed ({TOMOPY_SOURCE})"
+    try:
+        importlib.import_module("tomopy")
+    except Exception as error:  # its compiled libraries may be missing, or want another NumPy
+        return f"cannot be imported ({error}); {TOMOPY_SOURCE}"
     return _version("tomopy") or "installed"
 
 

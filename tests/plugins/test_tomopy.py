@@ -221,6 +221,17 @@ def test_registering_twice_changes_nothing(tomopy):
     assert tomo_polysplat.register() == tomo_polysplat.register()
 
 
+def test_a_broken_tomopy_does_not_keep_astra_from_knowing(monkeypatch, caplog):
+    monkeypatch.setattr("tomo_polysplat.plugins.hosts.find_spec", lambda name: object())
+
+    def broken():
+        raise OSError("libtomo-recon.so: cannot open shared object file")
+
+    monkeypatch.setattr("tomo_polysplat.plugins.hosts._tell_tomopy", broken)
+    assert tomo_polysplat.register() == ("astra",)
+    assert "tomopy is installed but cannot be imported: libtomo" in caplog.text
+
+
 def test_the_solver_itself_in_chunks(tomopy):
     tomo, theta, truth = measured(slices=2)
     options = {"quality": "fast", "settings": {"passes": 4}}
