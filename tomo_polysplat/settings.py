@@ -77,6 +77,8 @@ class Settings:
     """Share of the rays kept from the fit to tell when it stops improving."""
     patience: int = 4
     """Checks without improvement of the held-out rays that end the run."""
+    metal_tail: float = 0.07
+    """A voxel with less than this share of a neighbour's metal holds a tail, which the neighbour gets back."""
     cutoff: float = 3.0
     """Standard deviations at which a projected Gaussian ends."""
     spectral_nodes: int = 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -38,7 +38,7 @@ class FitState:
         Since the reconstruction began.
     iteration, gaussians : int
     loss, held_out : float
-        Mean misfit of the fitted and of the held-out rays over the pass.
+        Mean misfit of the fitted and of the held-out rays over the pass; NaN where no ray was held out.
     share : float
         Of the run that is done, 0 to 1.
     volume : callable
@@ -56,7 +56,8 @@ class FitState:
     def record(self) -> dict[str, Any]:
         """The numbers, for the history."""
         names = ("seconds", "iteration", "loss", "held_out", "gaussians")
-        return {name: getattr(self, name) for name in names} | {"stage": "fit"}
+        values = {name: getattr(self, name) for name in names} | {"stage": "fit"}
+        return values | ({"held_out": None} if math.isnan(self.held_out) else {})
 
 
 @dataclass
@@ -67,6 +68,40 @@ class FitOutcome:
     history: list[dict[str, Any]] = field(default_factory=list)
     skipped_pairs: int = 0
     reason: str = ""
+
+
+@dataclass
+class _Pass:
+    """Sums over the steps of a pass; tensors until they are asked for, so that no step waits for a GPU."""
+
+    steps: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor, int | torch.Tensor]] = field(
+        default_factory=list
+    )
+
+    def read(self) -> tuple[float, float, int]:
+        """Mean misfit of the fitted rays and of the held-out ones, and the number of pairs skipped."""
+        fitted, held_out, weight, skipped = (float(sum(values)) for values in zip(*self.steps))
+        return fitted / len(self.steps), held_out / weight if weight else math.nan, round(skipped)
+
+
+class _Clock:
+    """How much of a run is done: of its steps or of its time, whichever ends first."""
+
+    def __init__(self, steps: int, deadline: float | None) -> None:
+        self.steps, self.deadline, self.begun, self.done = steps, deadline, time.perf_counter(), 0
+
+    @property
+    def late(self) -> bool:
+        """Whether the deadline has passed."""
+        return self.deadline is not None and time.perf_counter() >= self.deadline
+
+    def share(self) -> float:
+        """From 0 to 1."""
+        if self.deadline is None:
+            return self.done / self.steps
+        if self.late:
+            return 1.0
+        return max(self.done / self.steps, (time.perf_counter() - self.begun) / (self.deadline - self.begun))
 
 
 class _Fitter:
@@ -100,8 +135,27 @@ class _Fitter:
         )
         self.order = np.empty(0, int)
 
-    def step(self, share: float, batch: int) -> tuple[torch.Tensor, torch.Tensor, int | torch.Tensor]:
-        """One step of the optimiser; misfit of the fitted and the held-out rays, and pairs skipped."""
+    def passes(self, batch: int, clock: _Clock) -> Iterator[_Pass]:
+        """Step until the clock runs out; what each pass over the views gave, the last perhaps a part of one."""
+        steps = max(1, round(len(self.rays.views) / batch))
+        record = _Pass()
+        while (share := clock.share()) < 1:
+            record.steps.append(self.step(share, batch))
+            clock.done += 1
+            if len(record.steps) == steps:
+                yield record
+                record = _Pass()
+        if record.steps:
+            yield record
+
+    def step(
+        self, share: float, batch: int
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, int | torch.Tensor]:
+        """One step of the optimiser.
+
+        Returns the mean misfit of the fitted rays, the sum of that of the held-out rays, their weight, and
+        the pairs skipped.
+        """
         for group in self.optimiser.param_groups:
             group["lr"] = group["rate"] * self.settings.final_rate**share
         views, measured, weight, aside = self.rays.batch(self._next_views(batch))
@@ -121,7 +175,13 @@ class _Fitter:
             self.gaussians.own_material.clamp_(LEAST_U, 1.0)
             self.gaussians.shared_material.clamp_(LEAST_U, 1.0)
             self.gaussians.log_scale.clamp_(*self.bounds)
-            return fitted.detach(), misfit(predicted, measured, aside, self.settings), skipped
+            weight = aside.sum()
+            return (
+                fitted.detach(),
+                misfit(predicted, measured, aside, self.settings) * weight,
+                weight,
+                skipped,
+            )
 
     def _hold_materials(self, share: float) -> None:
         """Keep the soft matter's number, and for a while the metals': while edges are blurred they would drift.
@@ -165,49 +225,42 @@ def fit(
         logger.warning("The start volume is empty: no Gaussians, a volume of zeros.")
         return FitOutcome(gaussians, reason="nothing to fit: the start volume is empty")
     fitter = _Fitter(gaussians, spacing, rays, scene, settings, rng)
-    count = len(rays.views)
-    batch = min(views_per_step, count)
-    per_pass = max(1, round(count / batch))
-    steps = max(1, math.ceil(settings.passes * count / batch))
-    outcome = FitOutcome(gaussians.copy())
-    begun = time.perf_counter()
-    watch = _Watch(settings)
-    sums: list[tuple] = []
+    outcome, watch = FitOutcome(gaussians), _Watch(settings)
+    batch = min(views_per_step, len(rays.views))
+    clock = _Clock(max(1, math.ceil(settings.passes * len(rays.views) / batch)), deadline)
     try:
-        for step in range(steps):
-            share = step / steps
-            if deadline is not None:
-                share = max(share, (time.perf_counter() - begun) / max(deadline - begun, 1e-9))
-            if share >= 1:
-                outcome.reason = "the time budget was used"
-                break
-            sums.append(fitter.step(share, batch))
-            if len(sums) < per_pass and step + 1 < steps:
-                continue
-            loss, held_out, skipped = (float(sum(values)) / len(sums) for values in zip(*sums))
-            outcome.skipped_pairs += round(skipped * len(sums))
-            sums = []
+        for record in fitter.passes(batch, clock):
+            loss, held_out, skipped = record.read()
+            outcome.skipped_pairs += skipped
             state = FitState(
                 time.perf_counter() - started,
-                step + 1,
+                clock.done,
                 len(gaussians),
                 loss,
                 held_out,
-                share,
+                clock.share(),
                 lambda: volume(gaussians),
             )
             outcome.history.append(state.record())
             outcome.reason = watch.judge(state, gaussians)
-            if any([callback(state) is True for callback in callbacks]):
+            if any([_is_true(callback(state)) for callback in callbacks]):
                 outcome.reason = "a callback ended it"
             if outcome.reason:
                 break
     except KeyboardInterrupt:
-        logger.warning("Interrupted after %d steps; the best state so far is returned.", step)
+        logger.warning("Interrupted after %d steps; the best state so far is returned.", clock.done)
         outcome.reason = "interrupted"
-    outcome.reason = outcome.reason or f"{settings.passes:g} passes over the views were made"
+    used_up = (
+        "the time budget was used" if clock.late else f"{settings.passes:g} passes over the views were made"
+    )
+    outcome.reason = outcome.reason or used_up
     outcome.gaussians = watch.best or gaussians.copy()
     return outcome
+
+
+def _is_true(answer: Any) -> bool:
+    """Whether a callback said True; whatever else a function happens to return is no answer."""
+    return isinstance(answer, (bool, np.bool_)) and bool(answer)
 
 
 class _Watch:
@@ -227,10 +280,11 @@ class _Watch:
                     "the fit diverged in its first pass; see the log for rays out of range"
                 )
             return "the misfit stopped being finite"
-        score = state.held_out if self.settings.held_out else state.loss
+        held_out = math.isfinite(state.held_out)
+        score = state.held_out if held_out else state.loss
         self.waited = 0 if score < (1 - _IMPROVEMENT) * self.lowest else self.waited + 1
         if score <= self.lowest:
             self.lowest, self.best = score, gaussians.copy()
-        if self.settings.held_out and self.waited >= self.settings.patience:
+        if held_out and self.waited >= self.settings.patience:
             return f"the held-out rays had not improved for {self.waited} passes"
         return ""

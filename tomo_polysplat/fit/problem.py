@@ -118,6 +118,7 @@ class Problem:
             output_curve,
             kernel,
             settings.cutoff,
+            settings.metal_tail,
         )
 
     def _physics(

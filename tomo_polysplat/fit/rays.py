@@ -42,7 +42,8 @@ class Rays:
         The variance of -log(I/I0) is exp(P)/I0 for Poisson counts, to which that of the model is added; the
         weight is the inverse deviation, 1 for a ray without noise.
         """
-        values = self.projections[torch.as_tensor(chosen, device=self.projections.device)]
+        # Stacked view by view: an index tensor would have to travel to a GPU, which waits for it.
+        values = torch.stack([self.projections[view] for view in chosen.tolist()])
         usable = torch.isfinite(values)
         values = torch.where(usable, values, torch.zeros_like(values))
         weight = usable.to(values.dtype)
@@ -55,9 +56,8 @@ class Rays:
         device = self.projections.device
         if not self.held_out:
             return torch.zeros((len(chosen), *shape), dtype=torch.bool, device=device)
-        pixel = torch.arange(shape.numel(), device=device, dtype=torch.int64).reshape(shape)
-        view = torch.as_tensor(chosen, device=device, dtype=torch.int64)[:, None, None]
+        pixel = torch.arange(shape.numel(), device=device, dtype=torch.int64).reshape(shape) * 2654435761
         # One round of a multiplicative hash (Knuth) over the pair, to 16 even bits.
-        mixed = (pixel * 2654435761 + view * 40503 + 12345) & 0xFFFFFFFF
+        mixed = torch.stack([(pixel + (view * 40503 + 12345)) & 0xFFFFFFFF for view in chosen.tolist()])
         mixed = ((mixed ^ (mixed >> 15)) * 2246822519) & 0xFFFFFFFF
         return (mixed >> 16) < int(self.held_out * 65536)

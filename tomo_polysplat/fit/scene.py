@@ -11,7 +11,8 @@ from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.quadrature import Quadrature
 from tomo_polysplat.physics.transmission import polychromatic_projection
-from tomo_polysplat.render.renderer import project_gaussians, voxelise_gaussians
+from tomo_polysplat.render.metal_edges import without_tails
+from tomo_polysplat.render.renderer import project_gaussians, voxelise_gaussians, voxelise_means
 
 __all__ = ["FitScene"]
 
@@ -34,6 +35,8 @@ class FitScene:
         the energy of the volume; None for a monochromatic model.
     kernel : str
     cutoff : float
+    metal_tail : float
+        Share of a neighbour's metal below which a voxel's metal is a tail; see ``render.metal_edges``.
     """
 
     box: VoxelBox
@@ -43,6 +46,7 @@ class FitScene:
     output_curve: torch.Tensor | None
     kernel: str
     cutoff: float
+    metal_tail: float
 
     @property
     def polychromatic(self) -> bool:
@@ -59,12 +63,26 @@ class FitScene:
         return polychromatic_projection(areal, self.quadrature), skipped
 
     def attenuation(self, gaussians: Gaussians, box: VoxelBox) -> torch.Tensor:
-        """(nz, ny, nx) attenuation at the effective energy in soft references."""
-        weights = gaussians.weights(self.reference_curve)
-        if self.output_curve is not None:
-            weights = self.output_curve[None] @ weights
-        return voxelise_gaussians(gaussians, weights, box, self.kernel)[0]
+        """(nz, ny, nx) attenuation at the effective energy in soft references, at voxel centres."""
+        return voxelise_gaussians(gaussians, self._output_weights(gaussians), box, self.kernel)[0]
+
+    def volume(self, gaussians: Gaussians) -> torch.Tensor:
+        """(nz, ny, nx) attenuation at the effective energy in soft references, means over the voxels."""
+        return self._means(gaussians, self._output_weights(gaussians))[0]
 
     def basis(self, gaussians: Gaussians) -> torch.Tensor:
-        """(channels, nz, ny, nx) densities of the curves in soft references."""
-        return voxelise_gaussians(gaussians, gaussians.weights(self.reference_curve), self.box, self.kernel)
+        """(channels, nz, ny, nx) densities of the curves in soft references, means over the voxels."""
+        return self._means(gaussians, gaussians.weights(self.reference_curve))
+
+    def _means(self, gaussians: Gaussians, weights: torch.Tensor) -> torch.Tensor:
+        """Means over the voxels, with the tails of metal put back inside it."""
+        metal = gaussians.group > 0
+        parts = []
+        for chosen in (~metal, metal):
+            index = chosen.nonzero()[:, 0]
+            parts.append(voxelise_means(gaussians.select(index), weights[:, index], self.box, self.kernel))
+        return parts[0] + without_tails(parts[1], self.metal_tail)
+
+    def _output_weights(self, gaussians: Gaussians) -> torch.Tensor:
+        weights = gaussians.weights(self.reference_curve)
+        return weights if self.output_curve is None else self.output_curve[None] @ weights

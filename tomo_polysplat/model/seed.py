@@ -41,14 +41,8 @@ def seed_gaussians(
         Distance of the seeds in the grid's unit.
     """
     dims = 2 if grid.planar else 3
-    points = _lattice(grid, spacing, dims)
-    fine = _reaches(start, points, grid, settings.metal_level, spacing)
-    points = np.concatenate([points[~fine], _split(points[fine], spacing, dims)])
-    size = np.full(len(points), spacing)
-    size[np.count_nonzero(~fine) :] /= 2
-    value, nearby = _sample(start, points, grid, spacing, dims)
-    keep = nearby > settings.support_level
-    points, size, value = points[keep], size[keep], np.maximum(value[keep], _LEAST)
+    start = _sharpened(start, settings.metal_level)
+    points, size, value = _lattices(start, grid, spacing, dims, settings)
     own, shared, group = _materials(start, points, value, grid, settings, polychromatic)
     # A lattice of Gaussians of this height averages to the wanted value: the cell's integral over the
     # Gaussian's.
@@ -72,6 +66,39 @@ def seed_gaussians(
     # Neighbours in space beside each other in memory, which the kernels use.
     order = spatial_order(gaussians.position)
     return gaussians.select(order)
+
+
+def _sharpened(start: np.ndarray, level: float) -> np.ndarray:
+    """The start with every piece of metal cut at half its height, its mass kept and its rim made soft matter.
+
+    Filtered backprojection blurs; the blurred rim of metal is many times as bright as what really lies there.
+    """
+    from scipy import ndimage
+
+    pieces, number = ndimage.label(start > level)
+    sharp = start.copy()
+    for label in range(1, number + 1):
+        piece = pieces == label
+        values = start[piece]
+        core = piece & (start > 0.5 * np.quantile(values, 0.9))
+        sharp[piece] = np.minimum(values, 1.0)
+        sharp[core] = start[core] * (values.sum() / start[core].sum())
+    return sharp
+
+
+def _lattices(
+    start: np.ndarray, grid: VolumeGrid, spacing: float, dims: int, settings: Settings
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points (n, 3) on the support, the spacing at each and the start's mean over the cell of each."""
+    coarse = _lattice(grid, spacing, dims)
+    metal = _reaches(start, coarse, grid, settings.metal_level, spacing)
+    parts = []
+    for points, size in ((coarse[~metal], spacing), (_split(coarse[metal], spacing, dims), spacing / 2)):
+        value, nearby = _sample(start, points, grid, size, dims)
+        keep = nearby > settings.support_level
+        parts.append((points[keep], np.full(keep.sum(), size), np.maximum(value[keep], _LEAST)))
+    points, size, value = (np.concatenate(arrays) for arrays in zip(*parts))
+    return points, size, value
 
 
 def _lattice(grid: VolumeGrid, spacing: float, dims: int) -> np.ndarray:

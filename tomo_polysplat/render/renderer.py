@@ -12,11 +12,20 @@ from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 
-__all__ = ["VOXEL_CUTOFF", "detector_views", "project_gaussians", "voxel_box", "voxelise_gaussians"]
+__all__ = [
+    "VOXEL_CUTOFF",
+    "detector_views",
+    "project_gaussians",
+    "voxel_box",
+    "voxelise_gaussians",
+    "voxelise_means",
+]
 
 # Where a volume's Gaussians end so that they hold the same mass as a projected one cut at 3 deviations,
 # 1 - exp(-9/2) of the whole: the solution c of erf(c/sqrt 2) - sqrt(2/pi) c exp(-c^2/2) = 1 - exp(-9/2).
 VOXEL_CUTOFF = 3.3682
+# Samples a voxel and axis for thin Gaussians, and how many samples are held at once.
+_SAMPLES, _SLAB = 3, 1 << 25
 
 
 def detector_views(geometry: Geometry, planar: bool) -> DetectorViews:
@@ -61,3 +70,26 @@ def voxelise_gaussians(
         kernel=kernel,
         cutoff=VOXEL_CUTOFF,
     )
+
+
+def voxelise_means(gaussians: Gaussians, weights: torch.Tensor, box: VoxelBox, kernel: str) -> torch.Tensor:
+    """(channels, nz, ny, nx) means of the Gaussians over the voxels; not differentiable.
+
+    Gaussians thinner than half a voxel would show or not show by where they lie between the voxel centres, so
+    these are sampled at several points a voxel, slab by slab of the part of the volume that they reach.
+    """
+    dims = gaussians.log_scale.shape[1]
+    edge = torch.as_tensor(box.spacing[:dims].copy(), dtype=torch.float32, device=weights.device)
+    thin = (gaussians.log_scale.exp().amin(dim=1) < 0.5 * float(edge.max())).nonzero()[:, 0]
+    wide = torch.ones(len(gaussians), dtype=torch.bool, device=weights.device).index_fill_(0, thin, False)
+    volume = voxelise_gaussians(gaussians.select(wide.nonzero()[:, 0]), weights[:, wide], box, kernel)
+    if len(thin):
+        some, heights = gaussians.select(thin), weights[:, thin]
+        fine = np.array([1 if n == 1 and dims == 2 else _SAMPLES for n in box.shape])
+        depth = max(1, _SLAB // int(np.prod(fine) * box.shape[1] * box.shape[2]))
+        for low in range(0, box.shape[0], depth):
+            shape = (min(depth, box.shape[0] - low), *box.shape[1:])
+            samples = voxelise_gaussians(some, heights, box.part((low, 0, 0), shape).refined(fine), kernel)
+            blocks = [n for pair in zip(shape, fine) for n in pair]
+            volume[:, low : low + shape[0]] += samples.reshape(len(weights), *blocks).mean(dim=(2, 4, 6))
+    return volume

@@ -29,3 +29,9 @@ class VoxelBox:
     def part(self, start: tuple[int, int, int], shape: tuple[int, int, int]) -> VoxelBox:
         """The sub-block of ``shape`` that begins at voxel ``start`` (z, y, x)."""
         return VoxelBox(self.first + np.array(start[::-1]) * self.spacing, self.spacing, shape)
+
+    def refined(self, factor: np.ndarray) -> VoxelBox:
+        """The same block cut into ``factor`` (z, y, x) times as many voxels an axis."""
+        spacing = self.spacing / factor[::-1]
+        shape = tuple(int(n * f) for n, f in zip(self.shape, factor))
+        return VoxelBox(self.first - 0.5 * (self.spacing - spacing), spacing, shape)  # type: ignore[arg-type]
