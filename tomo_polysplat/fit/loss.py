@@ -45,12 +45,11 @@ def roughness(
 ) -> torch.Tensor:
     """Total variation of the volume in a random box of ``settings.tv_box`` voxels an edge."""
     edges = [settings.tv_box] * 3 if scene.box.shape[0] > 1 else [1, *[settings.tv_box_planar] * 2]
-    shape = tuple(min(edge, n) for edge, n in zip(edges, scene.box.shape))
-    start = tuple(int(rng.integers(0, n - m + 1)) for n, m in zip(scene.box.shape, shape))
-    box = scene.box.part(start, shape)
-    like = {"dtype": torch.float32, "device": gaussians.position.device}
-    lower = torch.as_tensor(box.first, **like)
-    upper = torch.as_tensor(box.first + (np.array(shape[::-1]) - 1) * box.spacing, **like)
+    nz, ny, nx = (min(edge, n) for edge, n in zip(edges, scene.box.shape))
+    z, y, x = (int(rng.integers(0, n - m + 1)) for n, m in zip(scene.box.shape, (nz, ny, nx)))
+    box = scene.box.part((z, y, x), (nz, ny, nx))
+    lower = gaussians.position.new_tensor(box.first)
+    upper = gaussians.position.new_tensor(box.first + (np.array([nx, ny, nz]) - 1) * box.spacing)
     with torch.no_grad():
         reach = VOXEL_CUTOFF * gaussians.log_scale.amax(dim=1, keepdim=True).exp()
         near = ((gaussians.position + reach >= lower) & (gaussians.position - reach <= upper)).all(dim=1)
