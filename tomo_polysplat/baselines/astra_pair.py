@@ -56,8 +56,9 @@ class AstraPair:
         from astra.experimental import direct_FP3D
 
         shape = (self.geometry.rows, len(views), self.geometry.columns)
+        volume = volume.contiguous()
         projections = self._unwritten(shape, volume)
-        direct_FP3D(self._projector(views), volume.contiguous(), projections)
+        direct_FP3D(self._projector(views), volume, projections)
         return self._written(projections, "projection").transpose(0, 1)
 
     def adjoint(self, projections: torch.Tensor, views: np.ndarray) -> torch.Tensor:

@@ -34,8 +34,9 @@ __all__ = ["voxel_poly"]
 
 VIEWS_PER_STEP = 4
 RATE_ATTENUATION, RATE_MATERIAL = 3e-2, 3e-3  # per step of Adam, falling like those of the Gaussians
-_LARGEST_PROJECTION = 15.0
-_IMPROVEMENT = 2e-3
+# As in the fit of Gaussians: the spectral nodes serve P up to this, and held-out rays whose error falls by less
+# than this share in a pass have stopped improving.
+_LARGEST_PROJECTION, _IMPROVEMENT = 15.0, 2e-3
 
 
 def voxel_poly(
@@ -138,33 +139,31 @@ class _Fit:
         deadline: float | None,
         callbacks: Sequence[Callable[[FitState], Any]],
     ) -> VoxelModel:
-        """The model of the best pass."""
-        views = len(self.rays.views)
-        groups = [
-            np.arange(first, views, -(-views // VIEWS_PER_STEP))
-            for first in range(-(-views // VIEWS_PER_STEP))
-        ]
-        steps = math.ceil(self.settings.passes * len(groups))
+        """The model of the pass whose held-out rays fitted best."""
         begun, step, lowest, waited = time.perf_counter(), 0, math.inf, 0
+        groups = _interleaved(len(self.rays.views))
+        steps = math.ceil(self.settings.passes * len(groups))
         best = self.model.copy()
-        while step < steps and waited < self.settings.patience:
-            sums = []
-            for group in rng.permutation(len(groups))[: steps - step]:
-                share = step / steps
-                if deadline is not None:
-                    share = max(share, (time.perf_counter() - begun) / max(deadline - begun, 1e-9))
-                if share >= 1:
+
+        def share() -> float:
+            used = 0.0 if deadline is None else (time.perf_counter() - begun) / max(deadline - begun, 1e-9)
+            return max(step / steps, used)
+
+        while share() < 1 and waited < self.settings.patience:
+            errors = []
+            for group in rng.permutation(len(groups)):
+                if share() >= 1:
                     break
-                sums.append(self._step(groups[group], share))
+                errors.append(self._step(groups[group], share()))
                 step += 1
-            if not sums:
+            if not errors:
                 break
-            loss, held_out = torch.stack(sums).mean(dim=0).tolist()
+            loss, held_out = torch.stack(errors).mean(dim=0).tolist()
             waited = 0 if held_out < (1 - _IMPROVEMENT) * lowest else waited + 1
             if held_out <= lowest:
                 lowest, best = held_out, self.model.copy()
             seconds = time.perf_counter() - started
-            state = FitState(seconds, step, 0, loss, held_out, step / steps, lambda: self.volume(self.model))
+            state = FitState(seconds, step, 0, loss, held_out, share(), lambda: self.volume(self.model))
             if any([callback(state) is True for callback in callbacks]) or not math.isfinite(loss):
                 break
         return best
@@ -194,3 +193,9 @@ class _Fit:
     def volume(self, model: VoxelModel) -> np.ndarray:
         """(nz, ny, nx) attenuation in 1/unit."""
         return self._output(model.weights(self.reference_curve)).cpu().numpy() * np.float32(self.water)
+
+
+def _interleaved(views: int) -> list[np.ndarray]:
+    """All views in groups of about ``VIEWS_PER_STEP``, each spread over the whole scan."""
+    count = -(-views // VIEWS_PER_STEP)
+    return [np.arange(first, views, count) for first in range(count)]

@@ -28,7 +28,7 @@ _WARM_UP_VIEWS, _WARM_UP_BUDGET = 45, 1.0
 # A run that ended by itself before this share of its budget would not use a larger one.
 _USED_UP = 0.9
 # Bytes a voxel that finding the errors of one volume takes.
-_BYTES_OF_ERRORS = 120
+_BYTES_OF_ERRORS = 160
 
 Record = dict[str, Any]
 

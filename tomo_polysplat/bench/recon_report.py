@@ -57,7 +57,7 @@ def write_figures(folder: Path, record: Mapping[str, Any]) -> list[Path]:
 def _error_figure(folder: Path, record: Mapping[str, Any], scene: str, size: int) -> Path:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9.6, 4.2), layout="constrained")
+    figure = Figure(figsize=(10.6, 4.2), layout="constrained")
     here = [r for r in record["runs"] if (r["scene"], r["size"]) == (scene, size) and r["seconds"]]
     for axis, key, label in zip(figure.subplots(1, 2), ("psnr", "psnr_all"), ("without metal", "everywhere")):
         for name in dict.fromkeys(run["method"] for run in here):
@@ -83,7 +83,7 @@ def _size_figure(folder: Path, record: Mapping[str, Any], scene: str) -> Path:
     """For methods with several budgets, the run with the smallest error."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(5.6, 4.2), layout="constrained")
+    figure = Figure(figsize=(7.2, 4.2), layout="constrained")
     axis = figure.subplots()
     here = [run for run in record["runs"] if run["scene"] == scene and run["seconds"]]
     for name in dict.fromkeys(run["method"] for run in here):
@@ -97,7 +97,7 @@ def _size_figure(folder: Path, record: Mapping[str, Any], scene: str) -> Path:
     axis.set_xticks(sizes, [str(size) for size in sizes])
     axis.minorticks_off()
     _dress(axis)
-    axis.legend(frameon=False, fontsize=8)
+    figure.legend(loc="outside right center", frameon=False, fontsize=8)
     figure.suptitle(f"{scene}; {_machine(record)}", fontsize=10)
     return _save(figure, folder / f"recon-seconds-{scene}.png")
 
