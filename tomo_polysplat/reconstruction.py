@@ -34,6 +34,9 @@ __all__ = ["reconstruct"]
 
 logger = logging.getLogger(__name__)
 
+# No number above 0 has a logarithm beyond this in float64.
+_LARGEST_LOGARITHM = 745.0
+
 
 def reconstruct(
     projections: Any,
@@ -57,7 +60,8 @@ def reconstruct(
     Parameters
     ----------
     projections : array, shape (rows, views, columns), or (views, columns) for 2D geometries
-        -log(I/I0) in ASTRA's order. Values that are not finite are not used, and counted.
+        -log(I/I0) in ASTRA's order. Values that are not finite, or that no logarithm takes, are not used, and
+        counted; nor are the masked ones of a masked array.
     proj_geom, vol_geom : dict
         ASTRA geometries, lengths in ``unit``; vol_geom's window must be in the same unit.
     spectrum : Spectrum, optional
@@ -171,15 +175,19 @@ def _usable(projections: Any, proj_geom: Mapping[str, Any], valid: Any) -> tuple
     with np.errstate(over="ignore"):
         values = np.array(projections_from_astra(projections, proj_geom), np.float32)
     counts = {"rays": values.size, "rays_not_finite": int(np.count_nonzero(~np.isfinite(values)))}
+    values[~np.isfinite(values)] = np.nan
     if valid is not None:
         mask = require_array("valid", valid)
         require_shape("valid", mask, np.shape(projections), "of the projections")
         mask = projections_from_astra(mask.astype(np.float32), proj_geom) > 0.5
         counts["rays_marked_invalid"] = int(np.count_nonzero(~mask))
         values[~mask] = np.nan
-    values[~np.isfinite(values)] = np.nan
+    impossible = np.abs(values) > _LARGEST_LOGARITHM
+    counts["rays_out_of_range"] = int(np.count_nonzero(impossible))
+    values[impossible] = np.nan
     if np.isnan(values).all():
-        raise fail("projections", "at least one usable ray", "none", "check the flat fields and the mask")
+        remedy = "give -log(I/I0), not intensities, and check the flat fields and the mask"
+        raise fail("projections", "at least one usable ray", "none", remedy)
     return values, counts
 
 

@@ -141,7 +141,9 @@ class Problem:
         """Gaussians to start from."""
         relative = start / (self.depth * plan.reference)
         spacing = plan.spacing * self.voxel
-        gaussians = seed_gaussians(relative, self.grid, spacing, settings, self.polychromatic, device)
+        gaussians = seed_gaussians(
+            relative, self.grid, spacing, settings, self.polychromatic, self.planar, device
+        )
         free = int((gaussians.group < 0).sum())
         plan.reasons["gaussians"] = f"{len(gaussians)}, the material number free for {free}"
         return gaussians
@@ -163,8 +165,8 @@ def _snapped_geometry(geometry: Geometry) -> Geometry:
     origin = geometry.origin
     if geometry.beam == "parallel":
         origin = origin / np.linalg.norm(origin, axis=1, keepdims=True)
-    parts = {"origin": origin, "corner": geometry.corner, "u": geometry.u, "v": geometry.v}
-    return replace(geometry, **{name: _snapped(vectors) for name, vectors in parts.items()})
+    origin, corner, u, v = map(_snapped, (origin, geometry.corner, geometry.u, geometry.v))
+    return replace(geometry, origin=origin, corner=corner, u=u, v=v)
 
 
 def _snapped(vectors: np.ndarray) -> np.ndarray:

@@ -27,6 +27,7 @@ def seed_gaussians(
     spacing: float,
     settings: Settings,
     polychromatic: bool,
+    planar: bool,
     device: torch.device,
 ) -> Gaussians:
     """Seed the support of a start volume.
@@ -38,12 +39,15 @@ def seed_gaussians(
     grid : VolumeGrid
         In the solver's coordinates.
     spacing : float
-        Distance of the seeds in the grid's unit.
+        Wanted distance of the seeds in the grid's unit; a whole number of them fills the window.
+    planar : bool
+        Endless along z, for a scan of one plane.
     """
-    dims = 2 if grid.planar else 3
+    dims = 2 if planar else 3
     start = _sharpened(start, settings.metal_level)
-    points, size, value = _lattices(start, grid, spacing, dims, settings)
-    own, shared, group = _materials(start, points, value, grid, settings, polychromatic)
+    points, step, value = _lattices(start, grid, spacing, dims, settings)
+    reach = settings.free_radius * float(grid.voxel_size[:dims].min())
+    own, shared, group = _materials(start, points, value, grid, reach, settings, polychromatic)
     # A lattice of Gaussians of this height averages to the wanted value: the cell's integral over the
     # Gaussian's.
     width = settings.seed_width
@@ -56,7 +60,7 @@ def seed_gaussians(
     rotation[:, 0] = 1.0
     gaussians = Gaussians(
         tensor(points),
-        tensor(np.repeat(np.log(width * size)[:, None], dims, axis=1)),
+        tensor(np.log(width * step)),
         tensor(rotation),
         tensor(attenuation),
         tensor(own),
@@ -75,60 +79,64 @@ def _sharpened(start: np.ndarray, level: float) -> np.ndarray:
     """
     from scipy import ndimage
 
-    pieces, number = ndimage.label(start > level)
+    pieces, _ = ndimage.label(start > level)
     sharp = start.copy()
-    for label in range(1, number + 1):
-        piece = pieces == label
-        values = start[piece]
-        core = piece & (start > 0.5 * np.quantile(values, 0.9))
-        sharp[piece] = np.minimum(values, 1.0)
-        sharp[core] = start[core] * (values.sum() / start[core].sum())
+    for label, box in enumerate(ndimage.find_objects(pieces), 1):
+        piece, old, new = pieces[box] == label, start[box], sharp[box]
+        values = old[piece]
+        core = piece & (old > 0.5 * np.quantile(values, 0.9))
+        new[piece] = np.minimum(values, 1.0)
+        new[core] = old[core] * (values.sum() / old[core].sum())
     return sharp
 
 
 def _lattices(
     start: np.ndarray, grid: VolumeGrid, spacing: float, dims: int, settings: Settings
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points (n, 3) on the support, the spacing at each and the start's mean over the cell of each."""
-    coarse = _lattice(grid, spacing, dims)
+    """Points (n, 3) on the support, the lattice's steps (n, dims) and the start's mean over the cell of each."""
+    coarse, step = _lattice(grid, spacing, dims)
     metal = _reaches(start, coarse, grid, settings.metal_level, spacing)
     parts = []
-    for points, size in ((coarse[~metal], spacing), (_split(coarse[metal], spacing, dims), spacing / 2)):
-        value, nearby = _sample(start, points, grid, size, dims)
+    for points, cell in ((coarse[~metal], step), (_split(coarse[metal], step), step / 2)):
+        value, nearby = _sample(start, points, grid, cell)
         keep = nearby > settings.support_level
-        parts.append((points[keep], np.full(keep.sum(), size), np.maximum(value[keep], _LEAST)))
-    points, size, value = (np.concatenate(arrays) for arrays in zip(*parts))
-    return points, size, value
+        cells = np.tile(cell, (int(keep.sum()), 1))
+        parts.append((points[keep], cells, np.maximum(value[keep], _LEAST)))
+    points, steps, values = (np.concatenate(arrays) for arrays in zip(*parts))
+    return points, steps, values
 
 
-def _lattice(grid: VolumeGrid, spacing: float, dims: int) -> np.ndarray:
-    """Points (n, 3) of a lattice centred in the grid's window; one layer when planar."""
-    axes = []
-    for k in range(3):
-        count = max(1, round(grid.extent[k] / spacing)) if k < dims else 1
-        axes.append(grid.lower[k] + (np.arange(count) + 0.5) * grid.extent[k] / count)
-    x, y, z = np.meshgrid(*axes, indexing="ij")
-    return np.stack([x, y, z], -1).reshape(-1, 3)
+def _lattice(grid: VolumeGrid, spacing: float, dims: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) of a lattice that fills the grid's window, and its steps (dims,); planar, in one layer."""
+    counts = np.maximum(np.round(grid.extent / spacing).astype(int), 1)
+    counts[dims:] = 1
+    steps = grid.extent / counts
+    x, y, z = np.meshgrid(
+        *(low + (np.arange(n) + 0.5) * d for low, n, d in zip(grid.lower, counts, steps)), indexing="ij"
+    )
+    return np.stack([x, y, z], -1).reshape(-1, 3), steps[:dims]
 
 
-def _sample(start: np.ndarray, points: np.ndarray, grid: VolumeGrid, spacing: float, dims: int):
+def _sample(
+    start: np.ndarray, points: np.ndarray, grid: VolumeGrid, cell: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Mean of the start over the cell of each seed, and the largest such mean among it and its neighbours."""
     from scipy import ndimage
 
-    cells = np.maximum(np.round(spacing / grid.voxel_size[::-1]).astype(int), 1)
-    if dims == 2:
-        cells[0] = 1
+    cells = np.ones(3, int)
+    cells[3 - len(cell) :] = np.maximum(np.round(cell / grid.voxel_size[: len(cell)]).astype(int), 1)[::-1]
     mean = ndimage.uniform_filter(start, cells, mode="nearest") if cells.max() > 1 else start
     index = _voxel_of(points, grid)
     around = ndimage.maximum_filter(mean, [min(3, n) for n in mean.shape])
     return mean[index].astype(np.float64), around[index]
 
 
-def _split(points: np.ndarray, spacing: float, dims: int) -> np.ndarray:
-    """Every lattice point replaced by the 2^dims points of a lattice of half the spacing in its cell."""
+def _split(points: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Every lattice point replaced by the 2^dims points of a lattice of half the steps in its cell."""
+    dims = len(step)
     corners = np.stack(np.meshgrid(*[[-0.25, 0.25]] * dims, indexing="ij"), -1).reshape(-1, dims)
     offsets = np.zeros((len(corners), 3))
-    offsets[:, :dims] = corners * spacing
+    offsets[:, :dims] = corners * step
     return (points[:, None] + offsets).reshape(-1, 3)
 
 
@@ -150,6 +158,7 @@ def _materials(
     points: np.ndarray,
     value: np.ndarray,
     grid: VolumeGrid,
+    reach: float,
     settings: Settings,
     polychromatic: bool,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -164,7 +173,6 @@ def _materials(
     own = np.full(len(points), settings.soft_u)
     if not polychromatic:
         return own, np.array([settings.soft_u]), group
-    reach = settings.free_radius * float(grid.voxel_size[: 2 if grid.planar else 3].min())
     group[_reaches(start, points, grid, settings.bone_level, reach)] = -1
     own[value > settings.bone_level] = settings.bone_u
     pieces, number = ndimage.label(start > settings.metal_level)

@@ -28,7 +28,7 @@ def without_tails(metal: torch.Tensor, share: float) -> torch.Tensor:
     total = metal.sum(dim=0, keepdim=True)
     if share <= 0 or not bool((total > 0).any()):
         return metal
-    window = tuple(min(3, n) if n > 1 else 1 for n in total.shape[1:])
+    window = tuple(3 if n > 1 else 1 for n in total.shape[1:])
     margin = tuple(n // 2 for n in window)
 
     def around(volume: torch.Tensor) -> torch.Tensor:
