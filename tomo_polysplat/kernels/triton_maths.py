@@ -1,4 +1,4 @@
-"""Steps shared by the Triton kernels: scale and rotation to the whitening matrix and back, bit sets of lanes.
+"""Steps shared by the Triton kernels: scale and rotation to the whitening matrix and back.
 
 The set-up of a Gaussian runs in float64 (its differences and cross products cancel), the sums over its
 pixels or voxels in float32.
@@ -19,15 +19,13 @@ __all__ = [
     "HALF_LOG2E",
     "cross",
     "dot",
-    "lane_set",
-    "lowest_lane",
     "on_device",
     "require_scene",
     "rotation_matrix",
     "whitening_adjoint",
 ]
 
-# Gaussians next to each other in the list that share one bounding box; also the width of a set of lanes.
+# Neighbours in the list that are splatted together, one to a lane of a warp.
 GROUP = 32
 # exp(-q / 2) = 2^-(HALF_LOG2E q): the kernels carry q scaled so, as the hardware's exponential has base 2.
 HALF_LOG2E = 0.7213475204444817
@@ -56,19 +54,6 @@ def cross(a0, a1, a2, b0, b1, b2):
 @triton.jit
 def dot(a0, a1, a2, b0, b1, b2):
     return a0 * b0 + a1 * b1 + a2 * b2
-
-
-@triton.jit
-def lane_set(hit, lane):
-    """The set of the 32 lanes where ``hit``, as bits of one integer that every lane knows."""
-    return tl.sum(tl.where(hit, 1 << lane, 0), 0).to(tl.int32)
-
-
-@triton.jit
-def lowest_lane(lanes):
-    """The lowest bit set in ``lanes``: the exponent of that power of two as a float."""
-    power = (lanes & -lanes).to(tl.float32)
-    return ((power.to(tl.int32, bitcast=True) >> 23) & 255) - 127
 
 
 @triton.jit

@@ -12,7 +12,7 @@ A view maps a point to the detector through one 3x3 matrix. With the columns of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -20,7 +20,11 @@ import torch
 __all__ = ["DetectorViews"]
 
 
-@dataclass(frozen=True)
+# Views a batch may have for its table to be put together from slices: no copy from the host, which would wait.
+_FEW = 32
+
+
+@dataclass(frozen=True, eq=False)
 class DetectorViews:
     """Views of one scan.
 
@@ -44,15 +48,36 @@ class DetectorViews:
     rows: int
     columns: int
     planar: bool = False
+    _tables: dict[torch.device, torch.Tensor] = field(default_factory=dict, init=False, repr=False)
+    _chosen_from: tuple[DetectorViews, np.ndarray] | None = field(default=None, repr=False)
 
     def __len__(self) -> int:
         return len(self.origin)
 
     def select(self, indices: np.ndarray | list[int]) -> DetectorViews:
         """The views of these indices, in their order."""
-        return DetectorViews(
-            self.cone, self.origin[indices], self.matrix[indices], self.rows, self.columns, self.planar
-        )
+        indices = np.arange(len(self))[indices]
+        origin, matrix = self.origin[indices], self.matrix[indices]
+        return DetectorViews(self.cone, origin, matrix, self.rows, self.columns, self.planar, (self, indices))
+
+    def table(self, device: torch.device) -> torch.Tensor:
+        """(views, 21) float64 origin, inverse and matrix, row by row, on a device.
+
+        It is copied there once for all views of a scan; a selection is put together from it on the device.
+        """
+        if device not in self._tables:
+            self._tables[device] = self._build_table(device)
+        return self._tables[device]
+
+    def _build_table(self, device: torch.device) -> torch.Tensor:
+        count = len(self)
+        if self._chosen_from is not None and 0 < count <= _FEW:
+            whole, indices = self._chosen_from
+            table = whole.table(device)
+            return torch.cat([table[k : k + 1] for k in indices.tolist()])
+        parts = [self.origin, self.inverse.reshape(count, 9), self.matrix.reshape(count, 9)]
+        # From ordinary memory the copy is staged at once: it neither waits for the device nor races with numpy.
+        return torch.from_numpy(np.concatenate(parts, axis=1)).to(device, non_blocking=True)
 
     @property
     def inverse(self) -> np.ndarray:

@@ -29,12 +29,13 @@ def project(
     """
     if kernel == "reference":
         return reference.project(position, scale, rotation, weight, views, cutoff)
-    if kernel == "numba":
-        image, skipped = _NumbaProject.apply(position, scale, rotation, weight, views, cutoff)
-    else:
+    skipped: Any  # on the device, for the triton kernel: reading it would wait for the device
+    if kernel == "triton":
         from tomo_polysplat.kernels.project import triton_kernel
 
         image, skipped = triton_kernel.project(position, scale, rotation, weight, views, cutoff)
+        return image, skipped
+    image, skipped = _NumbaProject.apply(position, scale, rotation, weight, views, cutoff)
     factor = math.sqrt(2 * math.pi) * views.ray_lengths(position.device, position.dtype)
     return image * factor, skipped
 

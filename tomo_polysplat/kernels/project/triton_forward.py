@@ -1,8 +1,9 @@
-"""The projection on CUDA: every tile of pixels gathers the Gaussians that reach it.
+"""The projection on CUDA: neighbours in the list are summed tile by tile and added to the image.
 
-A tile finds them through the bounding boxes of groups of neighbours in the list, then through their
-outlines, so the order of the sum is that of the list: no atomics, the same bits on every run. The search is
-quick when Gaussians near in the list are near in space.
+A warp holds the outlines of GROUP neighbours, one to a lane. For every tile of their common window it finds
+those that reach the tile, sums them in registers, and adds the sum to the image atomically: one addition for
+many Gaussians. Additions meet in any order, so the image repeats to rounding (about 1e-7), not to the bit.
+The windows are small when Gaussians near in the list are near in space.
 """
 
 from __future__ import annotations
@@ -11,53 +12,36 @@ import torch
 import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
+from tomo_polysplat.kernels.project.triton_image import spread
 from tomo_polysplat.kernels.project.triton_setup import RECORD
-from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, lane_set, lowest_lane, on_device
+from tomo_polysplat.kernels.triton_lanes import add_four, adds_four, lane_set, load_four, lowest_lane
+from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, on_device
 from tomo_polysplat.kernels.views import DetectorViews
 
-__all__ = ["TILE", "footprint_value", "gather_image", "squared_length"]
+__all__ = ["TILE", "splat"]
 
-TILE = (8, 16)  # rows and columns of a tile, handled by one warp
-_PROGRAMS = 1 << 14  # enough to even out the tiles' loads; fewer tiles are each shared by several programs
-_MOST_PARTS = 8
-
-
-@triton.jit
-def squared_length(x, y, lx, ly, lxx, lxy, lyy):
-    """l of a pixel: |e|^2 in units of its value at the projected centre; see triton_setup."""
-    return (1.0 + y * (ly + lyy * y)) + x * ((lx + lxy * y) + lxx * x)
+TILE = (16, 8)  # rows and columns
+_PLANAR_TILE = (1, 64)
+_PROGRAMS = 1 << 15  # enough to fill the device; the windows of fewer groups are each shared out
+_MOST_PARTS = 16
+_FAR = tl.constexpr(1e30)
 
 
 @triton.jit
-def footprint_value(x, y, r11, r12, r22, length, cut, CONE: tl.constexpr):
-    """2^-q / sqrt(l) within the cut, zero beyond, then -q and 1 / l, of pixels with l = ``length``."""
-    t, up = r11 * x + r12 * y, r22 * y
-    minus = -(t * t + up * up)
-    if CONE:
-        root = tl.math.rsqrt(length)
-        inverse = root * root
-        minus *= inverse
-        value = tl.exp2(minus) * root
-    else:
-        inverse = 1.0
-        value = tl.exp2(minus)
-    return tl.where(minus >= -cut, value, 0.0), minus, inverse
+def _outlines(record, group, count, GROUP: tl.constexpr):
+    """yc, ry (-1 where there is no outline), xc, m, hx of a group's outlines; see triton_setup."""
+    n = group * GROUP + tl.arange(0, GROUP)
+    at = record + tl.minimum(n, count - 1).to(tl.int64) * RECORD
+    _, yc, ry, xc = load_four(at + 4)
+    m, hx, _, _ = load_four(at + 8)
+    return yc, tl.where(n < count, ry, -1.0), xc, m, hx
 
 
 @triton.jit
-def _reaches(ellipse, n, count, left, right, top, bottom):
-    """Whether the outlines of the Gaussians ``n``, within the rows of a tile, reach its columns."""
-    live = n < count
-    yc = tl.load(ellipse + n, mask=live, other=0.0)
-    ry = tl.load(ellipse + count + n, mask=live, other=-1.0)
-    xc = tl.load(ellipse + 2 * count + n, mask=live, other=0.0)
-    m = tl.load(ellipse + 3 * count + n, mask=live, other=0.0)
-    hx = tl.load(ellipse + 4 * count + n, mask=live, other=1.0)
+def _reaches(yc, ry, xc, m, hx, ahead, left, right, top, bottom):
+    """Whether the outlines, within the rows of a tile, reach its columns."""
     low, high = tl.maximum(top - yc, -ry), tl.minimum(bottom - yc, ry)
-    # The outline's rightmost point lies ``ahead`` rows below the centre and its leftmost as many above.
-    ahead = m * ry * ry * tl.math.rsqrt(m * m * ry * ry + hx * hx)
-    y_right = tl.minimum(tl.maximum(ahead, low), high)
-    y_left = tl.minimum(tl.maximum(-ahead, low), high)
+    y_right, y_left = tl.minimum(tl.maximum(ahead, low), high), tl.minimum(tl.maximum(-ahead, low), high)
     u_right, u_left = y_right / ry, y_left / ry
     x_right = xc + m * y_right + hx * tl.sqrt(tl.maximum(1.0 - u_right * u_right, 0.0))
     x_left = xc + m * y_left - hx * tl.sqrt(tl.maximum(1.0 - u_left * u_left, 0.0))
@@ -65,88 +49,108 @@ def _reaches(ellipse, n, count, left, right, top, bottom):
 
 
 @triton.jit
-def _gather_kernel(
-    record, ellipse, boxes, image, count, groups, rows, columns, cut,
-    CHANNELS: tl.constexpr, CONE: tl.constexpr, TILE_H: tl.constexpr, TILE_W: tl.constexpr,
-    PARTS: tl.constexpr, GROUP: tl.constexpr,
-):  # fmt: skip
-    across = tl.cdiv(columns, TILE_W)
-    left, top = (tl.program_id(0) % across) * TILE_W, (tl.program_id(0) // across) * TILE_H
-    view = (tl.program_id(1) // PARTS).to(tl.int64)
-    part = tl.program_id(1) % PARTS
-    record += view * count * RECORD
-    ellipse += view * 5 * count
-    boxes += view * 4 * groups
-    lane = tl.arange(0, GROUP)
-    j, i = left + tl.arange(0, TILE_W), top + tl.arange(0, TILE_H)
-    column, row = j.to(tl.float32)[None, :], i.to(tl.float32)[:, None]
-    x0, y0 = left.to(tl.float32), top.to(tl.float32)
-    x1, y1 = x0 + (TILE_W - 1), y0 + (TILE_H - 1)
-    sum0 = tl.zeros([TILE_H, TILE_W], tl.float32)
+def _sum_tile(
+    record,
+    found,
+    left,
+    top,
+    cut,
+    CHANNELS: tl.constexpr,
+    CONE: tl.constexpr,
+    H: tl.constexpr,
+    W: tl.constexpr,
+):
+    """Sums of the Gaussians ``found`` over a tile, (columns, rows): so a lane has pixels of one row."""
+    column = left.to(tl.float32) + tl.arange(0, W).to(tl.float32)[:, None]
+    row = top.to(tl.float32) + tl.arange(0, H).to(tl.float32)[None, :]
+    sum0 = tl.zeros([W, H], tl.float32)
     sum1, sum2, sum3 = sum0, sum0, sum0
-    lx, ly, lxx, lxy, lyy = 0.0, 0.0, 0.0, 0.0, 0.0
-    for first in range(part * GROUP, groups, PARTS * GROUP):
-        box, known = boxes + first + lane, first + lane < groups
-        meets = tl.load(box, mask=known, other=0.0) <= x1
-        meets &= tl.load(box + groups, mask=known, other=0.0) >= x0
-        meets &= tl.load(box + 2 * groups, mask=known, other=0.0) <= y1
-        meets &= tl.load(box + 3 * groups, mask=known, other=0.0) >= y0
-        near = lane_set(meets & known, lane)
-        while near != 0:
-            start = (first + lowest_lane(near)) * GROUP
-            near &= near - 1
-            found = lane_set(_reaches(ellipse, start + lane, count, x0, x1, y0, y1), lane)
-            while found != 0:
-                at = record + (start + lowest_lane(found)).to(tl.int64) * RECORD
-                found &= found - 1
-                x, y = column - tl.load(at), row - tl.load(at + 1)
-                r11, r12, r22 = tl.load(at + 2), tl.load(at + 3), tl.load(at + 4)
-                if CONE:
-                    lx, ly = tl.load(at + 5), tl.load(at + 6)
-                    lxx, lxy, lyy = tl.load(at + 7), tl.load(at + 8), tl.load(at + 9)
-                value, _, _ = footprint_value(
-                    x, y, r11, r12, r22, squared_length(x, y, lx, ly, lxx, lxy, lyy), cut, CONE
+    while found != 0:
+        at = record + lowest_lane(found).to(tl.int64) * RECORD
+        found &= found - 1
+        column0, row0, r11, r12 = load_four(at)
+        r22, _, _, _ = load_four(at + 4)
+        w0, w1, w2, w3 = load_four(at + 16)
+        x, y = column - column0, row - row0
+        u = r22 * y
+        t = r11 * x + r12 * y
+        q = t * t + u * u
+        if CONE:
+            _, _, lx, ly = load_four(at + 8)
+            lxx, lxy, lyy, _ = load_four(at + 12)
+            length = (1.0 + y * (ly + lyy * y)) + x * ((lx + lxy * y) + lxx * x)
+            root = tl.math.rsqrt(length)
+            q *= root * root
+            value = tl.where(q <= cut, tl.exp2(-1.0 * q) * root, 0.0)
+        else:
+            value = tl.where(q <= cut, tl.exp2(-1.0 * q), 0.0)
+        sum0 += w0 * value
+        if CHANNELS > 1:
+            sum1 += w1 * value
+        if CHANNELS > 2:
+            sum2 += w2 * value
+        if CHANNELS > 3:
+            sum3 += w3 * value
+    return sum0, sum1, sum2, sum3
+
+
+@triton.jit
+def _splat_kernel(
+    record, image, count, rows, columns, cut,
+    CHANNELS: tl.constexpr, CONE: tl.constexpr, TILE_H: tl.constexpr, TILE_W: tl.constexpr,
+    PARTS: tl.constexpr, GROUP: tl.constexpr, AT_ONCE: tl.constexpr,
+):  # fmt: skip
+    group, part = tl.program_id(0) // PARTS, tl.program_id(0) % PARTS
+    view = tl.program_id(1).to(tl.int64)
+    record += view * count * RECORD
+    yc, ry, xc, m, hx = _outlines(record, group, count, GROUP)
+    record += group.to(tl.int64) * GROUP * RECORD
+    reach = tl.sqrt(m * m * ry * ry + hx * hx)
+    # The outline's rightmost point lies ``ahead`` rows below the centre and its leftmost as many above.
+    ahead = m * ry * ry / reach
+    seen = ry > 0
+    x_low = tl.maximum(tl.min(tl.where(seen, xc - reach, _FAR), 0), 0.0)
+    x_high = tl.minimum(tl.max(tl.where(seen, xc + reach, -_FAR), 0), columns - 1.0)
+    y_low = tl.maximum(tl.min(tl.where(seen, yc - ry, _FAR), 0), 0.0)
+    y_high = tl.minimum(tl.max(tl.where(seen, yc + ry, -_FAR), 0), rows - 1.0)
+    if (x_low <= x_high) & (y_low <= y_high):
+        # From an even column: two pixels of four channels fill one sector of memory.
+        left0, top0 = x_low.to(tl.int32) // 2 * 2, y_low.to(tl.int32)
+        across = (x_high.to(tl.int32) - left0) // TILE_W + 1
+        tiles = ((y_high.to(tl.int32) - top0) // TILE_H + 1) * across
+        for tile in range(part, tiles, PARTS):
+            down = tile // across
+            left, top = left0 + (tile - down * across) * TILE_W, top0 + down * TILE_H
+            x0, y0 = left.to(tl.float32), top.to(tl.float32)
+            hit = _reaches(yc, ry, xc, m, hx, ahead, x0, x0 + (TILE_W - 1), y0, y0 + (TILE_H - 1))
+            found = lane_set(hit & seen, tl.arange(0, GROUP))
+            if found != 0:
+                sum0, sum1, sum2, sum3 = _sum_tile(
+                    record, found, left, top, cut, CHANNELS, CONE, TILE_H, TILE_W
                 )
-                sum0 += tl.load(at + 11) * value
-                if CHANNELS > 1:
-                    sum1 += tl.load(at + 12) * value
-                if CHANNELS > 2:
-                    sum2 += tl.load(at + 13) * value
-                if CHANNELS > 3:
-                    sum3 += tl.load(at + 14) * value
-    views = tl.num_programs(1) // PARTS
-    inside = (i[:, None] < rows) & (j[None, :] < columns)
-    # image: (parts, channels, views, rows, columns)
-    stride = views.to(tl.int64) * rows * columns
-    pixel = (
-        image
-        + part * CHANNELS * stride
-        + view * rows * columns
-        + i[:, None].to(tl.int64) * columns
-        + j[None, :]
-    )
-    tl.store(pixel, sum0, mask=inside)
-    if CHANNELS > 1:
-        tl.store(pixel + stride, sum1, mask=inside)
-    if CHANNELS > 2:
-        tl.store(pixel + 2 * stride, sum2, mask=inside)
-    if CHANNELS > 3:
-        tl.store(pixel + 3 * stride, sum3, mask=inside)
+                j, i = left + tl.arange(0, TILE_W)[:, None], top + tl.arange(0, TILE_H)[None, :]
+                pixel = (view * rows + i) * columns + j
+                inside = (i < rows) & (j < columns)
+                if CHANNELS == 1:
+                    tl.atomic_add(image + pixel, sum0, mask=inside & (sum0 != 0), sem="relaxed")
+                else:
+                    inside &= (sum0 != 0) | (sum1 != 0) | (sum2 != 0) | (sum3 != 0)
+                    add_four(image + 4 * pixel, sum0, sum1, sum2, sum3, inside, AT_ONCE)
 
 
-def gather_image(record, ellipse, boxes, channels: int, views: DetectorViews, cutoff: float) -> torch.Tensor:
-    """Image (channels, views, rows, columns) of the footprints, without the pixel factor."""
+def splat(record, channels: int, views: DetectorViews, cutoff: float) -> torch.Tensor:
+    """Image of the footprints in the layout of triton_image, without the factor of the pixel."""
     many, count = record.shape[:2]
-    shape = (channels, many, views.rows, views.columns)
-    if not (count and many):
-        return record.new_zeros(shape)
-    tiles = triton.cdiv(views.rows, TILE[0]) * triton.cdiv(views.columns, TILE[1])
-    parts = max(1, min(_MOST_PARTS, _PROGRAMS // (tiles * many), triton.cdiv(boxes.shape[2], GROUP)))
-    image = record.new_empty((parts, *shape))
+    image = record.new_zeros((many, views.rows, views.columns, spread(channels)))
+    if not (count and image.numel()):
+        return image
+    groups = triton.cdiv(count, GROUP)
+    parts = triton.next_power_of_2(max(1, min(_MOST_PARTS, _PROGRAMS // (groups * many))))
+    tile = _PLANAR_TILE if views.rows == 1 else TILE
     with on_device(record):
-        _gather_kernel[(tiles, many * parts)](
-            record, ellipse, boxes, image, count, boxes.shape[2], views.rows, views.columns,
-            cutoff * cutoff * HALF_LOG2E, CHANNELS=channels, CONE=views.cone, TILE_H=TILE[0], TILE_W=TILE[1],
-            PARTS=parts, GROUP=GROUP, num_warps=1, num_stages=1,
+        _splat_kernel[(groups * parts, many)](
+            record, image, count, views.rows, views.columns, cutoff * cutoff * HALF_LOG2E,
+            CHANNELS=channels, CONE=views.cone, TILE_H=tile[0], TILE_W=tile[1], PARTS=parts, GROUP=GROUP,
+            AT_ONCE=adds_four(record.device), num_warps=1, num_stages=1,
         )  # fmt: skip
-    return image[0] if parts == 1 else image.sum(0)
+    return image

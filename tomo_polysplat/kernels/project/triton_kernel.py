@@ -1,7 +1,8 @@
 """The projection of Gaussians on CUDA, as a differentiable torch operation. README.md derives the formulas.
 
-Forward and backward are deterministic; see triton_forward.py and triton_backward.py. Gaussians that are near
-in space should be near in the list (``kernels.spatial_order``): that changes the speed, not the result.
+The image repeats to rounding from run to run, the gradients of one image to the bit; see triton_forward.py and
+triton_backward.py. Gaussians that are near in space should be near in the list (``kernels.spatial_order``):
+that changes the speed, not the result.
 """
 
 from __future__ import annotations
@@ -9,9 +10,10 @@ from __future__ import annotations
 import torch
 
 from tomo_polysplat.kernels.project.triton_backward import sum_moments
-from tomo_polysplat.kernels.project.triton_forward import gather_image
+from tomo_polysplat.kernels.project.triton_forward import splat
+from tomo_polysplat.kernels.project.triton_image import finish_image
 from tomo_polysplat.kernels.project.triton_pull_back import pull_back
-from tomo_polysplat.kernels.project.triton_setup import footprints, view_table
+from tomo_polysplat.kernels.project.triton_setup import footprints
 from tomo_polysplat.kernels.triton_maths import require_scene
 from tomo_polysplat.kernels.views import DetectorViews
 
@@ -26,7 +28,7 @@ def project(
     views: DetectorViews,
     cutoff: float,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Line integrals of weighted Gaussians, without the factor of the pixel; arguments as for the reference.
+    """Line integrals of weighted Gaussians; arguments as for the reference.
 
     Returns
     -------
@@ -49,19 +51,19 @@ class _Project(torch.autograd.Function):
         position, scale, rotation, weight = (
             t.detach().contiguous() for t in (position, scale, rotation, weight)
         )
-        table = view_table(views, position.device)
-        record, ellipse, boxes, skipped = footprints(position, scale, rotation, weight, views, table, cutoff)
-        image = gather_image(record, ellipse, boxes, len(weight), views, cutoff)
-        ctx.save_for_backward(position, scale, rotation, weight, table, record, ellipse)
+        table = views.table(position.device)
+        record, skipped = footprints(position, scale, rotation, weight, views, table, cutoff)
+        image = finish_image(splat(record, len(weight), views, cutoff), table, len(weight), views)
+        ctx.save_for_backward(position, scale, rotation, weight, table, record)
         ctx.views, ctx.cutoff = views, cutoff
         ctx.mark_non_differentiable(skipped)
         return image, skipped
 
     @staticmethod
     def backward(ctx, grad_image, _):
-        position, scale, rotation, weight, table, record, ellipse = ctx.saved_tensors
-        if not record.numel():
+        position, scale, rotation, weight, table, record = ctx.saved_tensors
+        if not (record.numel() and grad_image.numel()):
             return (*map(torch.zeros_like, (position, scale, rotation, weight)), None, None)
-        moments = sum_moments(record, ellipse, grad_image, ctx.views, ctx.cutoff)
-        grads = pull_back(position, scale, rotation, weight, table, ctx.views, record, ellipse, moments)
+        moments = sum_moments(record, grad_image, table, ctx.views, ctx.cutoff)
+        grads = pull_back(position, scale, rotation, weight, table, ctx.views, record, moments)
         return (*grads, None, None)

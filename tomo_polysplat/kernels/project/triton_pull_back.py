@@ -10,8 +10,8 @@ import torch
 import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
-from tomo_polysplat.kernels.project.triton_backward import MOMENTS
-from tomo_polysplat.kernels.project.triton_setup import RECORD, VIEW, chain, whitening
+from tomo_polysplat.kernels.project.triton_setup import RECORD, ROOT, VIEW, chain, whitening
+from tomo_polysplat.kernels.triton_lanes import SUMS, load_four
 from tomo_polysplat.kernels.triton_maths import cross, dot, on_device, whitening_adjoint
 from tomo_polysplat.kernels.views import DetectorViews
 
@@ -21,13 +21,25 @@ _BLOCK = 64
 
 
 @triton.jit
-def _moment(at, live, k, factor):
-    return tl.load(at + k, mask=live, other=0.0).to(tl.float64) * factor
+def _moments(at, live, a, b, c, d):
+    """Four of the sums, in float64, each times its unit; zero where the Gaussian has no footprint."""
+    m0, m1, m2, m3 = load_four(at)
+    return (
+        tl.where(live, m0, 0.0).to(tl.float64) * a,
+        tl.where(live, m1, 0.0).to(tl.float64) * b,
+        tl.where(live, m2, 0.0).to(tl.float64) * c,
+        tl.where(live, m3, 0.0).to(tl.float64) * d,
+    )
+
+
+@triton.jit
+def _mix(a, x0, x1, x2, b, y0, y1, y2):
+    return a * x0 + b * y0, a * x1 + b * y1, a * x2 + b * y2
 
 
 @triton.jit
 def _pull_back_kernel(
-    position, scale, rotation, views, record, ellipse, moments,
+    position, scale, rotation, views, record, moments,
     grad_position, grad_scale, grad_rotation, grad_weight, count, many,
     CHANNELS: tl.constexpr, CONE: tl.constexpr, PLANAR: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -38,72 +50,77 @@ def _pull_back_kernel(
     G00, G01, G02, G10, G11, G12, G20, G21, G22 = none, none, none, none, none, none, none, none, none
     P0, P1, P2 = none, none, none
     C0, C1, C2, C3 = none, none, none, none
-    at, half_height, footprint, sums = views, ellipse + count + n, record + n * RECORD, moments + n * MOMENTS
-    for _ in range(many):
-        seen = live & (tl.load(half_height, mask=live, other=-1.0) > 0)
+    known = tl.minimum(n, count - 1)
+    at, footprint, sums = views, record + known * RECORD, moments + known * SUMS
+    for _view in range(many):
+        _, _, ry, _ = load_four(footprint + 4)
+        _, _, _, inverse = load_four(footprint + 12)
+        seen, inverse = live & (ry > 0), inverse.to(tl.float64)
         (
             _, kappa, column, row, r0, r1, r2, w0, w1, w2, a0, a1, a2, b0, b1, b2,
             nu0, nu1, nu2, nv0, nv1, nv2,
         ) = chain(position, n, live, at, m00, m01, m02, m10, m11, m12, m20, m21, m22, CONE)  # fmt: skip
-        inverse = tl.load(footprint + 10, mask=seen, other=0.0).to(tl.float64)
-        C0 += _moment(sums, seen, 11, inverse)
-        if CHANNELS > 1:
-            C1 += _moment(sums, seen, 12, inverse)
-        if CHANNELS > 2:
-            C2 += _moment(sums, seen, 13, inverse)
-        if CHANNELS > 3:
-            C3 += _moment(sums, seen, 14, inverse)
-        # dL/d(distance^2 |e|^2) = -h / 2 and dL/d|e|^2 = -s / 2, here doubled: every use has a factor 2.
-        unit = -inverse * inverse
-        hx, hxx = _moment(sums, seen, 0, unit), _moment(sums, seen, 2, unit)
-        hy, hxy, hyy = none, none, none
-        sy, sxy, syy = none, none, none
+        # dL/d(distance^2 |e|^2) = -h / 2 and dL/d|e|^2 = -s / 2, here doubled: every use has a factor 2. The
+        # sums take t and u ROOT / |e_centre| times too large.
+        one, two, zero = -inverse * inverse, -inverse / ROOT, -1.0 / (ROOT * ROOT)
+        ht, hu, htt, htu = _moments(sums, seen, two, two, zero, zero)
+        huu, s, st, su = _moments(sums + 4, seen, zero, one, two, two)
+        stt, stu, suu, c0 = _moments(sums + 8, seen, zero, zero, zero, inverse)
+        c1, c2, c3, _ = _moments(sums + 12, seen, inverse, inverse, inverse, inverse)
+        C0, C1, C2, C3 = C0 + c0, C1 + c1, C2 + c2, C3 + c3
+        # nu = r11 q1 and nv = r12 q1 + r22 q2, so x = by_t t - back u and y = by_u u.
+        by_t = 1.0 / tl.sqrt(tl.where(seen, dot(nu0, nu1, nu2, nu0, nu1, nu2), 1.0))
+        q10, q11, q12 = by_t * nu0, by_t * nu1, by_t * nu2
+        r12 = dot(q10, q11, q12, nv0, nv1, nv2)
+        q20, q21, q22 = nv0 - r12 * q10, nv1 - r12 * q11, nv2 - r12 * q12
+        r22 = tl.sqrt(dot(q20, q21, q22, q20, q21, q22))
+        by_u = none
         if not PLANAR:
-            hy, hxy = _moment(sums, seen, 1, unit), _moment(sums, seen, 3, unit)
-            hyy = _moment(sums, seen, 4, unit)
-        s = _moment(sums, seen, 5, unit)
-        e0, e1, e2 = kappa * w0, kappa * w1, kappa * w2
-        nu_nu, nu_nv = dot(nu0, nu1, nu2, nu0, nu1, nu2), dot(nu0, nu1, nu2, nv0, nv1, nv2)
-        # Gradients of nu, nv and of kappa w.
-        gnu0, gnu1, gnu2 = nu0 * hxx + nv0 * hxy, nu1 * hxx + nv1 * hxy, nu2 * hxx + nv2 * hxy
-        gnv0, gnv1, gnv2 = nu0 * hxy + nv0 * hyy, nu1 * hxy + nv1 * hyy, nu2 * hxy + nv2 * hyy
-        ge0, ge1, ge2 = e0 * s, e1 * s, e2 * s
-        g_column = -(nu_nu * hx + nu_nv * hy)
-        g_row = -(nu_nv * hx + dot(nv0, nv1, nv2, nv0, nv1, nv2) * hy)
+            by_u = tl.where(seen & (r22 > 0), 1.0 / tl.where(r22 > 0, r22, 1.0), 0.0)
+        q20, q21, q22 = by_u * q20, by_u * q21, by_u * q22
+        back = by_t * r12 * by_u
+        t0, t1, t2 = _mix(htt, q10, q11, q12, htu, q20, q21, q22)
+        u0, u1, u2 = _mix(htu, q10, q11, q12, huu, q20, q21, q22)
+        gnu0, gnu1, gnu2 = _mix(by_t, t0, t1, t2, -back, u0, u1, u2)
+        gnv0, gnv1, gnv2 = by_u * u0, by_u * u1, by_u * u2
+        g_column, g_row = -ht / by_t, -(r12 * ht + r22 * hu)
+        # The adjoints of nu = w x WU and nv = w x WV.
         ga0, ga1, ga2 = cross(gnu0, gnu1, gnu2, w0, w1, w2)
         gb0, gb1, gb2 = cross(gnv0, gnv1, gnv2, w0, w1, w2)
+        gw0, gw1, gw2 = cross(a0, a1, a2, gnu0, gnu1, gnu2)
+        t0, t1, t2 = cross(b0, b1, b2, gnv0, gnv1, gnv2)
+        gw0, gw1, gw2 = gw0 + t0, gw1 + t1, gw2 + t2
         if CONE:
-            sx, sxx = _moment(sums, seen, 6, unit), _moment(sums, seen, 8, unit)
-            if not PLANAR:
-                sy, sxy = _moment(sums, seen, 7, unit), _moment(sums, seen, 9, unit)
-                syy = _moment(sums, seen, 10, unit)
-            ge0, ge1, ge2 = ge0 + a0 * sx + b0 * sy, ge1 + a1 * sx + b1 * sy, ge2 + a2 * sx + b2 * sy
-            ga0 += e0 * sx + a0 * sxx + b0 * sxy
-            ga1 += e1 * sx + a1 * sxx + b1 * sxy
-            ga2 += e2 * sx + a2 * sxx + b2 * sxy
-            gb0 += e0 * sy + a0 * sxy + b0 * syy
-            gb1 += e1 * sy + a1 * sxy + b1 * syy
-            gb2 += e2 * sy + a2 * sxy + b2 * syy
-            ab = dot(a0, a1, a2, b0, b1, b2)
-            g_column -= dot(e0, e1, e2, a0, a1, a2) * s + dot(a0, a1, a2, a0, a1, a2) * sx + ab * sy
-            g_row -= dot(e0, e1, e2, b0, b1, b2) * s + ab * sx + dot(b0, b1, b2, b0, b1, b2) * sy
+            # e = e0 + t et + u eu.
+            e0, e1, e2 = kappa * w0, kappa * w1, kappa * w2
+            t0, t1, t2 = by_t * a0, by_t * a1, by_t * a2
+            u0, u1, u2 = _mix(by_u, b0, b1, b2, -back, a0, a1, a2)
+            ge0, ge1, ge2 = s * e0 + st * t0 + su * u0, s * e1 + st * t1 + su * u1, s * e2 + st * t2 + su * u2
+            along0, along1 = st * e0 + stt * t0 + stu * u0, st * e1 + stt * t1 + stu * u1
+            along2 = st * e2 + stt * t2 + stu * u2
+            up0, up1 = su * e0 + stu * t0 + suu * u0, su * e1 + stu * t1 + suu * u1
+            up2 = su * e2 + stu * t2 + suu * u2
+            t0, t1, t2 = _mix(by_t, along0, along1, along2, -back, up0, up1, up2)
+            ga0, ga1, ga2 = ga0 + t0, ga1 + t1, ga2 + t2
+            gb0, gb1, gb2 = gb0 + by_u * up0, gb1 + by_u * up1, gb2 + by_u * up2
+            gw0, gw1, gw2 = gw0 + kappa * ge0, gw1 + kappa * ge1, gw2 + kappa * ge2
+            g_column -= dot(ge0, ge1, ge2, a0, a1, a2)
+            g_row -= dot(ge0, ge1, ge2, b0, b1, b2)
+        else:
+            gw0, gw1, gw2 = gw0 + s * w0, gw1 + s * w1, gw2 + s * w2
         if PLANAR:
             g_row = none
-        # The adjoints of nu = w x WU and nv = w x WV.
-        gw0, gw1, gw2 = cross(a0, a1, a2, gnu0, gnu1, gnu2)
-        q0, q1, q2 = cross(b0, b1, b2, gnv0, gnv1, gnv2)
-        gw0, gw1, gw2 = gw0 + q0 + kappa * ge0, gw1 + q1 + kappa * ge1, gw2 + q2 + kappa * ge2
-        u0, u1, u2 = tl.load(at + 12), tl.load(at + 15), tl.load(at + 18)
-        v0, v1, v2 = tl.load(at + 13), tl.load(at + 16), tl.load(at + 19)
-        G00 += dot(gw0, ga0, gb0, r0, u0, v0)
-        G01 += dot(gw0, ga0, gb0, r1, u1, v1)
-        G02 += dot(gw0, ga0, gb0, r2, u2, v2)
-        G10 += dot(gw1, ga1, gb1, r0, u0, v0)
-        G11 += dot(gw1, ga1, gb1, r1, u1, v1)
-        G12 += dot(gw1, ga1, gb1, r2, u2, v2)
-        G20 += dot(gw2, ga2, gb2, r0, u0, v0)
-        G21 += dot(gw2, ga2, gb2, r1, u1, v1)
-        G22 += dot(gw2, ga2, gb2, r2, u2, v2)
+        U0, U1, U2 = tl.load(at + 12), tl.load(at + 15), tl.load(at + 18)
+        V0, V1, V2 = tl.load(at + 13), tl.load(at + 16), tl.load(at + 19)
+        G00 += dot(gw0, ga0, gb0, r0, U0, V0)
+        G01 += dot(gw0, ga0, gb0, r1, U1, V1)
+        G02 += dot(gw0, ga0, gb0, r2, U2, V2)
+        G10 += dot(gw1, ga1, gb1, r0, U0, V0)
+        G11 += dot(gw1, ga1, gb1, r1, U1, V1)
+        G12 += dot(gw1, ga1, gb1, r2, U2, V2)
+        G20 += dot(gw2, ga2, gb2, r0, U0, V0)
+        G21 += dot(gw2, ga2, gb2, r1, U1, V1)
+        G22 += dot(gw2, ga2, gb2, r2, U2, V2)
         g_depth = none
         if CONE:
             P0 += dot(m00, m10, m20, gw0, gw1, gw2)
@@ -115,9 +132,8 @@ def _pull_back_kernel(
         P1 += dot(tl.load(at + 4), tl.load(at + 7), tl.load(at + 10), g_column, g_row, g_depth)
         P2 += dot(tl.load(at + 5), tl.load(at + 8), tl.load(at + 11), g_column, g_row, g_depth)
         at += VIEW
-        half_height += 5 * count
-        footprint += count * RECORD
-        sums += count * MOMENTS
+        footprint += tl.cast(count, tl.int64) * RECORD
+        sums += tl.cast(count, tl.int64) * SUMS
     tl.store(grad_position + n * 3, P0.to(tl.float32), mask=live)
     tl.store(grad_position + n * 3 + 1, P1.to(tl.float32), mask=live)
     tl.store(grad_position + n * 3 + 2, P2.to(tl.float32), mask=live)
@@ -135,13 +151,13 @@ def _pull_back_kernel(
 
 
 def pull_back(
-    position, scale, rotation, weight, table: torch.Tensor, views: DetectorViews, record, ellipse, moments
+    position, scale, rotation, weight, table: torch.Tensor, views: DetectorViews, record, moments
 ) -> tuple[torch.Tensor, ...]:
     """Gradients of position, scale, rotation and weight from the moments, summed over the views."""
     grads = tuple(torch.empty_like(t) for t in (position, scale, rotation, weight))
     with on_device(position):
         _pull_back_kernel[(triton.cdiv(len(position), _BLOCK),)](
-            position, scale, rotation, table, record, ellipse, moments, *grads, len(position), len(views),
+            position, scale, rotation, table, record, moments, *grads, len(position), len(views),
             CHANNELS=len(weight), CONE=views.cone, PLANAR=views.planar, BLOCK=_BLOCK, num_warps=2,
         )  # fmt: skip
     return grads

@@ -2,46 +2,34 @@
 
 README.md has the formulas.
 
-``record`` (views, count, 16) holds for one Gaussian at a time, with x and y counted from the projected centre
+``record`` (views, count, 20) holds for one Gaussian, with x and y counted from the projected centre
 
 * 0, 1: column and row of the projected centre;
 * 2-4: r11, r12, r22 with q = ((r11 x + r12 y)^2 + (r22 y)^2) / l, the squared distance times HALF_LOG2E;
-* 5-9: l = 1 + x (l5 + l7 x + l8 y) + y (l6 + l9 y) = |e|^2 / |e_centre|^2 (one for parallel rays);
-* 10: 1 / |e_centre|;
-* 11-14: the weights, times 1 / |e_centre|.
-
-``ellipse`` (views, 5, count) holds the outline where the Gaussian is cut, for many Gaussians at a time: row
-yc and half-height ry, column xc, slope m and half-width hx with
-|column - xc - m (row - yc)| <= hx sqrt(1 - ((row - yc) / ry)^2); ry = -1 where there is none. ``boxes``
-(views, 4, groups) are the bounding boxes, columns then rows, of GROUP neighbours in the list.
+* 5-9: the outline where the Gaussian is cut, as row yc and half-height ry, column xc, slope m and half-width hx
+  with |column - xc - m (row - yc)| <= hx sqrt(1 - ((row - yc) / ry)^2); ry = -1 if it misses the detector;
+* 10-14: l = 1 + x (l10 + l12 x + l13 y) + y (l11 + l14 y) = |e|^2 / |e_centre|^2 (one for parallel rays);
+* 15: 1 / |e_centre|;
+* 16-19: the weights, times 1 / |e_centre|.
 """
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
-from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, cross, dot, on_device, rotation_matrix
+from tomo_polysplat.kernels.triton_lanes import store_four
+from tomo_polysplat.kernels.triton_maths import HALF_LOG2E, cross, dot, on_device, rotation_matrix
 from tomo_polysplat.kernels.views import DetectorViews
 
-__all__ = ["RECORD", "VIEW", "chain", "footprints", "view_table", "whitening"]
+__all__ = ["RECORD", "ROOT", "VIEW", "chain", "footprints", "whitening"]
 
-RECORD = tl.constexpr(16)
+RECORD = tl.constexpr(20)
 VIEW = tl.constexpr(21)  # origin, inverse and matrix of a view, row by row
-_ROOT = tl.constexpr(HALF_LOG2E**0.5)
-_FAR = tl.constexpr(1e30)
+ROOT = tl.constexpr(HALF_LOG2E**0.5)
 _SLACK = tl.constexpr(0.01)  # of a pixel, on the outline: rounding must not cut what q still includes
 _BLOCK = 128
-
-
-def view_table(views: DetectorViews, device: torch.device) -> torch.Tensor:
-    """(views, 21) float64 origin, inverse and matrix."""
-    count = len(views)
-    parts = [views.origin, views.inverse.reshape(count, 9), views.matrix.reshape(count, 9)]
-    # From ordinary memory the copy is staged at once: it neither waits for the device nor races with numpy.
-    return torch.from_numpy(np.concatenate(parts, axis=1)).to(device, non_blocking=True)
 
 
 @triton.jit
@@ -130,32 +118,21 @@ def _outline(cut, r11, r12, r22, lc, lx, ly, lxx, lxy, lyy, PLANAR: tl.constexpr
 
 
 @triton.jit
-def _store_outline(ellipse, boxes, view, n, live, count, groups, yc, ry, xc, m, hx, valid, BLOCK, GROUP):
-    ry = tl.where(valid, ry + _SLACK, -1.0)
-    hx += _SLACK
-    out = ellipse + view * 5 * count + n
-    tl.store(out, yc.to(tl.float32), mask=live)
-    tl.store(out + count, ry.to(tl.float32), mask=live)
-    tl.store(out + 2 * count, xc.to(tl.float32), mask=live)
-    tl.store(out + 3 * count, m.to(tl.float32), mask=live)
-    tl.store(out + 4 * count, hx.to(tl.float32), mask=live)
-    reach = tl.sqrt(m * m * ry * ry + hx * hx)
-    low_x, high_x = tl.where(valid, xc - reach, _FAR), tl.where(valid, xc + reach, -_FAR)
-    low_y, high_y = tl.where(valid, yc - ry, _FAR), tl.where(valid, yc + ry, -_FAR)
-    g = tl.program_id(0) * (BLOCK // GROUP) + tl.arange(0, BLOCK // GROUP)
-    box = boxes + view * 4 * groups + g
-    shape: tl.constexpr = [BLOCK // GROUP, GROUP]
-    tl.store(box, tl.min(tl.reshape(low_x, shape), 1).to(tl.float32), mask=g < groups)
-    tl.store(box + groups, tl.max(tl.reshape(high_x, shape), 1).to(tl.float32), mask=g < groups)
-    tl.store(box + 2 * groups, tl.min(tl.reshape(low_y, shape), 1).to(tl.float32), mask=g < groups)
-    tl.store(box + 3 * groups, tl.max(tl.reshape(high_y, shape), 1).to(tl.float32), mask=g < groups)
+def _store(at, a, b, c, d, live):
+    store_four(at, a.to(tl.float32), b.to(tl.float32), c.to(tl.float32), d.to(tl.float32), live)
+
+
+@triton.jit
+def _weight(weight, n, count, live, k, inverse, CHANNELS: tl.constexpr):
+    if k < CHANNELS:
+        return (tl.load(weight + k * count + n, mask=live, other=0.0) * inverse).to(tl.float32)
+    return tl.zeros_like(inverse).to(tl.float32)
 
 
 @triton.jit
 def _footprint_kernel(
-    position, scale, rotation, weight, views, record, ellipse, boxes, skipped, count, groups, cutoff,
+    position, scale, rotation, weight, views, record, skipped, count, rows, columns, cutoff,
     CHANNELS: tl.constexpr, CONE: tl.constexpr, PLANAR: tl.constexpr, BLOCK: tl.constexpr,
-    GROUP: tl.constexpr,
 ):  # fmt: skip
     n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     view = tl.program_id(1).to(tl.int64)
@@ -195,40 +172,38 @@ def _footprint_kernel(
         row = zero
     cut = cutoff * cutoff
     yc, ry, xc, m, hx, outlined = _outline(cut, r11, r12, r22, 1.0, lx, ly, lxx, lxy, lyy, PLANAR)
-    valid &= outlined
-    _store_outline(
-        ellipse, boxes, view, n, live, count, groups, yc + row, ry, xc + column, m, hx, valid, BLOCK, GROUP
+    yc, ry, xc, hx = yc + row, ry + _SLACK, xc + column, hx + _SLACK
+    reach = tl.sqrt(m * m * ry * ry + hx * hx)
+    valid &= (
+        outlined & (yc + ry >= 0) & (yc - ry <= rows - 1) & (xc + reach >= 0) & (xc - reach <= columns - 1)
     )
-    out = record + (view * count + n) * RECORD
-    tl.store(out, column.to(tl.float32), mask=live)
-    tl.store(out + 1, row.to(tl.float32), mask=live)
-    tl.store(out + 2, (r11 * _ROOT).to(tl.float32), mask=live)
-    tl.store(out + 3, (r12 * _ROOT).to(tl.float32), mask=live)
-    tl.store(out + 4, (r22 * _ROOT).to(tl.float32), mask=live)
-    if CONE:
-        tl.store(out + 5, (2 * lx).to(tl.float32), mask=live)
-        tl.store(out + 6, (2 * ly).to(tl.float32), mask=live)
-        tl.store(out + 7, lxx.to(tl.float32), mask=live)
-        tl.store(out + 8, (2 * lxy).to(tl.float32), mask=live)
-        tl.store(out + 9, lyy.to(tl.float32), mask=live)
-    tl.store(out + 10, inverse.to(tl.float32), mask=live)
-    for k in tl.static_range(CHANNELS):
-        height = tl.load(weight + k * count + n, mask=live, other=0.0)
-        tl.store(out + 11 + k, (height * inverse).to(tl.float32), mask=live)
+    ry = tl.where(valid, ry, -1.0)
+    to = record + (view * count + n) * RECORD
+    _store(to, column, row, r11 * ROOT, r12 * ROOT, live)
+    _store(to + 4, r22 * ROOT, yc, ry, xc, live)
+    _store(to + 8, m, hx, 2 * lx, 2 * ly, live)
+    _store(to + 12, lxx, 2 * lxy, lyy, inverse, live)
+    store_four(
+        to + 16,
+        _weight(weight, n, count, live, 0, inverse, CHANNELS),
+        _weight(weight, n, count, live, 1, inverse, CHANNELS),
+        _weight(weight, n, count, live, 2, inverse, CHANNELS),
+        _weight(weight, n, count, live, 3, inverse, CHANNELS),
+        live,
+    )
 
 
-def footprints(position, scale, rotation, weight, views: DetectorViews, table: torch.Tensor, cutoff: float):
-    """``record``, ``ellipse``, ``boxes`` of the module docstring; number of skipped pairs, 0-dim int64."""
-    count, groups, many = len(position), triton.cdiv(len(position), GROUP), len(views)
+def footprints(
+    position, scale, rotation, weight, views: DetectorViews, table: torch.Tensor, cutoff: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """``record`` of the module docstring and the number of skipped pairs, 0-dim int64."""
+    count, many = len(position), len(views)
     record = position.new_empty((many, count, RECORD.value))
-    ellipse = position.new_empty((many, 5, count))
-    boxes = position.new_empty((many, 4, groups))
     skipped = torch.zeros((), dtype=torch.int64, device=position.device)
     if count and many:
         with on_device(position):
             _footprint_kernel[(triton.cdiv(count, _BLOCK), many)](
-                position, scale, rotation, weight, table, record, ellipse, boxes, skipped, count, groups,
-                cutoff, CHANNELS=len(weight), CONE=views.cone, PLANAR=views.planar, BLOCK=_BLOCK, GROUP=GROUP,
-                num_warps=4,
+                position, scale, rotation, weight, table, record, skipped, count, views.rows, views.columns,
+                cutoff, CHANNELS=len(weight), CONE=views.cone, PLANAR=views.planar, BLOCK=_BLOCK, num_warps=4,
             )  # fmt: skip
-    return record, ellipse, boxes, skipped
+    return record, skipped

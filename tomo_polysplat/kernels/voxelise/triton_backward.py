@@ -1,6 +1,6 @@
 """The adjoint of voxelising on CUDA: every Gaussian gathers the gradients of its voxels, without atomics.
 
-One warp sums over the voxels of a Gaussian (``moments``); a second kernel, with one lane a Gaussian, takes
+Half a warp sums over the voxels of a Gaussian (``moments``); a second kernel, with one lane a Gaussian, takes
 these sums back to position, scale and rotation.
 """
 
@@ -10,16 +10,16 @@ import torch
 import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
+from tomo_polysplat.kernels.triton_lanes import SUMS, half_sums, load_four
 from tomo_polysplat.kernels.triton_maths import HALF_LOG2E, dot, on_device, whitening_adjoint
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
-from tomo_polysplat.kernels.voxelise.triton_setup import RECORD, scaled_whitening
+from tomo_polysplat.kernels.voxelise.triton_setup import RECORD, ROOT, scaled_whitening, triangle
 
 __all__ = ["BLOCK", "pull_back", "sum_moments"]
 
-BLOCK = (8, 4)  # rows and columns of the lanes that walk along the rows of an ellipsoid
-_RUN = 4  # neighbours in the list handled by one warp: their voxels overlap, so they stay in the cache
+BLOCK = (8, 2)  # lines and columns of the lanes that walk along the lines of an ellipsoid
+_RUN = 4  # times two neighbours handled by one warp: their voxels overlap, so they stay in the cache
 _GAUSSIANS = 64
-_MOMENTS = tl.constexpr(16)
 
 
 @triton.jit
@@ -35,31 +35,27 @@ def _moments_kernel(
     record, grad, moments, count, nz, ny, nx, stride, cut,
     CHANNELS: tl.constexpr, BLOCK_H: tl.constexpr, BLOCK_W: tl.constexpr, RUN: tl.constexpr,
 ):  # fmt: skip
-    down, across = tl.arange(0, BLOCK_H)[:, None], tl.arange(0, BLOCK_W)[None, :]
-    zero = tl.zeros([BLOCK_H, BLOCK_W], tl.float32)
-    w1, w2, w3 = 0.0, 0.0, 0.0
-    at = record + tl.program_id(0).to(tl.int64) * RUN * RECORD
-    to = moments + tl.program_id(0).to(tl.int64) * RUN * _MOMENTS
-    for _ in range(tl.program_id(0) * RUN, tl.minimum(count, tl.program_id(0) * RUN + RUN)):
-        xc, yc, zc = tl.load(at), tl.load(at + 1), tl.load(at + 2)
-        r11, r12, r13 = tl.load(at + 3), tl.load(at + 4), tl.load(at + 5)
-        r22, r23, r33 = tl.load(at + 6), tl.load(at + 7), tl.load(at + 8)
-        w0 = tl.load(at + 12)
-        if CHANNELS > 1:
-            w1 = tl.load(at + 13)
-        if CHANNELS > 2:
-            w2 = tl.load(at + 14)
-        if CHANNELS > 3:
-            w3 = tl.load(at + 15)
-        hx, hy, hz, hxx, hxy = zero, zero, zero, zero, zero
-        hxz, hyy, hyz, hzz = zero, zero, zero, zero
+    lane = tl.arange(0, 32)
+    down, across = lane % 16 // BLOCK_W, lane % BLOCK_W
+    zero = tl.zeros([32], tl.float32)
+    for pair in range(tl.program_id(0) * RUN, tl.minimum((count + 1) // 2, tl.program_id(0) * RUN + RUN)):
+        n = 2 * pair + lane // 16
+        at = record + tl.minimum(n, count - 1).to(tl.int64) * RECORD
+        xc, yc, zc, r11 = load_four(at)
+        r12, r13, r22, r23 = load_four(at + 4)
+        r33, _, half_y, half_z = load_four(at + 8)
+        w0, w1, w2, w3 = load_four(at + 12)
+        ht, hu, hv, htt, htu = zero, zero, zero, zero, zero
+        htv, huu, huv, hvv = zero, zero, zero, zero
         c0, c1, c2, c3 = zero, zero, zero, zero
-        first_y, lines = _indices(yc, tl.load(at + 10), ny)
-        first_z, slices = _indices(zc, tl.load(at + 11), nz)
-        for first in range(0, lines * slices, BLOCK_H):
+        first_y, rows = _indices(yc, half_y, ny)
+        first_z, slices = _indices(zc, half_z, nz)
+        lines, rows = rows * slices, tl.maximum(rows, 1)
+        for first in range(0, tl.max(lines, 0), BLOCK_H):
             line = first + down
-            known = line < lines * slices
-            iy, iz = first_y + line % lines, first_z + line // lines
+            known = line < lines
+            slab = line // rows
+            iy, iz = first_y + line - slab * rows, first_z + slab
             y, z = iy.to(tl.float32) - yc, iz.to(tl.float32) - zc
             shift, up, out = r12 * y + r13 * z, r22 * y + r23 * z, r33 * z
             rest = up * up + out * out
@@ -67,9 +63,9 @@ def _moments_kernel(
             start = tl.minimum(tl.maximum(xc - shift / r11 - spread, 0.0), nx + 0.0)
             start = tl.math.ceil(start).to(tl.int32)
             wide = tl.where(known & (rest <= cut), tl.minimum(2 * spread, nx - 1.0), -1.0)
-            widest = tl.max(tl.max(wide, 1), 0)
+            widest = tl.max(wide, 0)
             at_line = grad + (iz.to(tl.int64) * ny + iy) * nx
-            h0, h1, h2 = zero, zero, zero
+            h0, h1 = zero, zero
             for step in range(0, tl.math.floor(widest).to(tl.int32) + 1, BLOCK_W):
                 j = start + (step + across)
                 inside = (j < nx) & known
@@ -93,49 +89,32 @@ def _moments_kernel(
                     total += w3 * g
                     c3 += g * value
                 h = total * value
-                along = h * x
+                along = h * t
                 h0 += h
                 h1 += along
-                h2 += along * x
-            hx += h1
-            hy += h0 * y
-            hz += h0 * z
-            hxx += h2
-            hxy += h1 * y
-            hxz += h1 * z
-            hyy += h0 * (y * y)
-            hyz += h0 * (y * z)
-            hzz += h0 * (z * z)
-        tl.store(to, tl.sum(hx))
-        tl.store(to + 1, tl.sum(hy))
-        tl.store(to + 2, tl.sum(hz))
-        tl.store(to + 3, tl.sum(hxx))
-        tl.store(to + 4, tl.sum(hxy))
-        tl.store(to + 5, tl.sum(hxz))
-        tl.store(to + 6, tl.sum(hyy))
-        tl.store(to + 7, tl.sum(hyz))
-        tl.store(to + 8, tl.sum(hzz))
-        tl.store(to + 12, tl.sum(c0))
-        if CHANNELS > 1:
-            tl.store(to + 13, tl.sum(c1))
-        if CHANNELS > 2:
-            tl.store(to + 14, tl.sum(c2))
-        if CHANNELS > 3:
-            tl.store(to + 15, tl.sum(c3))
-        at += RECORD
-        to += _MOMENTS
+                htt += along * t
+            ht += h1
+            hu += h0 * up
+            hv += h0 * out
+            htu += h1 * up
+            htv += h1 * out
+            huu += h0 * (up * up)
+            huv += h0 * (up * out)
+            hvv += h0 * (out * out)
+        total = half_sums(lane, ht, hu, hv, htt, htu, htv, huu, huv, hvv, zero, zero, zero, c0, c1, c2, c3)
+        tl.store(moments + n.to(tl.int64) * SUMS + lane % 16, total, mask=n < count)
 
 
 def sum_moments(record, grad_volume: torch.Tensor, box: VoxelBox, cutoff: float) -> torch.Tensor:
-    """(count, 16) sums over the voxels of each ellipsoid, with x, y, z from its centre in voxels.
+    """(count, 16) sums over the voxels of each ellipsoid, with t, u, v the three terms of q in triton_setup.
 
-    First of h (x, y, z, x^2, xy, xz, y^2, yz, z^2) with dL/d(distance^2) = -h / 2, from 12 of f dL/df by
+    First of h (t, u, v, t^2, tu, tv, u^2, uv, v^2) with dL/d(distance^2) = -h / 2, from 12 of f dL/df by
     channel.
     """
-    moments = record.new_empty((len(record), _MOMENTS.value))
+    moments = record.new_empty((len(record), SUMS.value))
     grad = grad_volume.contiguous()
     with on_device(record):
-        _moments_kernel[(triton.cdiv(len(record), _RUN),)](
+        _moments_kernel[(triton.cdiv(len(record), 2 * _RUN),)](
             record, grad, moments, len(record), *box.shape, grad.stride(0), cutoff * cutoff * HALF_LOG2E,
             CHANNELS=len(grad), BLOCK_H=BLOCK[0], BLOCK_W=BLOCK[1], RUN=_RUN, num_warps=1, num_stages=1,
         )  # fmt: skip
@@ -143,15 +122,12 @@ def sum_moments(record, grad_volume: torch.Tensor, box: VoxelBox, cutoff: float)
 
 
 @triton.jit
-def _row_gradient(a0, a1, a2, x, y, z, xx, xy, xz, yy, yz, zz, t0, t1, t2, s, sx, sy, sz):
-    """One row of dL/dW, and what the row of W adds to dL/dposition."""
-    ahead = dot(a0, a1, a2, x, y, z)
-    return (
-        -dot(a0, a1, a2, xx, xy, xz) * sx,
-        -dot(a0, a1, a2, xy, yy, yz) * sy,
-        -dot(a0, a1, a2, xz, yz, zz) * sz,
-        ahead * t0 / s, ahead * t1 / s, ahead * t2 / s,
-    )  # fmt: skip
+def _row_gradient(q0, q1, q2, r11, r12, r13, r22, r23, r33, xx, xy, xz, yy, yz, zz):
+    """One row of q M r^-T, by back substitution; without r33 nothing depends on z."""
+    m0, m1, m2 = dot(q0, q1, q2, xx, xy, xz), dot(q0, q1, q2, xy, yy, yz), dot(q0, q1, q2, xz, yz, zz)
+    g2 = tl.where(r33 > 0, m2 / tl.where(r33 > 0, r33, 1.0), 0.0)
+    g1 = (m1 - r23 * g2) / r22
+    return (m0 - r12 * g1 - r13 * g2) / r11, g1, g2
 
 
 @triton.jit
@@ -165,36 +141,37 @@ def _pull_back_kernel(
         t00, t01, t02, t10, t11, t12, t20, t21, t22,
         a00, a01, a02, a10, a11, a12, a20, a21, a22, s0, s1, s2,
     ) = scaled_whitening(scale, rotation, table, n, live)  # fmt: skip
-    at = moments + n * _MOMENTS
-    x = tl.load(at, mask=live, other=0.0).to(tl.float64)
-    y = tl.load(at + 1, mask=live, other=0.0).to(tl.float64)
-    z = tl.load(at + 2, mask=live, other=0.0).to(tl.float64)
-    xx = tl.load(at + 3, mask=live, other=0.0).to(tl.float64)
-    xy = tl.load(at + 4, mask=live, other=0.0).to(tl.float64)
-    xz = tl.load(at + 5, mask=live, other=0.0).to(tl.float64)
-    yy = tl.load(at + 6, mask=live, other=0.0).to(tl.float64)
-    yz = tl.load(at + 7, mask=live, other=0.0).to(tl.float64)
-    zz = tl.load(at + 8, mask=live, other=0.0).to(tl.float64)
+    r11, r12, r13, r22, r23, r33, q00, q10, q20, q01, q11, q21, q02, q12, q22 = triangle(
+        a00, a01, a02, a10, a11, a12, a20, a21, a22
+    )
+    at = moments + tl.minimum(n, count - 1) * SUMS
+    t, u, v, tt = load_four(at)
+    tu, tv, uu, uv = load_four(at + 4)
+    vv, _, _, _ = load_four(at + 8)
+    # distance^2 = t^2 + u^2 + v^2 in units of ROOT: dL/dA = -q M r^-T, dL/dposition = W^T q m.
+    one, two = 1.0 / ROOT, -1.0 / (ROOT * ROOT)
+    t, u, v = t.to(tl.float64) * one, u.to(tl.float64) * one, v.to(tl.float64) * one
+    tt, tu, tv = tt.to(tl.float64) * two, tu.to(tl.float64) * two, tv.to(tl.float64) * two
+    uu, uv, vv = uu.to(tl.float64) * two, uv.to(tl.float64) * two, vv.to(tl.float64) * two
+    m0, m1, m2 = (
+        dot(q00, q01, q02, t, u, v) / s0,
+        dot(q10, q11, q12, t, u, v) / s1,
+        dot(q20, q21, q22, t, u, v) / s2,
+    )
+    tl.store(grad_position + n * 3, dot(t00, t10, t20, m0, m1, m2).to(tl.float32), mask=live)
+    tl.store(grad_position + n * 3 + 1, dot(t01, t11, t21, m0, m1, m2).to(tl.float32), mask=live)
+    tl.store(grad_position + n * 3 + 2, dot(t02, t12, t22, m0, m1, m2).to(tl.float32), mask=live)
     sx, sy, sz = tl.load(table + 3), tl.load(table + 4), tl.load(table + 5)
-    # distance^2 = |A u|^2: dL/dA = -A sum(h u u^T), dL/dposition = W^T A sum(h u).
-    g00, g01, g02, p0, p1, p2 = _row_gradient(
-        a00, a01, a02, x, y, z, xx, xy, xz, yy, yz, zz, t00, t01, t02, s0, sx, sy, sz
-    )
-    g10, g11, g12, q0, q1, q2 = _row_gradient(
-        a10, a11, a12, x, y, z, xx, xy, xz, yy, yz, zz, t10, t11, t12, s1, sx, sy, sz
-    )
-    g20, g21, g22, o0, o1, o2 = _row_gradient(
-        a20, a21, a22, x, y, z, xx, xy, xz, yy, yz, zz, t20, t21, t22, s2, sx, sy, sz
-    )
-    tl.store(grad_position + n * 3, (p0 + q0 + o0).to(tl.float32), mask=live)
-    tl.store(grad_position + n * 3 + 1, (p1 + q1 + o1).to(tl.float32), mask=live)
-    tl.store(grad_position + n * 3 + 2, (p2 + q2 + o2).to(tl.float32), mask=live)
+    g00, g01, g02 = _row_gradient(q00, q01, q02, r11, r12, r13, r22, r23, r33, tt, tu, tv, uu, uv, vv)
+    g10, g11, g12 = _row_gradient(q10, q11, q12, r11, r12, r13, r22, r23, r33, tt, tu, tv, uu, uv, vv)
+    g20, g21, g22 = _row_gradient(q20, q21, q22, r11, r12, r13, r22, r23, r33, tt, tu, tv, uu, uv, vv)
     for k in tl.static_range(CHANNELS):
-        tl.store(grad_weight + k * count + n, tl.load(at + 12 + k, mask=live, other=0.0), mask=live)
+        tl.store(grad_weight + k * count + n, tl.load(at + 12 + k), mask=live)
     whitening_adjoint(
         scale, rotation, n, live,
         t00 / s0, t01 / s0, t02 / s0, t10 / s1, t11 / s1, t12 / s1, t20 / s2, t21 / s2, t22 / s2,
-        g00, g01, g02, g10, g11, g12, g20, g21, g22, grad_scale, grad_rotation,
+        g00 * sx, g01 * sy, g02 * sz, g10 * sx, g11 * sy, g12 * sz, g20 * sx, g21 * sy, g22 * sz,
+        grad_scale, grad_rotation,
     )  # fmt: skip
 
 

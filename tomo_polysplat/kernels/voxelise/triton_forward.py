@@ -1,7 +1,7 @@
-"""Voxelising on CUDA: every brick of voxels gathers the Gaussians that reach it.
+"""Voxelising on CUDA: neighbours in the list are summed brick by brick and added to the volume.
 
-As in the projection, a brick finds them through the bounding boxes of groups of neighbours in the list, so
-there are no atomics and every run gives the same bits.
+As in the projection, a warp holds GROUP neighbours, one to a lane, finds those that reach a brick of their
+common window, sums them in registers and adds the sum atomically: the volume repeats to rounding.
 """
 
 from __future__ import annotations
@@ -10,111 +10,126 @@ import torch
 import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
-from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, dot, lane_set, lowest_lane, on_device
+from tomo_polysplat.kernels.triton_lanes import lane_set, load_four, lowest_lane
+from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, dot, on_device
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.kernels.voxelise.triton_setup import RECORD
 
-__all__ = ["BRICK", "gather_volume"]
+__all__ = ["BRICK", "splat"]
 
-BRICK = (4, 4, 8)  # slices, rows and columns of a brick, handled by one warp
+BRICK = (4, 8, 8)  # slices, rows and columns
+_PROGRAMS = 1 << 15  # enough to fill the device; the windows of fewer groups are each shared out
+_MOST_PARTS = 16
+_NOWHERE = tl.constexpr(-1e30)
 
 
 @triton.jit
-def _reaches(shape, n, count, x, y, z, cut, WIDE: tl.constexpr, HIGH: tl.constexpr, DEEP: tl.constexpr):
-    """Whether the ellipsoids of the Gaussians ``n`` can meet the brick centred at (x, y, z).
+def _window(centre, half, live, length):
+    """First and last index that the bounding boxes of a group share with an axis."""
+    low = tl.maximum(tl.min(tl.where(live, centre - half, -_NOWHERE), 0), 0.0)
+    high = tl.minimum(tl.max(tl.where(live, centre + half, _NOWHERE), 0), length - 1.0)
+    return tl.math.ceil(tl.minimum(low, length + 0.0)).to(tl.int32), tl.maximum(high, -1.0).to(tl.int32)
+
+
+@triton.jit
+def _reaches(x, y, z, r11, r12, r13, r22, r23, r33, cut, W: tl.constexpr, H: tl.constexpr, D: tl.constexpr):
+    """Whether ellipsoids can meet the brick whose centre lies at (x, y, z) from theirs.
 
     Seen along the line from the ellipsoid's centre to the brick's, in units where the ellipsoid is a ball of
     radius sqrt(cut), they do not when the ball ends before the brick begins.
     """
-    live = n < count
-    x -= tl.load(shape + n, mask=live, other=0.0)
-    y -= tl.load(shape + count + n, mask=live, other=0.0)
-    z -= tl.load(shape + 2 * count + n, mask=live, other=0.0)
-    r11 = tl.load(shape + 3 * count + n, mask=live, other=0.0)
-    r12 = tl.load(shape + 4 * count + n, mask=live, other=0.0)
-    r13 = tl.load(shape + 5 * count + n, mask=live, other=0.0)
-    r22 = tl.load(shape + 6 * count + n, mask=live, other=0.0)
-    r23 = tl.load(shape + 7 * count + n, mask=live, other=0.0)
-    r33 = tl.load(shape + 8 * count + n, mask=live, other=0.0)
     d0, d1, d2 = dot(r11, r12, r13, x, y, z), r22 * y + r23 * z, r33 * z
     square = dot(d0, d1, d2, d0, d1, d2)
-    half = tl.abs(r11 * d0) * ((WIDE - 1) / 2) + tl.abs(r12 * d0 + r22 * d1) * ((HIGH - 1) / 2)
-    half += tl.abs(dot(r13, r23, r33, d0, d1, d2)) * ((DEEP - 1) / 2)
+    half = tl.abs(r11 * d0) * ((W - 1) / 2) + tl.abs(r12 * d0 + r22 * d1) * ((H - 1) / 2)
+    half += tl.abs(dot(r13, r23, r33, d0, d1, d2)) * ((D - 1) / 2)
     # A hundredth more than the cut: rounding must not lose a voxel.
-    return live & (square - half <= 1.01 * tl.sqrt(cut * square))
+    return square - half <= 1.01 * tl.sqrt(cut * square)
 
 
 @triton.jit
-def _gather_kernel(
-    record, shape, boxes, volume, count, groups, nz, ny, nx, stride, cut,
-    CHANNELS: tl.constexpr, DEEP: tl.constexpr, HIGH: tl.constexpr, WIDE: tl.constexpr, GROUP: tl.constexpr,
-):  # fmt: skip
-    across, down = tl.cdiv(nx, WIDE), tl.cdiv(ny, HIGH)
-    brick = tl.program_id(0)
-    x0, y0 = (brick % across) * WIDE, (brick // across % down) * HIGH
-    z0 = brick // across // down * DEEP
-    lane, line = tl.arange(0, GROUP), tl.arange(0, DEEP * HIGH)
-    ix, iy, iz = x0 + tl.arange(0, WIDE), y0 + line % HIGH, z0 + line // HIGH
-    fx, fy, fz = ix.to(tl.float32)[None, :], iy.to(tl.float32)[:, None], iz.to(tl.float32)[:, None]
-    left, top, front = x0.to(tl.float32), y0.to(tl.float32), z0.to(tl.float32)
-    sum0 = tl.zeros([DEEP * HIGH, WIDE], tl.float32)
+def _sum_brick(record, found, x, y, z, cut, CHANNELS: tl.constexpr):
+    """Sums of the Gaussians ``found`` over a brick, (columns, lines): so a lane has voxels of one line."""
+    sum0 = tl.zeros_like(x + y)
     sum1, sum2, sum3 = sum0, sum0, sum0
-    for first in range(0, groups, GROUP):
-        box, known = boxes + first + lane, first + lane < groups
-        meets = (tl.load(box, mask=known, other=0.0) <= left + (WIDE - 1)) & known
-        meets &= tl.load(box + groups, mask=known, other=0.0) <= top + (HIGH - 1)
-        meets &= tl.load(box + 2 * groups, mask=known, other=0.0) <= front + (DEEP - 1)
-        meets &= tl.load(box + 3 * groups, mask=known, other=0.0) >= left
-        meets &= tl.load(box + 4 * groups, mask=known, other=0.0) >= top
-        meets &= tl.load(box + 5 * groups, mask=known, other=0.0) >= front
-        near = lane_set(meets, lane)
-        while near != 0:
-            start = (first + lowest_lane(near)) * GROUP
-            near &= near - 1
-            x, y, z = left + (WIDE - 1) / 2, top + (HIGH - 1) / 2, front + (DEEP - 1) / 2
-            hit = _reaches(shape, start + lane, count, x, y, z, cut, WIDE, HIGH, DEEP)
-            found = lane_set(hit, lane)
-            while found != 0:
-                at = record + (start + lowest_lane(found)).to(tl.int64) * RECORD
-                found &= found - 1
-                dx, dy, dz = fx - tl.load(at), fy - tl.load(at + 1), fz - tl.load(at + 2)
-                t = tl.load(at + 3) * dx + (tl.load(at + 4) * dy + tl.load(at + 5) * dz)
-                up, out = tl.load(at + 6) * dy + tl.load(at + 7) * dz, tl.load(at + 8) * dz
-                minus = -(up * up + out * out) - t * t
-                value = tl.where(minus >= -cut, tl.exp2(minus), 0.0)
-                sum0 += tl.load(at + 12) * value
+    while found != 0:
+        at = record + lowest_lane(found) * RECORD
+        found &= found - 1
+        cx, cy, cz, r11 = load_four(at)
+        r12, r13, r22, r23 = load_four(at + 4)
+        r33, _, _, _ = load_four(at + 8)
+        w0, w1, w2, w3 = load_four(at + 12)
+        dx, dy, dz = x - cx, y - cy, z - cz
+        up, out = r22 * dy + r23 * dz, r33 * dz
+        t = r11 * dx + (r12 * dy + r13 * dz)
+        q = t * t + (up * up + out * out)
+        value = tl.where(q <= cut, tl.exp2(-1.0 * q), 0.0)
+        sum0 += w0 * value
+        if CHANNELS > 1:
+            sum1 += w1 * value
+        if CHANNELS > 2:
+            sum2 += w2 * value
+        if CHANNELS > 3:
+            sum3 += w3 * value
+    return sum0, sum1, sum2, sum3
+
+
+@triton.jit
+def _splat_kernel(
+    record, volume, count, nz, ny, nx, stride, cut,
+    CHANNELS: tl.constexpr, D: tl.constexpr, H: tl.constexpr, W: tl.constexpr,
+    PARTS: tl.constexpr, GROUP: tl.constexpr,
+):  # fmt: skip
+    group, part, lane = tl.program_id(0) // PARTS, tl.program_id(0) % PARTS, tl.arange(0, GROUP)
+    n = group * GROUP + lane
+    at = record + tl.minimum(n, count - 1).to(tl.int64) * RECORD
+    cx, cy, cz, r11 = load_four(at)
+    r12, r13, r22, r23 = load_four(at + 4)
+    r33, half_x, half_y, half_z = load_four(at + 8)
+    live = n < count
+    x0, x1 = _window(cx, half_x, live, nx)
+    y0, y1 = _window(cy, half_y, live, ny)
+    z0, z1 = _window(cz, half_z, live, nz)
+    if (x0 <= x1) & (y0 <= y1) & (z0 <= z1):
+        record += group.to(tl.int64) * GROUP * RECORD
+        x0 = x0 // 8 * 8  # eight voxels fill a sector of memory
+        across, down = (x1 - x0) // W + 1, (y1 - y0) // H + 1
+        line = tl.arange(0, D * H)[None, :]
+        for brick in range(part, across * down * ((z1 - z0) // D + 1), PARTS):
+            slab = brick // across
+            left, top, front = x0 + brick % across * W, y0 + slab % down * H, z0 + slab // down * D
+            x, y, z = left + (W - 1) / 2 - cx, top + (H - 1) / 2 - cy, front + (D - 1) / 2 - cz
+            found = lane_set(live & _reaches(x, y, z, r11, r12, r13, r22, r23, r33, cut, W, H, D), lane)
+            if found != 0:
+                ix, iy, iz = left + tl.arange(0, W)[:, None], top + line % H, front + line // H
+                sum0, sum1, sum2, sum3 = _sum_brick(
+                    record, found, ix.to(tl.float32), iy.to(tl.float32), iz.to(tl.float32), cut, CHANNELS
+                )
+                inside = (ix < nx) & (iy < ny) & (iz < nz)
+                voxel = volume + ((iz.to(tl.int64) * ny + iy) * nx + ix)
+                tl.atomic_add(voxel, sum0, mask=inside & (sum0 != 0), sem="relaxed")
                 if CHANNELS > 1:
-                    sum1 += tl.load(at + 13) * value
+                    voxel += stride
+                    tl.atomic_add(voxel, sum1, mask=inside & (sum1 != 0), sem="relaxed")
                 if CHANNELS > 2:
-                    sum2 += tl.load(at + 14) * value
+                    voxel += stride
+                    tl.atomic_add(voxel, sum2, mask=inside & (sum2 != 0), sem="relaxed")
                 if CHANNELS > 3:
-                    sum3 += tl.load(at + 15) * value
-    inside = ((iz < nz) & (iy < ny))[:, None] & (ix < nx)[None, :]
-    voxel = volume + ((iz.to(tl.int64) * ny + iy) * nx)[:, None] + ix[None, :]
-    tl.store(voxel, sum0, mask=inside)
-    if CHANNELS > 1:
-        voxel += stride
-        tl.store(voxel, sum1, mask=inside)
-    if CHANNELS > 2:
-        voxel += stride
-        tl.store(voxel, sum2, mask=inside)
-    if CHANNELS > 3:
-        voxel += stride
-        tl.store(voxel, sum3, mask=inside)
+                    voxel += stride
+                    tl.atomic_add(voxel, sum3, mask=inside & (sum3 != 0), sem="relaxed")
 
 
-def gather_volume(record, shape, boxes, channels: int, box: VoxelBox, cutoff: float) -> torch.Tensor:
+def splat(record, channels: int, box: VoxelBox, cutoff: float) -> torch.Tensor:
     """Volume (channels, nz, ny, nx) of the ellipsoids."""
-    count, (nz, ny, nx) = len(record), box.shape
-    if not count:
-        return record.new_zeros((channels, *box.shape))
-    volume = record.new_empty((channels, *box.shape))
-    bricks = triton.cdiv(nz, BRICK[0]) * triton.cdiv(ny, BRICK[1]) * triton.cdiv(nx, BRICK[2])
-    if bricks:
-        with on_device(record):
-            _gather_kernel[(bricks,)](
-                record, shape, boxes, volume, count, boxes.shape[1], nz, ny, nx, volume.stride(0),
-                cutoff * cutoff * HALF_LOG2E, CHANNELS=channels, DEEP=BRICK[0], HIGH=BRICK[1], WIDE=BRICK[2],
-                GROUP=GROUP, num_warps=1, num_stages=1,
-            )  # fmt: skip
+    count = len(record)
+    volume = record.new_zeros((channels, *box.shape))
+    if not (count and volume.numel()):
+        return volume
+    groups = triton.cdiv(count, GROUP)
+    parts = triton.next_power_of_2(max(1, min(_MOST_PARTS, _PROGRAMS // groups)))
+    with on_device(record):
+        _splat_kernel[(groups * parts,)](
+            record, volume, count, *box.shape, volume.stride(0), cutoff * cutoff * HALF_LOG2E,
+            CHANNELS=channels, D=BRICK[0], H=BRICK[1], W=BRICK[2], PARTS=parts, GROUP=GROUP, num_warps=1,
+            num_stages=1,
+        )  # fmt: skip
     return volume

@@ -1,7 +1,8 @@
 """Gaussians sampled at voxel centres on CUDA, as a differentiable torch operation.
 
-README.md derives the formulas. Forward and backward are deterministic. Gaussians that are near in space
-should be near in the list (``kernels.spatial_order``): that changes the speed, not the result.
+README.md derives the formulas. The volume repeats to rounding from run to run, the gradients of one volume to
+the bit; see triton_forward.py and triton_backward.py. Gaussians that are near in space should be near in the
+list (``kernels.spatial_order``): that changes the speed, not the result.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import torch
 from tomo_polysplat.kernels.triton_maths import require_scene
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.kernels.voxelise.triton_backward import pull_back, sum_moments
-from tomo_polysplat.kernels.voxelise.triton_forward import gather_volume
+from tomo_polysplat.kernels.voxelise.triton_forward import splat
 from tomo_polysplat.kernels.voxelise.triton_setup import box_table, ellipsoids
 
 __all__ = ["voxelise"]
@@ -47,10 +48,10 @@ class _Voxelise(torch.autograd.Function):
             t.detach().contiguous() for t in (position, scale, rotation, weight)
         )
         table = box_table(box, position.device)
-        record, shape, boxes = ellipsoids(position, scale, rotation, weight, table, cutoff)
+        record = ellipsoids(position, scale, rotation, weight, table, cutoff)
         ctx.save_for_backward(position, scale, rotation, weight, table, record)
         ctx.box, ctx.cutoff = box, cutoff
-        return gather_volume(record, shape, boxes, len(weight), box, cutoff)
+        return splat(record, len(weight), box, cutoff)
 
     @staticmethod
     def backward(ctx, grad_volume):

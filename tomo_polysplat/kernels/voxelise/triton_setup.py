@@ -6,9 +6,7 @@ With x, y, z counted in voxels from the Gaussian's centre, q = HALF_LOG2E times 
 (r11 x + r12 y + r13 z)^2 + (r22 y + r23 z)^2 + (r33 z)^2.
 
 ``record`` (count, 16): 0-2 the centre (x, y, z) in voxels; 3-8 r11, r12, r13, r22, r23, r33; 9-11 the
-half-widths of the bounding box along x, y, z; 12-15 the weights. ``shape`` (9, count): its first nine, for
-many Gaussians at a time. ``boxes`` (6, groups): lower and upper x, y, z of the bounding boxes of GROUP
-neighbours in the list.
+half-widths of the bounding box along x, y, z; 12-15 the weights.
 """
 
 from __future__ import annotations
@@ -18,13 +16,14 @@ import torch
 import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
-from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, dot, on_device, rotation_matrix
+from tomo_polysplat.kernels.triton_lanes import store_four
+from tomo_polysplat.kernels.triton_maths import HALF_LOG2E, dot, on_device, rotation_matrix
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 
-__all__ = ["RECORD", "box_table", "ellipsoids", "scaled_whitening"]
+__all__ = ["RECORD", "ROOT", "box_table", "ellipsoids", "scaled_whitening", "triangle"]
 
 RECORD = tl.constexpr(16)
-_ROOT = tl.constexpr(HALF_LOG2E**0.5)
+ROOT = tl.constexpr(HALF_LOG2E**0.5)
 _SLACK = tl.constexpr(0.01)  # of a voxel, on the bounding box: rounding must not cut what q still includes
 _BLOCK = 128
 
@@ -51,6 +50,28 @@ def scaled_whitening(scale, rotation, table, n, live):
 
 
 @triton.jit
+def triangle(a00, a01, a02, a10, a11, a12, a20, a21, a22):
+    """A = q r: r11, r12, r13, r22, r23, r33 and the columns of q, the third zero where r33 is.
+
+    What is left of y and z across x is kept as vectors: squares subtracted afterwards would cancel.
+    """
+    r11 = tl.sqrt(dot(a00, a10, a20, a00, a10, a20))
+    x0, x1, x2 = a00 / r11, a10 / r11, a20 / r11
+    r12, r13 = dot(x0, x1, x2, a01, a11, a21), dot(x0, x1, x2, a02, a12, a22)
+    y0, y1, y2 = a01 - x0 * r12, a11 - x1 * r12, a21 - x2 * r12
+    r22 = tl.sqrt(dot(y0, y1, y2, y0, y1, y2))
+    y0, y1, y2 = y0 / r22, y1 / r22, y2 / r22
+    z0, z1, z2 = a02 - x0 * r13, a12 - x1 * r13, a22 - x2 * r13
+    r23 = dot(y0, y1, y2, z0, z1, z2)
+    z0, z1, z2 = z0 - y0 * r23, z1 - y1 * r23, z2 - y2 * r23
+    r33 = tl.sqrt(dot(z0, z1, z2, z0, z1, z2))
+    by_r33 = tl.where(r33 > 0, 1.0 / tl.where(r33 > 0, r33, 1.0), 0.0)
+    return (
+        r11, r12, r13, r22, r23, r33, x0, x1, x2, y0, y1, y2, z0 * by_r33, z1 * by_r33, z2 * by_r33,
+    )  # fmt: skip
+
+
+@triton.jit
 def _centre(position, table, n, live, axis):
     p = tl.load(position + n * 3 + axis, mask=live, other=0.0).to(tl.float64)
     return (p - tl.load(table + axis)) / tl.load(table + 3 + axis)
@@ -66,29 +87,21 @@ def _reach(t0, t1, t2, s0, s1, s2):
 
 
 @triton.jit
-def _store_axis(record, shape, boxes, n, live, count, groups, axis, centre, half, BLOCK, GROUP):
-    tl.store(record + n * RECORD + axis, centre.to(tl.float32), mask=live)
-    tl.store(record + n * RECORD + 9 + axis, half.to(tl.float32), mask=live)
-    tl.store(shape + axis * count + n, centre.to(tl.float32), mask=live)
-    split: tl.constexpr = [BLOCK // GROUP, GROUP]
-    low = tl.min(tl.reshape(tl.where(live, centre - half, float("inf")), split), 1)
-    high = tl.max(tl.reshape(tl.where(live, centre + half, -float("inf")), split), 1)
-    g = tl.program_id(0) * (BLOCK // GROUP) + tl.arange(0, BLOCK // GROUP)
-    tl.store(boxes + axis * groups + g, low.to(tl.float32), mask=g < groups)
-    tl.store(boxes + (3 + axis) * groups + g, high.to(tl.float32), mask=g < groups)
+def _store(at, a, b, c, d, live):
+    store_four(at, a.to(tl.float32), b.to(tl.float32), c.to(tl.float32), d.to(tl.float32), live)
 
 
 @triton.jit
-def _store_factor(record, shape, n, live, count, k, factor):
-    single = (factor * _ROOT).to(tl.float32)
-    tl.store(record + n * RECORD + k, single, mask=live)
-    tl.store(shape + k * count + n, single, mask=live)
+def _weight(weight, n, count, live, k, CHANNELS: tl.constexpr):
+    if k < CHANNELS:
+        return tl.load(weight + k * count + n, mask=live, other=0.0)
+    return tl.zeros(n.shape, tl.float32)
 
 
 @triton.jit
 def _ellipsoid_kernel(
-    position, scale, rotation, weight, table, record, shape, boxes, count, groups, cutoff,
-    CHANNELS: tl.constexpr, BLOCK: tl.constexpr, GROUP: tl.constexpr,
+    position, scale, rotation, weight, table, record, count, cutoff,
+    CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = n < count
@@ -96,44 +109,33 @@ def _ellipsoid_kernel(
         t00, t01, t02, t10, t11, t12, t20, t21, t22,
         a00, a01, a02, a10, a11, a12, a20, a21, a22, s0, s1, s2,
     ) = scaled_whitening(scale, rotation, table, n, live)  # fmt: skip
-    # The triangle of A's QR factors. What is left of y and z across x is kept as vectors: squares subtracted
-    # afterwards would cancel.
-    xx = dot(a00, a10, a20, a00, a10, a20)
-    xy, xz = dot(a00, a10, a20, a01, a11, a21), dot(a00, a10, a20, a02, a12, a22)
-    y0, y1, y2 = a01 - a00 * xy / xx, a11 - a10 * xy / xx, a21 - a20 * xy / xx
-    z0, z1, z2 = a02 - a00 * xz / xx, a12 - a10 * xz / xx, a22 - a20 * xz / xx
-    yy, yz = dot(y0, y1, y2, y0, y1, y2), dot(y0, y1, y2, z0, z1, z2)
-    z0, z1, z2 = z0 - y0 * yz / yy, z1 - y1 * yz / yy, z2 - y2 * yz / yy
-    r11, r22 = tl.sqrt(xx), tl.sqrt(yy)
-    _store_factor(record, shape, n, live, count, 3, r11)
-    _store_factor(record, shape, n, live, count, 4, xy / r11)
-    _store_factor(record, shape, n, live, count, 5, xz / r11)
-    _store_factor(record, shape, n, live, count, 6, r22)
-    _store_factor(record, shape, n, live, count, 7, yz / r22)
-    _store_factor(record, shape, n, live, count, 8, tl.sqrt(dot(z0, z1, z2, z0, z1, z2)))
+    r11, r12, r13, r22, r23, r33, _, _, _, _, _, _, _, _, _ = triangle(
+        a00, a01, a02, a10, a11, a12, a20, a21, a22
+    )
     x = cutoff * _reach(t00, t10, t20, s0, s1, s2) / tl.load(table + 3) + _SLACK
     y = cutoff * _reach(t01, t11, t21, s0, s1, s2) / tl.load(table + 4) + _SLACK
     z = cutoff * _reach(t02, t12, t22, s0, s1, s2) / tl.load(table + 5) + _SLACK
-    cx, cy = _centre(position, table, n, live, 0), _centre(position, table, n, live, 1)
-    _store_axis(record, shape, boxes, n, live, count, groups, 0, cx, x, BLOCK, GROUP)
-    _store_axis(record, shape, boxes, n, live, count, groups, 1, cy, y, BLOCK, GROUP)
-    cz = _centre(position, table, n, live, 2)
-    _store_axis(record, shape, boxes, n, live, count, groups, 2, cz, z, BLOCK, GROUP)
-    for k in tl.static_range(CHANNELS):
-        height = tl.load(weight + k * count + n, mask=live, other=0.0)
-        tl.store(record + n * RECORD + 12 + k, height, mask=live)
+    to = record + n * RECORD
+    cx, cy, cz = (
+        _centre(position, table, n, live, 0), _centre(position, table, n, live, 1),
+        _centre(position, table, n, live, 2),
+    )  # fmt: skip
+    _store(to, cx, cy, cz, r11 * ROOT, live)
+    _store(to + 4, r12 * ROOT, r13 * ROOT, r22 * ROOT, r23 * ROOT, live)
+    _store(to + 8, r33 * ROOT, x, y, z, live)
+    w0, w1 = _weight(weight, n, count, live, 0, CHANNELS), _weight(weight, n, count, live, 1, CHANNELS)
+    w2, w3 = _weight(weight, n, count, live, 2, CHANNELS), _weight(weight, n, count, live, 3, CHANNELS)
+    store_four(to + 12, w0, w1, w2, w3, live)
 
 
-def ellipsoids(position, scale, rotation, weight, table: torch.Tensor, cutoff: float):
-    """``record``, ``shape`` and ``boxes`` of the module docstring."""
-    count, groups = len(position), triton.cdiv(len(position), GROUP)
+def ellipsoids(position, scale, rotation, weight, table: torch.Tensor, cutoff: float) -> torch.Tensor:
+    """``record`` of the module docstring."""
+    count = len(position)
     record = position.new_empty((count, RECORD.value))
-    shape = position.new_empty((9, count))
-    boxes = position.new_empty((6, groups))
     if count:
         with on_device(position):
             _ellipsoid_kernel[(triton.cdiv(count, _BLOCK),)](
-                position, scale, rotation, weight, table, record, shape, boxes, count, groups, cutoff,
-                CHANNELS=len(weight), BLOCK=_BLOCK, GROUP=GROUP, num_warps=4,
+                position, scale, rotation, weight, table, record, count, cutoff,
+                CHANNELS=len(weight), BLOCK=_BLOCK, num_warps=4,
             )  # fmt: skip
-    return record, shape, boxes
+    return record

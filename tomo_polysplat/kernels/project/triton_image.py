@@ -1,0 +1,126 @@
+"""Images as the CUDA kernels lay them out, and the factor of a pixel, sqrt(2 pi) times its ray's length.
+
+Several channels lie side by side, four to a pixel, so that one lane reads or adds all of a pixel at once; a
+single channel lies alone. ``finish_image`` goes from there to (channels, views, rows, columns),
+``lay_out_gradient`` comes back.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import triton  # noqa: TID253 - imported only where a kernel runs
+import triton.language as tl  # noqa: TID253
+
+from tomo_polysplat.kernels.project.triton_setup import VIEW
+from tomo_polysplat.kernels.triton_lanes import load_four, store_four
+from tomo_polysplat.kernels.triton_maths import on_device
+from tomo_polysplat.kernels.views import DetectorViews
+
+__all__ = ["finish_image", "lay_out_gradient", "spread"]
+
+_BLOCK = 256
+_ROOT_TWO_PI = tl.constexpr(math.sqrt(2 * math.pi))
+
+
+def spread(channels: int) -> int:
+    """Floats a pixel takes in the kernels' layout."""
+    return 1 if channels == 1 else 4
+
+
+@triton.jit
+def _factor(views, view, pixel, columns, CONE: tl.constexpr):
+    at = views + view * VIEW
+    d0, d1, d2 = tl.load(at + 14), tl.load(at + 17), tl.load(at + 20)
+    if CONE:
+        row = pixel // columns
+        i, j = row.to(tl.float64), (pixel - row * columns).to(tl.float64)
+        d0 += j * tl.load(at + 12) + i * tl.load(at + 13)
+        d1 += j * tl.load(at + 15) + i * tl.load(at + 16)
+        d2 += j * tl.load(at + 18) + i * tl.load(at + 19)
+    return _ROOT_TWO_PI * tl.sqrt((d0 * d0 + d1 * d1 + d2 * d2).to(tl.float32))
+
+
+@triton.jit
+def _finish_kernel(
+    raw, image, views, area, columns, CHANNELS: tl.constexpr, CONE: tl.constexpr, BLOCK: tl.constexpr
+):
+    view = tl.program_id(1).to(tl.int64)
+    pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = pixel < area
+    pixel = tl.minimum(pixel, area - 1)
+    factor = _factor(views, view, pixel, columns, CONE)
+    at = view * area + pixel
+    plane = tl.num_programs(1).to(tl.int64) * area
+    if CHANNELS == 1:
+        tl.store(image + at, tl.load(raw + at) * factor, mask=live)
+    else:
+        v0, v1, v2, v3 = load_four(raw + 4 * at)
+        tl.store(image + at, v0 * factor, mask=live)
+        tl.store(image + plane + at, v1 * factor, mask=live)
+        if CHANNELS > 2:
+            tl.store(image + 2 * plane + at, v2 * factor, mask=live)
+        if CHANNELS > 3:
+            tl.store(image + 3 * plane + at, v3 * factor, mask=live)
+
+
+def finish_image(raw: torch.Tensor, table: torch.Tensor, channels: int, views: DetectorViews) -> torch.Tensor:
+    """(channels, views, rows, columns) from the kernels' layout, times the factor of the pixel."""
+    image = raw.new_empty((channels, len(views), views.rows, views.columns))
+    area = views.rows * views.columns
+    if area and len(views):
+        with on_device(raw):
+            _finish_kernel[(triton.cdiv(area, _BLOCK), len(views))](
+                raw, image, table, area, views.columns, CHANNELS=channels, CONE=views.cone, BLOCK=_BLOCK,
+                num_warps=4,
+            )  # fmt: skip
+    return image
+
+
+@triton.jit
+def _lay_out_kernel(
+    grad,
+    pixels,
+    views,
+    area,
+    columns,
+    beyond,
+    CHANNELS: tl.constexpr,
+    CONE: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    view = tl.program_id(1).to(tl.int64)
+    pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = pixel < area
+    last = view == tl.num_programs(1) - 1
+    live = pixel < tl.where(last, area + beyond, area)
+    factor = _factor(views, view, pixel, columns, CONE)
+    at = view * area + pixel
+    plane = tl.num_programs(1).to(tl.int64) * area
+    g0 = tl.load(grad + at, mask=inside, other=0.0) * factor
+    if CHANNELS == 1:
+        tl.store(pixels + at, g0, mask=live)
+    else:
+        g1 = tl.load(grad + plane + at, mask=inside, other=0.0) * factor
+        g2, g3 = tl.zeros_like(g0), tl.zeros_like(g0)
+        if CHANNELS > 2:
+            g2 = tl.load(grad + 2 * plane + at, mask=inside, other=0.0) * factor
+        if CHANNELS > 3:
+            g3 = tl.load(grad + 3 * plane + at, mask=inside, other=0.0) * factor
+        store_four(pixels + 4 * at, g0, g1, g2, g3, live)
+
+
+def lay_out_gradient(
+    grad_image: torch.Tensor, table: torch.Tensor, views: DetectorViews, beyond: int
+) -> torch.Tensor:
+    """The gradient times the factor of the pixel in the kernels' layout, and ``beyond`` zero pixels after it."""
+    channels, area = len(grad_image), views.rows * views.columns
+    grad_image = grad_image.contiguous()
+    pixels = grad_image.new_empty((len(views) * area + beyond) * spread(channels))
+    with on_device(grad_image):
+        _lay_out_kernel[(triton.cdiv(area + beyond, _BLOCK), len(views))](
+            grad_image, pixels, table, area, views.columns, beyond, CHANNELS=channels, CONE=views.cone,
+            BLOCK=_BLOCK, num_warps=4,
+        )  # fmt: skip
+    return pixels

@@ -1,0 +1,129 @@
+"""What Triton's language lacks: four numbers moved at once, and the sums of many numbers over a warp.
+
+Each is a line of PTX on the device. Triton's interpreter has no PTX, so there the same is said in Triton.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+
+import torch
+import triton  # noqa: TID253 - imported only where a kernel runs
+import triton.language as tl  # noqa: TID253
+
+__all__ = ["SUMS", "add_four", "adds_four", "half_sums", "lane_set", "load_four", "lowest_lane", "store_four"]
+
+SUMS = tl.constexpr(16)  # tensors that half_sums takes
+# The only switch Triton has; it is read once, when the kernels are defined.
+_INTERPRETED = tl.constexpr(os.environ.get("TRITON_INTERPRET", "0") == "1")
+
+
+@functools.cache
+def adds_four(device: torch.device) -> bool:
+    """Whether the device adds four floats to memory in one instruction (compute capability 9.0)."""
+    return device.type == "cuda" and torch.cuda.get_device_capability(device)[0] >= 9
+
+
+@triton.jit
+def load_four(at):
+    """The four floats at ``at``, which must be 16-byte aligned and written by an earlier kernel."""
+    if _INTERPRETED:
+        return tl.load(at), tl.load(at + 1), tl.load(at + 2), tl.load(at + 3)
+    return tl.inline_asm_elementwise(
+        "ld.global.nc.v4.f32 {$0, $1, $2, $3}, [$4];", "=f,=f,=f,=f,l", [at.to(tl.int64)],
+        dtype=(tl.float32, tl.float32, tl.float32, tl.float32), is_pure=True, pack=1,
+    )  # fmt: skip
+
+
+@triton.jit
+def store_four(at, a, b, c, d, live):
+    """Store four floats at ``at``, 16-byte aligned, where ``live``."""
+    if _INTERPRETED:
+        tl.store(at, a, mask=live)
+        tl.store(at + 1, b, mask=live)
+        tl.store(at + 2, c, mask=live)
+        tl.store(at + 3, d, mask=live)
+    else:
+        tl.inline_asm_elementwise(
+            "{ .reg .pred p; setp.ne.s32 p, $6, 0; @p st.global.v4.f32 [$1], {$2, $3, $4, $5}; mov.u32 $0, 0; }",
+            "=r,l,f,f,f,f,r", [at.to(tl.int64), a, b, c, d, live.to(tl.int32)],
+            dtype=tl.int32, is_pure=False, pack=1,
+        )  # fmt: skip
+
+
+@triton.jit
+def add_four(at, a, b, c, d, live, AT_ONCE: tl.constexpr):
+    """Add four floats atomically to those at ``at``, 16-byte aligned, where ``live``."""
+    if AT_ONCE:
+        tl.inline_asm_elementwise(
+            "{ .reg .pred p; setp.ne.s32 p, $6, 0;"
+            " @p red.relaxed.gpu.global.add.v4.f32 [$1], {$2, $3, $4, $5}; mov.u32 $0, 0; }",
+            "=r,l,f,f,f,f,r", [at.to(tl.int64), a, b, c, d, live.to(tl.int32)],
+            dtype=tl.int32, is_pure=False, pack=1,
+        )  # fmt: skip
+    else:
+        tl.atomic_add(at, a, mask=live, sem="relaxed")
+        tl.atomic_add(at + 1, b, mask=live, sem="relaxed")
+        tl.atomic_add(at + 2, c, mask=live, sem="relaxed")
+        tl.atomic_add(at + 3, d, mask=live, sem="relaxed")
+
+
+def _butterfly() -> str:
+    """PTX that adds up 16 numbers over each half of a warp: lane l gets the sum of number l % 16.
+
+    In every step a lane hands half of its numbers to its partner and takes the partner's share of the other
+    half, so that 15 exchanges do what 64 would do one number at a time.
+    """
+    registers = ", ".join(f"v{k}" for k in range(SUMS.value))
+    lines = [
+        f"{{ .reg .pred p; .reg .b32 lane, bit; .reg .f32 give, keep, {registers}; mov.u32 lane, %laneid;"
+    ]
+    lines += [f"mov.f32 v{k}, ${k + 1};" for k in range(SUMS.value)]
+    for half in (8, 4, 2, 1):
+        lines.append(f"and.b32 bit, lane, {half}; setp.ne.u32 p, bit, 0;")
+        for k in range(half):
+            lines.append(f"selp.f32 give, v{k}, v{k + half}, p; selp.f32 keep, v{k + half}, v{k}, p;")
+            lines.append(f"shfl.sync.bfly.b32 give, give, {half}, 31, -1; add.f32 v{k}, keep, give;")
+    return " ".join([*lines, "mov.f32 $0, v0; }"])
+
+
+_BUTTERFLY = tl.constexpr(_butterfly())
+_BUTTERFLY_TYPES = tl.constexpr("=f" + ",f" * SUMS.value)
+
+
+@triton.jit
+def _half_sums(lane, which, total, k: tl.constexpr, value):
+    return tl.where(
+        (lane % 16 == k) & (lane // 16 == which), tl.sum(tl.where(lane // 16 == which, value, 0.0)), total
+    )
+
+
+@triton.jit
+def half_sums(lane, v0, v1, v2, v3, v4, v5, v6, v7, v8, v9, v10, v11, v12, v13, v14, v15):
+    """In lane l of a one-warp program, the sum of tensor l % 16 of these over the lane's half of the warp."""
+    if _INTERPRETED:
+        values = (v0, v1, v2, v3, v4, v5, v6, v7, v8, v9, v10, v11, v12, v13, v14, v15)
+        total = tl.zeros_like(v0)
+        for k in tl.static_range(16):
+            for which in tl.static_range(2):
+                total = _half_sums(lane, which, total, k, values[k])
+        return total
+    return tl.inline_asm_elementwise(
+        _BUTTERFLY, _BUTTERFLY_TYPES,
+        [v0, v1, v2, v3, v4, v5, v6, v7, v8, v9, v10, v11, v12, v13, v14, v15],
+        dtype=tl.float32, is_pure=False, pack=1,
+    )  # fmt: skip
+
+
+@triton.jit
+def lane_set(hit, lane):
+    """The set of the 32 lanes where ``hit``, as bits of one integer that every lane knows."""
+    return tl.sum(tl.where(hit, 1 << lane, 0), 0).to(tl.int32)
+
+
+@triton.jit
+def lowest_lane(lanes):
+    """The lowest bit set in ``lanes``: the exponent of that power of two as a float."""
+    power = (lanes & -lanes).to(tl.float32)
+    return ((power.to(tl.int32, bitcast=True) >> 23) & 255) - 127
