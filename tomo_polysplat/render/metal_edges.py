@@ -29,14 +29,17 @@ def without_tails(metal: torch.Tensor, share: float) -> torch.Tensor:
     if share <= 0 or not bool((total > 0).any()):
         return metal
     window = tuple(3 if n > 1 else 1 for n in total.shape[1:])
-    margin = tuple(n // 2 for n in window)
+    # Padded beforehand: the pools themselves refuse an axis of two voxels.
+    margin = [n // 2 for n in reversed(window) for _ in range(2)]
 
     def around(volume: torch.Tensor) -> torch.Tensor:
         """Sums over the neighbourhood."""
         count = window[0] * window[1] * window[2]
-        return count * torch.nn.functional.avg_pool3d(volume, window, stride=1, padding=margin)
+        return count * torch.nn.functional.avg_pool3d(
+            torch.nn.functional.pad(volume, margin), window, stride=1
+        )
 
-    peak = torch.nn.functional.max_pool3d(total, window, stride=1, padding=margin)
+    peak = torch.nn.functional.max_pool3d(torch.nn.functional.pad(total, margin), window, stride=1)
     tail = total < share * peak
     body = total.masked_fill(tail, 0.0)
     owner = around(body)
