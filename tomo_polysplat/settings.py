@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
@@ -98,7 +99,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 
-def make_settings(quality: str = "balanced", changes: dict[str, Any] | Settings | None = None) -> Settings:
+def make_settings(quality: str = "balanced", changes: Mapping[str, Any] | Settings | None = None) -> Settings:
     """The settings of a preset with some of them changed by name."""
     if isinstance(changes, Settings):
         return changes
