@@ -100,7 +100,7 @@ def _reference(level: float, polychromatic: bool) -> tuple[float, str]:
         return level or 1.0, "half of the start's mass lies below it"
     factor = 1000.0 ** round(math.log10(level) / 3) if level > 0 else 1.0
     if factor == 1:
-        return 1.0, "water"
+        return 1.0, "water, which the object is about as dense as"
     logger.warning(
         "The object is as dense as %.3g g/cm3 of water: the unit of length looks wrong by a factor of %g.",
         level,

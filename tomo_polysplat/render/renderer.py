@@ -23,7 +23,7 @@ __all__ = [
 
 # Where a volume's Gaussians end so that they hold the same mass as a projected one cut at 3 deviations,
 # 1 - exp(-9/2) of the whole: the solution c of erf(c/sqrt 2) - sqrt(2/pi) c exp(-c^2/2) = 1 - exp(-9/2).
-VOXEL_CUTOFF = 3.3682
+VOXEL_CUTOFF = 3.33424
 # Samples a voxel and axis for thin Gaussians, and how many samples are held at once.
 _SAMPLES, _SLAB = 3, 1 << 25
 

@@ -1,0 +1,103 @@
+"""Losses in closed form."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from tomo_polysplat.fit.loss import misfit, total_variation, weighted_huber, weighted_l1
+from tomo_polysplat.settings import Settings
+
+
+def uneven(seed=0, count=37):
+    generator = torch.Generator().manual_seed(seed)
+    predicted, measured = torch.rand((2, 3, 5, count), generator=generator, dtype=torch.float64)
+    return predicted, measured, torch.rand((3, 5, count), generator=generator, dtype=torch.float64) + 0.1
+
+
+def test_weighted_l1_is_the_weighted_mean_of_absolute_residuals():
+    predicted, measured, weight = uneven()
+    expected = np.average((predicted - measured).abs().numpy(), weights=weight.numpy())
+    assert float(weighted_l1(predicted, measured, weight)) == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_constant_factor_of_all_weights_changes_nothing_for_l1():
+    predicted, measured, weight = uneven()
+    once, thrice = (float(weighted_l1(predicted, measured, k * weight)) for k in (1, 3))
+    assert once == pytest.approx(thrice, rel=1e-12)
+
+
+@pytest.mark.parametrize("loss", [weighted_l1, lambda p, m, w: weighted_huber(p, m, w, 0.1)])
+def test_rays_without_weight_do_not_count(loss):
+    predicted, measured, weight = uneven()
+    weight[1] = 0
+    expected = loss(predicted[[0, 2]], measured[[0, 2]], weight[[0, 2]])
+    predicted[1] = 1e30
+    assert float(loss(predicted, measured, weight)) == pytest.approx(float(expected), rel=1e-12)
+    assert float(loss(predicted, measured, 0 * weight)) == 0
+
+
+def test_huber_is_quadratic_within_the_corner_and_absolute_far_beyond():
+    width, weight = 0.3, torch.tensor([0.5], dtype=torch.float64)
+    corner = width / 0.5
+    zero = torch.zeros(1, dtype=torch.float64)
+    for residual in (0.01, 0.5 * corner, 0.999 * corner):
+        value = float(weighted_huber(zero + residual, zero, weight, width))
+        assert value == pytest.approx(0.5 * (0.5 * residual) ** 2 / width / 0.5, rel=1e-9)
+    far = float(weighted_huber(zero + 1e4, zero, weight, width))
+    assert far == pytest.approx(1e4, rel=1e-4), "the weighted mean of absolute residuals"
+
+
+def test_huber_and_its_slope_are_continuous_at_the_corner():
+    weight, width = torch.tensor([2.0], dtype=torch.float64), 0.3
+    slopes = []
+    for residual in (0.15 - 1e-9, 0.15 + 1e-9):
+        x = torch.tensor([residual], dtype=torch.float64, requires_grad=True)
+        weighted_huber(x, torch.zeros_like(x), weight, width).backward()
+        slopes.append(float(x.grad))
+    assert slopes[0] == pytest.approx(slopes[1], rel=1e-6) == pytest.approx(1.0, rel=1e-6)
+
+
+def test_huber_tends_to_l1_as_its_corner_goes_to_zero():
+    predicted, measured, weight = uneven()
+    sharp = float(weighted_huber(predicted, measured, weight, 1e-9))
+    assert sharp == pytest.approx(float(weighted_l1(predicted, measured, weight)), rel=1e-6)
+
+
+def test_the_settings_choose_the_loss():
+    rays = uneven()
+    corner = Settings().huber_corner * Settings().model_error
+    assert misfit(*rays, Settings(loss="huber")) == weighted_huber(*rays, corner)
+    assert misfit(*rays, Settings(loss="l1")) == weighted_l1(*rays)
+    assert misfit(*rays, Settings(loss="huber")) != misfit(*rays, Settings(loss="l1"))
+
+
+def test_total_variation_of_a_ramp_is_its_slopes():
+    z, y, x = np.meshgrid(np.arange(5), np.arange(7), np.arange(4), indexing="ij")
+    volume = torch.as_tensor(0.5 * z - 0.25 * y + 2.0 * x)
+    assert float(total_variation(volume, 100.0)) == pytest.approx(0.5 + 0.25 + 2.0)
+
+
+def test_total_variation_of_a_cube_is_its_surface():
+    """Faces of (side)^2 over the number of neighbours along each axis: the mean, summed over the axes."""
+    volume = torch.zeros((9, 9, 9), dtype=torch.float64)
+    volume[3:6, 3:6, 3:6] = 0.7
+    assert float(total_variation(volume, 10.0)) == pytest.approx(3 * 0.7 * 2 * 9 / (8 * 9 * 9))
+
+
+def test_total_variation_of_one_slice_leaves_the_missing_axis_out():
+    volume = torch.rand((1, 6, 8), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    stacked = volume.repeat(3, 1, 1)
+    assert float(total_variation(volume, 10.0)) == pytest.approx(float(total_variation(stacked, 10.0)))
+    assert float(total_variation(torch.full((1, 1, 1), 3.0), 10.0)) == 0
+
+
+def test_brightness_above_the_ceiling_is_free():
+    volume = torch.zeros((1, 8, 8), dtype=torch.float64)
+    volume[0, 2:5, 2:5] = 3.0
+    brighter = volume * 100
+    assert float(total_variation(brighter, 2.5)) == pytest.approx(float(total_variation(volume, 2.5)))
+    assert float(total_variation(volume, math.inf)) == pytest.approx(
+        float(total_variation(volume, 2.5)) * 3.0 / 2.5
+    )

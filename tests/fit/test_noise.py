@@ -1,0 +1,61 @@
+"""The exposure read off the data of Poisson scans whose exposure is known."""
+
+import numpy as np
+import pytest
+
+from tomo_polysplat.fit.noise import photons_per_ray
+
+
+def disc(peak, views=40, rows=9, columns=97):
+    """Projections of an ellipsoid with a smooth profile in air; none of it needs resolving."""
+    u = np.linspace(-1.4, 1.4, columns)
+    v = np.linspace(-0.6, 0.6, rows)[:, None]
+    turn = np.linspace(0, np.pi, views, endpoint=False)[:, None, None]
+    across = (u / (1 + 0.2 * np.cos(2 * turn))) ** 2 + v**2
+    return peak * np.sqrt(np.clip(1 - across, 0, None))
+
+
+def poisson(projections, photons, seed=0):
+    counts = np.random.default_rng(seed).poisson(photons * np.exp(-projections))
+    return -np.log(np.maximum(counts, 0.5) / photons).astype(np.float32)
+
+
+@pytest.mark.parametrize("peak", [0.3, 1.5, 3.0])
+@pytest.mark.parametrize("photons", [300.0, 5e3, 1e5])
+def test_the_exposure_of_a_poisson_scan_is_found(photons, peak):
+    found = photons_per_ray(poisson(disc(peak), photons))
+    assert found == pytest.approx(photons, rel=0.15)
+
+
+def test_unusable_rays_do_not_matter():
+    scan = poisson(disc(1.0), 1e4)
+    scan[np.random.default_rng(1).random(scan.shape) < 0.1] = np.nan
+    assert photons_per_ray(scan) == pytest.approx(1e4, rel=0.15)
+
+
+def test_an_order_of_magnitude_in_exposure_is_an_order_of_magnitude_found():
+    low, high = (photons_per_ray(poisson(disc(1.0), n)) for n in (1e3, 1e4))
+    assert high / low == pytest.approx(10, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    "projections",
+    [
+        np.zeros((30, 4, 64), np.float32),
+        np.full((30, 4, 64), 1.5, np.float32),
+        np.broadcast_to(np.arange(64, dtype=np.float32) / 64, (30, 4, 64)),
+        np.where(np.arange(64) % 32 < 16, 0.0, 1.0).astype(np.float32) * np.ones((30, 4, 1), np.float32),
+    ],
+    ids=["air", "flat", "ramp", "blocks"],
+)
+def test_noiseless_data_have_infinitely_many_photons(projections):
+    assert photons_per_ray(projections) == np.inf
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (3, 1, 4), (1, 1, 8), (2, 1, 30)])
+def test_too_few_rays_say_nothing(shape):
+    assert photons_per_ray(np.random.default_rng(0).random(shape).astype(np.float32)) == np.inf
+
+
+def test_nothing_usable_says_nothing():
+    assert photons_per_ray(np.full((20, 4, 64), np.nan, np.float32)) == np.inf

@@ -1,0 +1,150 @@
+"""What is decided from the data, in any unit."""
+
+import logging
+
+import numpy as np
+import pytest
+
+from tomo_polysplat.fit.plan import make_plan, mass_level
+from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.physics.materials import Materials
+from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.settings import Settings
+
+WATER = 0.2  # 1/cm, for monochromatic problems
+
+
+def problem(
+    size=12,
+    factor=1.0,
+    unit="cm",
+    polychromatic=False,
+    planar=False,
+    stretch=(1, 1, 1),
+    pixel=1.0,
+    height=0.0,
+):
+    """A parallel scan of a window of 2 x 2 x 2 ``unit`` times ``factor``; ``pixel`` is in voxels."""
+    angles = np.linspace(0, np.pi, 20, endpoint=False)
+    shape = (1 if planar else size, size, size)
+    half = np.ones(3) if not planar else np.array([1, 1, 1 / size])
+    half = half * np.array(stretch)
+    step = pixel * 2 / size
+    rows, columns = (1 if planar else size), size
+    u = step * np.stack([np.cos(angles), np.sin(angles), 0 * angles], 1)
+    v = step * np.tile([0.0, 0, 1], (20, 1))
+    origin = np.stack([-np.sin(angles), np.cos(angles), 0 * angles], 1)
+    corner = -0.5 * (columns - 1) * u - 0.5 * (rows - 1) * v + [0, 0, height]
+    geometry = Geometry("parallel", origin, corner * factor, u * factor, v * factor, rows, columns)
+    grid = VolumeGrid(shape, -half * factor, half * factor)
+    spectrum = Spectrum.from_tube(90) if polychromatic else None
+    values = np.ones((20, rows, columns), np.float32)
+    return Problem.of(values, geometry, grid, unit, spectrum, Materials() if polychromatic else None)
+
+
+def ball(of, density):
+    z, y, x = np.meshgrid(*(np.linspace(-1, 1, n) if n > 1 else [0.0] for n in of.grid.shape), indexing="ij")
+    return np.where(x**2 + y**2 + z**2 < 0.8, np.float32(density * of.depth), np.float32(0))
+
+
+def plan(of, start, device="cpu", **settings):
+    return make_plan(start, of, Settings(**settings), device)
+
+
+@pytest.mark.parametrize("values", [[1.0, 1, 1, 1, 1], [1.0, 2, 3], [5.0, 1, 1, 1], [0.0, 0, 2, -3]])
+def test_mass_level_halves_the_mass(values):
+    volume = np.array(values, np.float32)
+    level = mass_level(volume)
+    positive = volume[volume > 0]
+    assert positive[positive <= level].sum() >= 0.5 * positive.sum()
+    assert positive[positive < level].sum() < 0.5 * positive.sum()
+
+
+def test_mass_level_of_nothing_is_zero():
+    assert mass_level(np.zeros((3, 3, 3))) == mass_level(-np.ones((3, 3, 3))) == 0
+
+
+def test_mass_level_is_not_moved_by_noise_and_little_metal():
+    rng = np.random.default_rng(0)
+    volume = np.where(rng.random(20000) < 0.4, 1.0, 0.0) + 0.05 * rng.standard_normal(20000)
+    volume[:10] = 100.0
+    assert mass_level(volume) == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("density", [0.05, 0.3, 1.0, 2.0, 20.0])
+def test_anything_near_the_density_of_water_is_measured_by_water(density):
+    of = problem(polychromatic=True)
+    assert plan(of, ball(of, density)).reference == 1.0
+
+
+@pytest.mark.parametrize("wrong", [1e-6, 1e-3, 1e3, 1e6])
+@pytest.mark.parametrize("density", [0.05, 1.0, 20.0])
+def test_lengths_off_by_a_power_of_a_thousand_change_the_reference_alike(wrong, density, caplog):
+    of = problem(polychromatic=True, factor=1 / wrong)
+    with caplog.at_level(logging.WARNING):
+        assert plan(of, ball(of, density * wrong)).reference == pytest.approx(wrong, rel=1e-12)
+    assert "unit of length" in caplog.text
+
+
+def test_a_monochromatic_reference_is_the_object_itself():
+    for factor in (1e-3, 1.0, 1e3):
+        of = problem(factor=factor)
+        assert plan(of, ball(of, WATER / factor)).reference == pytest.approx(WATER / factor, rel=1e-6)
+
+
+@pytest.mark.parametrize("factor", [10.0, 1e-3, 1 / 3, 1e4])
+def test_the_solver_sees_the_same_scan_in_any_unit(factor):
+    one, other = problem(), problem(factor=factor)
+    for name in ("origin", "corner", "u", "v"):
+        assert np.array_equal(getattr(one.geometry, name), getattr(other.geometry, name)), name
+    assert np.array_equal(one.grid.lower, other.grid.lower)
+    assert other.length == pytest.approx(factor * one.length) == pytest.approx(other.depth)
+
+
+def test_depth_is_in_centimetres_where_attenuation_is_tabulated_in_them():
+    assert problem(unit="mm", polychromatic=True).depth == pytest.approx(0.1)
+    assert problem(unit="mm").depth == pytest.approx(1.0)
+
+
+def test_one_row_and_one_slice_in_one_plane_are_planar():
+    assert problem(planar=True).planar and not problem().planar
+    assert not problem(planar=True, height=1.0).planar, "the rays pass beside the slice"
+
+
+def test_seeds_are_no_closer_than_voxels_or_pixels_can_tell():
+    fine = problem()
+    assert plan(fine, ball(fine, 1)).spacing == pytest.approx(1.3)
+    coarse = problem(pixel=2.0)
+    assert plan(coarse, ball(coarse, 1)).spacing == pytest.approx(2.6)
+
+
+@pytest.mark.parametrize("stretch", [(1, 1, 1), (1, 1, 5), (4, 1, 1)])
+def test_the_number_of_seeds_keeps_its_bound_for_any_voxels(stretch):
+    of = problem(stretch=stretch)
+    start = np.full(of.grid.shape, of.depth, np.float32)
+    chosen = plan(of, start, max_gaussians=100)
+    volume = float(np.prod(of.grid.extent))
+    assert volume / (chosen.spacing * of.voxel) ** 3 == pytest.approx(100)
+    assert "100 Gaussians" in chosen.reasons["seed_spacing_voxels"]
+
+
+def test_what_is_asked_for_is_taken_as_it_is():
+    of = problem(planar=True)
+    chosen = plan(of, ball(of, 1), seed_spacing=3.0, views_per_step=7)
+    assert (chosen.spacing, chosen.views_per_step) == (3.0, 7)
+    assert sum("asked for" in reason for reason in chosen.reasons.values()) == 2
+
+
+@pytest.mark.parametrize("polychromatic", [False, True])
+def test_every_decision_has_a_reason(polychromatic):
+    of = problem(planar=True, polychromatic=polychromatic)
+    for decision, words in plan(of, ball(of, 1)).reasons.items():
+        assert len(words.split()) > 3, decision
+
+
+def test_an_empty_start_can_be_planned():
+    for polychromatic in (False, True):
+        of = problem(polychromatic=polychromatic)
+        chosen = plan(of, np.zeros(of.grid.shape, np.float32))
+        assert chosen.reference == 1.0 and chosen.spacing > 0
