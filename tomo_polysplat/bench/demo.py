@@ -26,11 +26,15 @@ __all__ = ["run_demo"]
 
 # Small enough for a laptop's patience, large enough to see.
 _SIZE, _VIEWS = 64, 120
-_PASSES = 7.0
+_PASSES = 5.0
 
 
 def run_demo(
-    folder: Path, *, device: str = "auto", seed: int = 0, progress: Callable[[float, str], Any] = lambda *_: None
+    folder: Path,
+    *,
+    device: str = "auto",
+    seed: int = 0,
+    progress: Callable[[float, str], Any] = lambda *_: None,
 ) -> dict[str, Any]:
     """Reconstruct the scene "pins" with FDK, FDK after a water correction, and mono- and polychromatic splats.
 

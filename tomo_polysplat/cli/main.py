@@ -66,3 +66,7 @@ def build_parser() -> argparse.ArgumentParser:
 def _complain(message: str, code: int) -> int:
     print(f"tomo-polysplat: error: {' '.join(message.split())}", file=sys.stderr)
     return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -6,7 +6,7 @@ import numpy as np
 
 __all__ = ["photons_per_ray"]
 
-_VIEWS = 48
+_VIEWS = 24
 _BINS = 16
 
 

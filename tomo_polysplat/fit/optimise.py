@@ -26,6 +26,8 @@ logger = logging.getLogger(__name__)
 LEAST_U = -0.1
 # A held-out error that falls by less than this share in a pass over the views has stopped falling.
 _IMPROVEMENT = 2e-3
+# Fewer held-out rays in a pass, counted by weight, go up and down by chance.
+_FEWEST_HELD_OUT = 10.0
 
 
 @dataclass
@@ -38,7 +40,7 @@ class FitState:
         Since the reconstruction began.
     iteration, gaussians : int
     loss, held_out : float
-        Mean misfit of the fitted and of the held-out rays over the pass; NaN where no ray was held out.
+        Mean misfit of the fitted and of the held-out rays over the pass; NaN where too few were held out.
     share : float
         Of the run that is done, 0 to 1.
     volume : callable
@@ -81,7 +83,11 @@ class _Pass:
     def read(self) -> tuple[float, float, int]:
         """Mean misfit of the fitted rays and of the held-out ones, and the number of pairs skipped."""
         fitted, held_out, weight, skipped = (float(sum(values)) for values in zip(*self.steps))
-        return fitted / len(self.steps), held_out / weight if weight else math.nan, round(skipped)
+        return (
+            fitted / len(self.steps),
+            held_out / weight if weight >= _FEWEST_HELD_OUT else math.nan,
+            round(skipped),
+        )
 
 
 class _Clock:
@@ -167,7 +173,9 @@ class _Fitter:
                 self.gaussians, self.scene, self.settings, self.rng
             )
         self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
+        # On this thread: autograd's own would be woken and waited for at every step.
+        with torch.autograd.set_multithreading_enabled(False):
+            loss.backward()
         self._hold_materials(share)
         self.optimiser.step()
         with torch.no_grad():

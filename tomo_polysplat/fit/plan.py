@@ -63,7 +63,7 @@ def make_plan(start: np.ndarray, problem: Problem, settings: Settings, device: s
     reference, why = _reference(mass_level(start) / problem.depth, problem.polychromatic)
     support = int((start > settings.support_level * reference * problem.depth).sum())
     spacing, because = _seed_spacing(support, problem, settings, device)
-    views = settings.views_per_step or _views_per_step(problem)
+    views = settings.views_per_step or _views_per_step(problem, device)
     plan = Plan(reference, spacing, views)
     unit = "g/cm3" if problem.polychromatic else "per unit of length"
     plan.reasons = {
@@ -135,6 +135,6 @@ def _finest_spacing(problem: Problem) -> tuple[float, str]:
     return 1.3, "1.3 voxels"
 
 
-def _views_per_step(problem: Problem) -> int:
-    """A step costs little more in two dimensions, where a view is a line."""
-    return min(problem.geometry.views, 4 if problem.planar else 2)
+def _views_per_step(problem: Problem, device: str) -> int:
+    """More where a view is cheap beside a step: in two dimensions it is a line, and a GPU waits for launches."""
+    return min(problem.geometry.views, 4 if problem.planar or device == "cuda" else 2)

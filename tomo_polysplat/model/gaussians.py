@@ -59,11 +59,10 @@ class Gaussians:
         )
 
     def select(self, chosen: torch.Tensor) -> Gaussians:
-        """The Gaussians of an index or mask, still attached to the graph."""
+        """The Gaussians of these (m,) int64 indices, still attached to the graph."""
         whole = {"shared_material": self.shared_material}
-        own = {
-            field.name: getattr(self, field.name)[chosen] for field in fields(self) if field.name not in whole
-        }
+        names = [field.name for field in fields(self) if field.name not in whole]
+        own = {name: getattr(self, name).index_select(0, chosen) for name in names}
         return Gaussians(**own, **whole)
 
     @property
@@ -80,7 +79,9 @@ class Gaussians:
 
     def material(self) -> torch.Tensor:
         """(n,) material numbers u."""
-        return torch.where(self.group < 0, self.own_material, self.shared_material[self.group.clamp(min=0)])
+        # index_select, because the adjoint of indexing adds up equal indices one after the other.
+        shared = self.shared_material.index_select(0, self.group.clamp(min=0))
+        return torch.where(self.group < 0, self.own_material, shared)
 
     def weights(self, curve: torch.Tensor | None) -> torch.Tensor:
         """(3, n) densities of the soft, middle and dense curve, or the (1, n) attenuation without a curve.

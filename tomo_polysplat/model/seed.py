@@ -5,6 +5,7 @@ The grid is twice as fine at metal, whose edges are where an error of position c
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -127,8 +128,11 @@ def _sample(
     cells[3 - len(cell) :] = np.maximum(np.round(cell / grid.voxel_size[: len(cell)]).astype(int), 1)[::-1]
     mean = ndimage.uniform_filter(start, cells, mode="nearest") if cells.max() > 1 else start
     index = _voxel_of(points, grid)
-    around = ndimage.maximum_filter(mean, [min(3, n) for n in mean.shape])
-    return mean[index].astype(np.float64), around[index]
+    around = mean[index]
+    for offset in itertools.product((-1, 0, 1), repeat=3):
+        beside = tuple(np.clip(i + d, 0, n - 1) for i, d, n in zip(index, offset, mean.shape))
+        around = np.maximum(around, mean[beside])
+    return mean[index].astype(np.float64), around
 
 
 def _split(points: np.ndarray, step: np.ndarray) -> np.ndarray:
@@ -143,14 +147,15 @@ def _split(points: np.ndarray, step: np.ndarray) -> np.ndarray:
 def _reaches(
     start: np.ndarray, points: np.ndarray, grid: VolumeGrid, level: float, reach: float
 ) -> np.ndarray:
-    """Points within a distance of a voxel above a level."""
+    """Points within a distance, along every axis, of a voxel above a level."""
     from scipy import ndimage
 
-    above = start > level
-    if not above.any():
+    near = (start > level).astype(np.uint8)
+    if not near.any():
         return np.zeros(len(points), bool)
-    distance = ndimage.distance_transform_edt(~above, sampling=grid.voxel_size[::-1])
-    return distance[_voxel_of(points, grid)] <= reach
+    for axis, size in enumerate(grid.voxel_size[::-1]):
+        near = ndimage.maximum_filter1d(near, 2 * int(reach / size) + 1, axis=axis, mode="nearest")
+    return near[_voxel_of(points, grid)] > 0
 
 
 def _materials(

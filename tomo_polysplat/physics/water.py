@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from tomo_polysplat.checks import require_array
+from tomo_polysplat.parallel import cpu_threads, run_tasks, split_range
 from tomo_polysplat.physics.beer_lambert import projection
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.physics.spectrum import Spectrum
@@ -43,7 +44,13 @@ def water_equivalent(projections: Any, spectrum: Spectrum) -> np.ndarray:
     paths = largest / curve.min() * np.linspace(0.0, 1.0, _TABLE) ** 3
     table = projection(paths[None], log_weights, curve)
     table[0] = 0.0
-    water = np.interp(values, table, paths)
+    water = np.empty_like(values)
+    flat, out = values.reshape(-1), water.reshape(-1)
+
+    def look_up(first: int, last: int) -> None:
+        out[first:last] = np.interp(flat[first:last], table, paths)
+
+    run_tasks(look_up, split_range(flat.size, 4 * cpu_threads()))
     slope = float(curve[0] @ np.exp(log_weights))
     water = np.where(values < 0, values / slope, water)
     return np.where(values == np.inf, np.inf, water)
