@@ -15,6 +15,7 @@ import torch
 from tomo_polysplat.fit.loss import misfit, roughness
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.stopping import Clock, FitState, Watch
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 
@@ -24,42 +25,8 @@ logger = logging.getLogger(__name__)
 
 # Fat and plastics harden a beam less than water does: their curve is the mixture's continued a little below 0.
 LEAST_U = -0.1
-# A held-out error that falls by less than this share in a pass over the views has stopped falling.
-_IMPROVEMENT = 2e-3
 # Fewer held-out rays in a pass, counted by weight, go up and down by chance.
 _FEWEST_HELD_OUT = 10.0
-
-
-@dataclass
-class FitState:
-    """What a callback sees, once a pass over the views.
-
-    Attributes
-    ----------
-    seconds : float
-        Since the reconstruction began.
-    iteration, gaussians : int
-    loss, held_out : float
-        Mean misfit of the fitted and of the held-out rays over the pass; NaN where too few were held out.
-    share : float
-        Of the run that is done, 0 to 1.
-    volume : callable
-        Returns the current volume in 1/unit, shaped like that of the result.
-    """
-
-    seconds: float
-    iteration: int
-    gaussians: int
-    loss: float
-    held_out: float
-    share: float
-    volume: Callable[[], np.ndarray]
-
-    def record(self) -> dict[str, Any]:
-        """The numbers, for the history."""
-        names = ("seconds", "iteration", "loss", "held_out", "gaussians")
-        values = {name: getattr(self, name) for name in names} | {"stage": "fit"}
-        return values | ({"held_out": None} if math.isnan(self.held_out) else {})
 
 
 @dataclass
@@ -88,26 +55,6 @@ class _Pass:
             held_out / weight if weight >= _FEWEST_HELD_OUT else math.nan,
             round(skipped),
         )
-
-
-class _Clock:
-    """How much of a run is done: of its steps or of its time, whichever ends first."""
-
-    def __init__(self, steps: int, deadline: float | None) -> None:
-        self.steps, self.deadline, self.begun, self.done = steps, deadline, time.perf_counter(), 0
-
-    @property
-    def late(self) -> bool:
-        """Whether the deadline has passed."""
-        return self.deadline is not None and time.perf_counter() >= self.deadline
-
-    def share(self) -> float:
-        """From 0 to 1."""
-        if self.deadline is None:
-            return self.done / self.steps
-        if self.late:
-            return 1.0
-        return max(self.done / self.steps, (time.perf_counter() - self.begun) / (self.deadline - self.begun))
 
 
 class _Fitter:
@@ -141,7 +88,7 @@ class _Fitter:
         )
         self.order = np.empty(0, int)
 
-    def passes(self, batch: int, clock: _Clock) -> Iterator[_Pass]:
+    def passes(self, batch: int, clock: Clock) -> Iterator[_Pass]:
         """Step until the clock runs out; what each pass over the views gave, the last perhaps a part of one."""
         steps = max(1, round(len(self.rays.views) / batch))
         record = _Pass()
@@ -233,9 +180,9 @@ def fit(
         logger.warning("The start volume is empty: no Gaussians, a volume of zeros.")
         return FitOutcome(gaussians, reason="nothing to fit: the start volume is empty")
     fitter = _Fitter(gaussians, spacing, rays, scene, settings, rng)
-    outcome, watch = FitOutcome(gaussians), _Watch(settings)
+    outcome, watch = FitOutcome(gaussians), Watch(settings)
     batch = min(views_per_step, len(rays.views))
-    clock = _Clock(max(1, math.ceil(settings.passes * len(rays.views) / batch)), deadline)
+    clock = Clock(max(1, math.ceil(settings.passes * len(rays.views) / batch)), deadline)
     try:
         for record in fitter.passes(batch, clock):
             loss, held_out, skipped = record.read()
@@ -269,30 +216,3 @@ def fit(
 def _is_true(answer: Any) -> bool:
     """Whether a callback said True; whatever else a function happens to return is no answer."""
     return isinstance(answer, (bool, np.bool_)) and bool(answer)
-
-
-class _Watch:
-    """Keeps the best state and says when to stop."""
-
-    def __init__(self, settings: Settings) -> None:
-        self.settings = settings
-        self.best: Gaussians | None = None
-        self.lowest = math.inf
-        self.waited = 0
-
-    def judge(self, state: FitState, gaussians: Gaussians) -> str:
-        """The reason to stop, or nothing."""
-        if not math.isfinite(state.loss):
-            if self.best is None:
-                raise FloatingPointError(
-                    "the fit diverged in its first pass; see the log for rays out of range"
-                )
-            return "the misfit stopped being finite"
-        held_out = math.isfinite(state.held_out)
-        score = state.held_out if held_out else state.loss
-        self.waited = 0 if score < (1 - _IMPROVEMENT) * self.lowest else self.waited + 1
-        if score <= self.lowest:
-            self.lowest, self.best = score, gaussians.copy()
-        if held_out and self.waited >= self.settings.patience:
-            return f"the held-out rays had not improved for {self.waited} passes"
-        return ""

@@ -1,11 +1,12 @@
 """When a run stops, and what it returns."""
 
 import math
+import time
 
 import pytest
 import torch
 
-from tomo_polysplat.fit.optimise import FitState, _Watch
+from tomo_polysplat.fit.stopping import Clock, FitState, Watch
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 
@@ -32,44 +33,44 @@ def best(watch):
 
 
 def test_the_state_with_the_lowest_held_out_error_is_kept():
-    watch = _Watch(Settings(patience=10))
+    watch = Watch(Settings(patience=10))
     assert judge(watch, [5.0, 3.0, 1.0, 2.0, 1.5]) == [""] * 5
     assert best(watch) == 2
 
 
 def test_what_is_kept_is_a_copy():
-    watch, gaussians = _Watch(Settings()), cloud(1)
+    watch, gaussians = Watch(Settings()), cloud(1)
     watch.judge(FitState(0.0, 0, 1, 1.0, 1.0, 0.5, lambda: None), gaussians)
     gaussians.attenuation.fill_(7)
     assert best(watch) == 1
 
 
 def test_a_run_ends_after_as_many_passes_without_improvement():
-    watch = _Watch(Settings(patience=3))
+    watch = Watch(Settings(patience=3))
     answers = judge(watch, [2.0, 1.0, 1.1, 1.2, 1.3])
     assert answers[:4] == [""] * 4 and "3 passes" in answers[4]
     assert best(watch) == 1
 
 
 def test_a_hair_is_no_improvement_but_still_the_best():
-    watch = _Watch(Settings(patience=3))
+    watch = Watch(Settings(patience=3))
     answers = judge(watch, [1.0, 0.9999, 0.9998, 0.9997])
     assert answers[-1] and best(watch) == 3
 
 
 def test_patience_starts_again_with_every_improvement():
-    watch = _Watch(Settings(patience=2))
+    watch = Watch(Settings(patience=2))
     assert not any(judge(watch, [1.0, 1.1, 0.9, 1.0, 0.8, 0.9, 0.7]))
 
 
 def test_without_held_out_rays_the_loss_is_watched_and_nothing_ends_early():
-    watch = _Watch(Settings(patience=1, held_out=0.0))
+    watch = Watch(Settings(patience=1, held_out=0.0))
     assert judge(watch, [(loss, math.nan) for loss in (3.0, 1.0, 2.0, 2.0, 2.0)]) == [""] * 5
     assert best(watch) == 1
 
 
 def test_a_loss_that_is_no_number_ends_the_run_with_what_was_best():
-    watch = _Watch(Settings())
+    watch = Watch(Settings())
     assert "finite" in judge(watch, [2.0, 1.0, (math.nan, math.nan)])[-1]
     assert best(watch) == 1
 
@@ -77,4 +78,22 @@ def test_a_loss_that_is_no_number_ends_the_run_with_what_was_best():
 @pytest.mark.parametrize("loss", [math.nan, math.inf])
 def test_a_run_that_never_was_finite_says_so(loss):
     with pytest.raises(FloatingPointError, match="first pass"):
-        judge(_Watch(Settings()), [(loss, math.nan)])
+        judge(Watch(Settings()), [(loss, math.nan)])
+
+
+def test_a_run_without_a_deadline_is_timed_by_its_steps():
+    clock = Clock(8, None)
+    assert clock.share() == 0 and not clock.late
+    clock.done = 6
+    assert clock.share() == 0.75
+    clock.done = 8
+    assert clock.share() == 1 and not clock.late
+
+
+def test_a_deadline_can_only_shorten_a_run():
+    now = time.perf_counter()
+    assert Clock(8, now - 1).share() == 1 and Clock(8, now - 1).late
+    clock = Clock(8, now + 3600)
+    assert 0 <= clock.share() < 0.01 and not clock.late
+    clock.done = 4
+    assert clock.share() == 0.5

@@ -1,0 +1,63 @@
+"""Scans small enough to be reconstructed in a fraction of a second, each simulated once."""
+
+from functools import cache
+
+import astra
+import numpy as np
+
+import tomo_polysplat as tps
+from tomo_polysplat.scan.geometry import Geometry, from_astra, to_astra
+
+# Two passes over the views: enough to see every part at work.
+QUICK = {"passes": 2.0}
+
+
+@cache
+def fan(metal=True):
+    """Pins (or their metal-free control) in one plane: 40 views of 72 pixels, 48 x 48 voxels."""
+    return tps.simulate_scan("pins", size=48, views=40, geometry="fan", metal=metal)
+
+
+@cache
+def cone(size=24, views=40, metal=False):
+    return tps.simulate_scan("pins", size=size, views=views, metal=metal)
+
+
+def reconstruct(scan, projections=None, proj_geom=None, vol_geom=None, **options):
+    """A quick polychromatic reconstruction; what is not given is the scan's."""
+    options = {"spectrum": scan.spectrum, "unit": scan.unit, "settings": QUICK} | options
+    return tps.reconstruct(
+        scan.projections if projections is None else projections,
+        proj_geom or scan.proj_geom,
+        vol_geom or scan.vol_geom,
+        **options,
+    )
+
+
+def geometries(scan) -> tuple[Geometry, object]:
+    return from_astra(scan.proj_geom, scan.vol_geom)
+
+
+def scaled(scan, factor):
+    """The scan's geometries with every length times ``factor``."""
+    geometry, grid = geometries(scan)
+    return to_astra(geometry.scaled(factor), grid.scaled(factor))
+
+
+def window(vol_geom):
+    """The six numbers of a volume geometry's window."""
+    return [vol_geom["option"][f"Window{end}{axis}"] for axis in "XYZ" for end in ("Min", "Max")]
+
+
+def in_two_dimensions(scan):
+    """Projections (views, columns) and 2D geometries of a scan of one row."""
+    vectors = astra.geom_2vec(scan.proj_geom)["Vectors"]
+    flat = vectors[:, [0, 1, 3, 4, 6, 7]]
+    proj_geom = astra.create_proj_geom("fanflat_vec", scan.columns, np.ascontiguousarray(flat))
+    _, ny, nx = scan.volume_shape
+    return scan.projections[0], proj_geom, astra.create_vol_geom(ny, nx, *window(scan.vol_geom)[:4])
+
+
+def relative(volume, reference):
+    """Largest difference over the largest value."""
+    return float(np.abs(volume - reference).max() / np.abs(reference).max())

@@ -1,0 +1,206 @@
+"""What reconstruct accepts, ignores and refuses."""
+
+import copy
+import logging
+import math
+
+import astra
+import numpy as np
+import pytest
+import torch
+from small_scans import QUICK, fan, in_two_dimensions, reconstruct, relative
+
+import tomo_polysplat as tps
+
+
+@pytest.fixture(scope="module")
+def expected():
+    return reconstruct(fan())
+
+
+def as_big_endian(array):
+    return array.astype(">f4")
+
+
+def as_fortran(array):
+    return np.asfortranarray(array)
+
+
+def as_strided(array):
+    return np.repeat(array, 2, axis=2)[..., ::2]
+
+
+def as_torch(array):
+    return torch.from_numpy(array.copy())
+
+
+@pytest.mark.parametrize(
+    "change", [np.float64, as_big_endian, as_fortran, as_strided, as_torch, np.ndarray.tolist]
+)
+def test_the_form_of_an_array_does_not_matter(expected, change):
+    scan = fan()
+    assert np.array_equal(reconstruct(scan, change(scan.projections)).volume, expected.volume)
+
+
+def test_half_precision_is_what_it_says():
+    half = fan().projections.astype(np.float16)
+    pair = [reconstruct(fan(), p).volume for p in (half, half.astype(np.float32))]
+    assert np.array_equal(*pair)
+
+
+def test_nothing_handed_over_is_written_to(expected):
+    scan = fan()
+    projections, valid = scan.projections.copy(), np.ones(scan.projections.shape, bool)
+    projections[0, 3, 4:9], valid[0, 5] = np.nan, False
+    before = projections.copy(), copy.deepcopy((scan.proj_geom, scan.vol_geom))
+    projections.flags.writeable = valid.flags.writeable = False
+    reconstruct(scan, projections, valid=valid)
+    assert np.array_equal(projections, before[0], equal_nan=True)
+    for now, then in zip((scan.proj_geom, scan.vol_geom), before[1]):
+        assert set(now) == set(then) and all(np.all(now[key] == then[key]) for key in now)
+
+
+def spoilt():
+    scan = fan()
+    bad = np.zeros(scan.projections.shape, bool)
+    bad[0, 4, 20:24] = bad[0, 11] = bad[0, :, 60] = True
+    return scan, bad
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30, -1e6])
+def test_rays_that_say_nothing_are_ignored_and_counted(value):
+    """Whatever they hold, and however they are marked."""
+    scan, bad = spoilt()
+    marked = reconstruct(scan, np.where(bad, 7.0, scan.projections), valid=~bad)
+    held = reconstruct(scan, np.where(bad, np.float32(value), scan.projections))
+    assert np.array_equal(marked.volume, held.volume)
+    kind = "rays_out_of_range" if math.isfinite(value) else "rays_not_finite"
+    assert held.counts[kind] == marked.counts["rays_marked_invalid"] == bad.sum()
+    assert marked.counts["rays_not_finite"] == marked.counts["rays_out_of_range"] == 0
+
+
+def test_ignored_rays_cost_little(expected):
+    scan, bad = spoilt()
+    result = reconstruct(scan, np.where(bad, np.nan, scan.projections))
+    soft = (scan.truth > 0.1) & (scan.truth < 0.5)
+    assert np.abs(result.volume - expected.volume)[soft].mean() < 0.1 * scan.truth[soft].mean()
+
+
+def test_a_masked_array_masks():
+    scan, bad = spoilt()
+    masked = np.ma.MaskedArray(np.where(bad, np.float32(3.0), scan.projections), bad)
+    result = reconstruct(scan, masked)
+    assert result.counts["rays_marked_invalid"] == bad.sum()
+    assert np.array_equal(result.volume, reconstruct(scan, scan.projections, valid=~bad).volume)
+
+
+@pytest.mark.parametrize("polychromatic", [True, False])
+@pytest.mark.parametrize("value", [0.0, -0.5])
+def test_a_scan_of_nothing_is_a_volume_of_nothing(polychromatic, value, caplog, recwarn):
+    scan = fan()
+    with caplog.at_level(logging.WARNING):
+        result = reconstruct(
+            scan,
+            np.zeros_like(scan.projections) + np.float32(value) * (scan.projections > 0.5),
+            spectrum=scan.spectrum if polychromatic else None,
+        )
+    assert np.isfinite(result.volume).all() and np.abs(result.volume).max() < 0.03
+    assert not [w for w in recwarn if issubclass(w.category, RuntimeWarning)]
+    if value == 0:
+        assert not result.volume.any() and result.counts["gaussians"] == 0
+        assert "empty" in caplog.text and "empty" in result.plan["stop"]
+
+
+@pytest.mark.parametrize("views", [1, 2, 3])
+@pytest.mark.parametrize("flat", [True, False], ids=["2D", "3D"])
+def test_a_few_views_are_explained_though_not_enough(views, flat):
+    scan = fan(False)
+    chosen = np.linspace(0, 25, views).astype(int)
+    projections, proj_geom, vol_geom = in_two_dimensions(scan)
+    if flat:
+        part = projections[chosen]
+    else:
+        part, proj_geom, vol_geom = scan.projections[:, chosen], astra.geom_2vec(scan.proj_geom), None
+    proj_geom = proj_geom | {"Vectors": proj_geom["Vectors"][chosen]}
+    result = reconstruct(scan, part, proj_geom, vol_geom, settings={"passes": 30.0})
+    assert np.isfinite(result.volume).all()
+    first, last = result.history[0]["loss"], result.history[-1]["loss"]
+    assert last < 0.5 * first
+
+
+@pytest.mark.parametrize("columns", [1, 3])
+def test_a_detector_of_a_few_pixels_does_not_fail(columns):
+    scan = fan(False)
+    low = (scan.columns - columns) // 2
+    vectors = astra.geom_2vec(scan.proj_geom)["Vectors"]
+    proj_geom = astra.create_proj_geom("cone_vec", 1, columns, vectors)
+    result = reconstruct(scan, scan.projections[..., low : low + columns], proj_geom)
+    assert np.isfinite(result.volume).all() and result.volume.max() > 0.05
+
+
+REFUSED = {
+    "all NaN": (lambda s: {"projections": s.projections * np.nan}, ValueError, "projections.*usable ray"),
+    "nothing valid": (lambda s: {"valid": s.projections < -9}, ValueError, "projections.*usable ray"),
+    "intensities": (lambda s: {"projections": s.projections + 3e4}, ValueError, "not intensities"),
+    "axes swapped": (
+        lambda s: {"projections": s.projections.swapaxes(0, 1)},
+        ValueError,
+        "projections: expected shape",
+    ),
+    "no numbers": (lambda s: {"projections": np.full(s.projections.shape, "x")}, TypeError, "real numbers"),
+    "complex": (lambda s: {"projections": s.projections + 0j}, TypeError, "real numbers"),
+    "mask of another shape": (lambda s: {"valid": np.ones((3, 4))}, ValueError, "valid: expected shape"),
+    "unknown unit": (lambda s: {"unit": "inch"}, ValueError, "unit: expected one of m, cm, mm, um, pixel"),
+    "pixels with a spectrum": (lambda s: {"unit": "pixel"}, ValueError, "unit: .*real lengths"),
+    "unknown quality": (lambda s: {"quality": "superb"}, ValueError, "quality: expected one of fast"),
+    "unknown setting": (lambda s: {"settings": {"pases": 3}}, ValueError, "settings: .*passes.*'pases'"),
+    "unknown kernel": (lambda s: {"settings": {"kernel": "magic"}}, ValueError, "kernel: expected auto"),
+    "unknown device": (lambda s: {"device": "abacus"}, ValueError, "device: expected auto, cpu, cuda"),
+    "other device": (lambda s: {"device": "meta"}, ValueError, "device: expected auto, cpu, cuda"),
+    "absent device": (lambda s: {"device": "cuda:99"}, ValueError, "device: .*'cuda:99'"),
+    "no time": (lambda s: {"time_budget": 0}, ValueError, "time_budget: .*> 0"),
+    "time in words": (lambda s: {"time_budget": "long"}, TypeError, "time_budget: expected a number"),
+    "negative seed": (lambda s: {"seed": -1}, ValueError, "seed: .*>= 0"),
+    "half a seed": (lambda s: {"seed": 0.5}, ValueError, "seed: expected a whole number"),
+    "no function": (lambda s: {"callbacks": [3]}, TypeError, "callbacks: expected functions"),
+    "two materials": (lambda s: {"materials": ("water", "iron")}, (ValueError, TypeError), "material"),
+    "no geometry": (lambda s: {"proj_geom": {"type": "spiral"}}, ValueError, "proj_geom type"),
+    "two dimensions of volume": (
+        lambda s: {"vol_geom": astra.create_vol_geom(48, 48)},
+        ValueError,
+        "vol_geom: expected a 3D one",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_does_not_fit_is_refused_with_its_name(case):
+    make, error, words = REFUSED[case]
+    scan = fan()
+    threads = torch.get_num_threads()
+    with pytest.raises(error, match=words):
+        reconstruct(scan, **make(scan))
+    assert torch.get_num_threads() == threads
+
+
+def test_one_function_is_a_callback_too():
+    seen = []
+    reconstruct(fan(), callbacks=seen.append)
+    assert len(seen) == 2
+
+
+def test_settings_can_be_an_object():
+    from tomo_polysplat.settings import Settings
+
+    named = reconstruct(fan(), settings=QUICK | {"seed_spacing": 2.0})
+    whole = reconstruct(fan(), settings=Settings(passes=2.0, seed_spacing=2.0))
+    assert np.array_equal(named.volume, whole.volume)
+    assert named.settings["seed_spacing"] == 2.0 and "asked for" in named.plan["seed_spacing_voxels"]
+
+
+def test_materials_are_a_choice(expected):
+    named = reconstruct(fan(), materials=("water", "aluminium", "iron"))
+    assert np.array_equal(named.volume, expected.volume)
+    titanium = reconstruct(fan(), materials=tps.Materials(dense="titanium"))
+    assert relative(titanium.volume, expected.volume) > 1e-3
+    assert "titanium" in str(titanium.materials)

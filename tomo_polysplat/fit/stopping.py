@@ -1,0 +1,98 @@
+"""When a run ends, and which of its states is kept."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.settings import Settings
+
+__all__ = ["Clock", "FitState", "Watch"]
+
+# A held-out error that falls by less than this share in a pass over the views has stopped falling.
+_IMPROVEMENT = 2e-3
+
+
+@dataclass
+class FitState:
+    """What a callback sees, once a pass over the views.
+
+    Attributes
+    ----------
+    seconds : float
+        Since the reconstruction began.
+    iteration, gaussians : int
+    loss, held_out : float
+        Mean misfit of the fitted and of the held-out rays over the pass; NaN where too few were held out.
+    share : float
+        Of the run that is done, 0 to 1.
+    volume : callable
+        Returns the current volume in 1/unit, shaped like that of the result.
+    """
+
+    seconds: float
+    iteration: int
+    gaussians: int
+    loss: float
+    held_out: float
+    share: float
+    volume: Callable[[], np.ndarray]
+
+    def record(self) -> dict[str, Any]:
+        """The numbers, for the history."""
+        names = ("seconds", "iteration", "loss", "held_out", "gaussians")
+        values = {name: getattr(self, name) for name in names} | {"stage": "fit"}
+        return values | ({"held_out": None} if math.isnan(self.held_out) else {})
+
+
+class Clock:
+    """How much of a run is done: of its steps or of its time, whichever ends first."""
+
+    def __init__(self, steps: int, deadline: float | None) -> None:
+        self.steps, self.deadline, self.begun, self.done = steps, deadline, time.perf_counter(), 0
+
+    @property
+    def late(self) -> bool:
+        """Whether the deadline has passed."""
+        return self.deadline is not None and time.perf_counter() >= self.deadline
+
+    def share(self) -> float:
+        """From 0 to 1."""
+        if self.deadline is None:
+            return self.done / self.steps
+        if self.late:
+            return 1.0
+        return max(self.done / self.steps, (time.perf_counter() - self.begun) / (self.deadline - self.begun))
+
+
+class Watch:
+    """Keeps the best state and says when to stop."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.best: Gaussians | None = None
+        self.lowest = math.inf
+        self.waited = 0
+
+    def judge(self, state: FitState, gaussians: Gaussians) -> str:
+        """The reason to stop, or nothing."""
+        if not math.isfinite(state.loss):
+            if self.best is None:
+                raise FloatingPointError(
+                    "the fit diverged in its first pass; see the log for rays out of range"
+                )
+            return "the misfit stopped being finite"
+        held_out = math.isfinite(state.held_out)
+        score = state.held_out if held_out else state.loss
+        self.waited = 0 if score < (1 - _IMPROVEMENT) * self.lowest else self.waited + 1
+        if score <= self.lowest:
+            self.lowest, self.best = score, gaussians.copy()
+        if held_out and self.waited >= self.settings.patience:
+            return f"the held-out rays had not improved for {self.waited} passes"
+        return ""
