@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import functools
 import logging
-from typing import Any
 
 import numpy as np
 import torch
@@ -93,8 +92,10 @@ def _self_check(name: str, device_type: str) -> float:
     target = torch.rand((3, 1, 9, 13), generator=generator)
     outcomes = []
     for kernel, device, dtype in (("reference", "cpu", torch.float64), (name, device_type, torch.float32)):
-        inputs: Any = [t.to(device, dtype).requires_grad_() for t in scene]
-        image, _ = project(*inputs, views, kernel=kernel, cutoff=3.0)
+        inputs = [t.to(device, dtype).requires_grad_() for t in scene]
+        position, scale, rotation, weight = inputs
+        image, _ = project(position, scale, rotation, weight, views, kernel=kernel, cutoff=3.0)
         (image * target.to(device, dtype)).sum().backward()
-        outcomes.append([t.detach().cpu().double() for t in (image, *(t.grad for t in inputs))])
+        results = [image, *(t.grad for t in inputs if t.grad is not None)]
+        outcomes.append([t.detach().cpu().double() for t in results])
     return max(float((a - b).norm() / a.norm()) for a, b in zip(*outcomes))

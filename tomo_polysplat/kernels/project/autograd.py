@@ -45,8 +45,9 @@ class _NumbaProject(torch.autograd.Function):
     def forward(ctx, position, scale, rotation, weight, views, cutoff):
         from tomo_polysplat.kernels.project import numba_kernel
 
-        arrays: Any = [t.detach().contiguous().numpy() for t in (position, scale, rotation, weight)]
-        image, skipped, state = numba_kernel.forward(*arrays, views, cutoff)
+        arrays = [t.detach().contiguous().numpy() for t in (position, scale, rotation, weight)]
+        position, scale, rotation, weight = arrays
+        image, skipped, state = numba_kernel.forward(position, scale, rotation, weight, views, cutoff)
         ctx.arrays, ctx.views, ctx.cutoff, ctx.state = arrays, views, cutoff, state
         return torch.from_numpy(image), skipped
 
@@ -54,5 +55,8 @@ class _NumbaProject(torch.autograd.Function):
     def backward(ctx, grad_image, _):
         from tomo_polysplat.kernels.project import numba_kernel
 
-        grads = numba_kernel.backward(*ctx.arrays, ctx.views, ctx.cutoff, ctx.state, grad_image.numpy())
+        position, scale, rotation, weight = ctx.arrays
+        grads = numba_kernel.backward(
+            position, scale, rotation, weight, ctx.views, ctx.cutoff, ctx.state, grad_image.numpy()
+        )
         return (*map(torch.from_numpy, grads), None, None)

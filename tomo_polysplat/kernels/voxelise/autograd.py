@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 
 from tomo_polysplat.kernels.voxelise import reference
@@ -40,13 +38,17 @@ class _NumbaVoxelise(torch.autograd.Function):
     def forward(ctx, position, scale, rotation, weight, box, cutoff):
         from tomo_polysplat.kernels.voxelise import numba_kernel
 
-        arrays: Any = [t.detach().contiguous().numpy() for t in (position, scale, rotation, weight)]
+        arrays = [t.detach().contiguous().numpy() for t in (position, scale, rotation, weight)]
+        position, scale, rotation, weight = arrays
         ctx.arrays, ctx.box, ctx.cutoff = arrays, box, cutoff
-        return torch.from_numpy(numba_kernel.forward(*arrays, box, cutoff))
+        return torch.from_numpy(numba_kernel.forward(position, scale, rotation, weight, box, cutoff))
 
     @staticmethod
     def backward(ctx, grad_volume):
         from tomo_polysplat.kernels.voxelise import numba_kernel
 
-        grads = numba_kernel.backward(*ctx.arrays, ctx.box, ctx.cutoff, grad_volume.numpy())
+        position, scale, rotation, weight = ctx.arrays
+        grads = numba_kernel.backward(
+            position, scale, rotation, weight, ctx.box, ctx.cutoff, grad_volume.numpy()
+        )
         return (*map(torch.from_numpy, grads), None, None)
