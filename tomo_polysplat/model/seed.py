@@ -154,7 +154,9 @@ def _reaches(
     if not near.any():
         return np.zeros(len(points), bool)
     for axis, size in enumerate(grid.voxel_size[::-1]):
-        near = ndimage.maximum_filter1d(near, 2 * int(reach / size) + 1, axis=axis, mode="nearest")
+        # A whole number of voxels must not lose one to rounding.
+        voxels = int(reach / size + 1e-6)
+        near = ndimage.maximum_filter1d(near, 2 * voxels + 1, axis=axis, mode="nearest")
     return near[_voxel_of(points, grid)] > 0
 
 
