@@ -8,8 +8,8 @@ import numpy as np
 import tomo_polysplat as tps
 from tomo_polysplat.scan.geometry import Geometry, from_astra, to_astra
 
-# Two passes over the views: enough to see every part at work.
-QUICK = {"passes": 2.0}
+# Two passes over the views in a few steps: enough to see every part at work.
+QUICK = {"passes": 2.0, "views_per_step": 8}
 
 
 @cache
