@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from tomo_polysplat.checks import fail, require_array, require_choice, require_number, require_shape
+from tomo_polysplat.checks import fail, require_array, require_number, require_shape
 from tomo_polysplat.fit.optimise import FitOutcome, FitState, fit
 from tomo_polysplat.fit.plan import Plan, make_plan
 from tomo_polysplat.fit.problem import Problem
@@ -28,7 +28,6 @@ from tomo_polysplat.scan.geometry import (
     projections_from_astra,
 )
 from tomo_polysplat.settings import Settings, make_settings
-from tomo_polysplat.units import LENGTH_UNITS, cm_per
 
 __all__ = ["reconstruct"]
 
@@ -101,18 +100,15 @@ def reconstruct(
     chosen = make_settings(quality, settings)
     deadline = None if time_budget is None else started + require_number("time_budget", time_budget, above=0)
     rng, target, callbacks = _generator(seed), pick_device(device), _functions(callbacks)
-    polychromatic = spectrum is not None and not spectrum.is_monochromatic
-    curves = Materials.of(materials) if polychromatic else None
-    require_choice("unit", unit, LENGTH_UNITS)
     geometry, grid = from_astra(proj_geom, vol_geom)
     values, counts = _usable(projections, proj_geom, valid)
-    problem = Problem.of(values, geometry, grid, unit, spectrum if polychromatic else None, curves)
+    problem = Problem.of(values, geometry, grid, unit, spectrum, materials)
     flipped = is_planar_geometry(proj_geom)
     with one_torch_thread(target), progress_reports(progress) as report:
         report(0.0, "start volume")
-        start, about = problem.start_volume(target)
+        start, why = problem.start_volume(target)
         plan = make_plan(start, problem, chosen, target.type)
-        plan.reasons["start"] = f"{about['method'].upper()}: {about['reason']}"
+        plan.reasons["start"] = why
         scene, rays = problem.scene(plan, chosen, target), problem.rays(plan, chosen, target)
         outcome = fit(
             problem.seeds(start, plan, chosen, target),
@@ -124,27 +120,19 @@ def reconstruct(
             rng=rng,
             started=started,
             deadline=deadline,
-            volume=_volume_of(scene, plan, curves, spectrum, unit, flipped),
-            callbacks=[
-                lambda state: report(state.share, f"held-out error {state.held_out:.2e}"),
-                *callbacks,
-            ],
+            volume=_volume_of(scene, plan, problem, flipped),
+            callbacks=[lambda state: report(state.share, state.describe()), *callbacks],
         )
         report(1.0, "volume")
         plan.reasons["stop"] = outcome.reason
-        result = _result(
-            outcome,
-            scene,
-            grid,
-            problem,
-            plan,
-            unit=unit,
-            energy_kev=None if spectrum is None else spectrum.effective_energy,
-            spectrum=spectrum,
-            counts=counts | _counts(outcome),
-            settings=chosen.to_dict() | {"seed": seed, "quality": quality},
-            flipped_2d=flipped,
-        )
+        about = {
+            "unit": unit,
+            "spectrum": spectrum,
+            "flipped_2d": flipped,
+            "counts": counts | _counts(outcome),
+        }
+        result = _result(outcome, scene, grid, problem, plan, **about)
+    result.settings = chosen.to_dict() | {"seed": seed, "quality": quality}
     result.seconds = time.perf_counter() - started
     logger.info("Reconstructed in %.1f s: %s; %s", result.seconds, outcome.reason, result.counts)
     return result
@@ -192,17 +180,10 @@ def _usable(projections: Any, proj_geom: Mapping[str, Any], valid: Any) -> tuple
 
 
 def _volume_of(
-    scene: FitScene,
-    plan: Plan,
-    curves: Materials | None,
-    spectrum: Spectrum | None,
-    unit: str,
-    flipped: bool,
+    scene: FitScene, plan: Plan, problem: Problem, flipped: bool
 ) -> Callable[[Gaussians], np.ndarray]:
     """A function from Gaussians to the volume in 1/unit, for callbacks."""
-    factor = plan.reference
-    if curves is not None and spectrum is not None:
-        factor *= float(curves.mass_attenuation([spectrum.effective_energy])[0, 0]) * cm_per(unit)
+    factor = plan.reference * problem.soft_attenuation()
 
     def volume(gaussians: Gaussians) -> np.ndarray:
         with torch.no_grad():
@@ -240,6 +221,7 @@ def _result(
     return Result(
         basis,
         grid,
+        energy_kev=None if about["spectrum"] is None else about["spectrum"].effective_energy,
         materials=problem.materials,
         gaussians=parts,
         history=outcome.history,

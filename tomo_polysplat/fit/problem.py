@@ -6,12 +6,14 @@ the first reconstruction on happens in them, so that no choice, and not even rou
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 
+from tomo_polysplat.checks import require_choice
 from tomo_polysplat.fit.noise import photons_per_ray
 from tomo_polysplat.fit.plan import Plan
 from tomo_polysplat.fit.rays import Rays
@@ -27,7 +29,7 @@ from tomo_polysplat.render.renderer import detector_views, voxel_box
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.initial import initial_volume
-from tomo_polysplat.units import cm_per
+from tomo_polysplat.units import LENGTH_UNITS, cm_per
 
 __all__ = ["Problem"]
 
@@ -76,9 +78,13 @@ class Problem:
         grid: VolumeGrid,
         unit: str,
         spectrum: Spectrum | None,
-        materials: Materials | None,
+        materials: Materials | Sequence[Any] | None,
     ) -> Problem:
-        """The problem of a scan in the caller's unit."""
+        """The problem of a scan in the caller's unit; a spectrum of one energy makes it monochromatic."""
+        require_choice("unit", unit, LENGTH_UNITS)
+        if spectrum is not None and spectrum.is_monochromatic:
+            spectrum = None
+        curves = None if spectrum is None else Materials.of(materials)
         planar = geometry.planar and grid.planar
         # A plane beside the slice is another plane.
         planar = planar and bool(grid.lower[2] <= geometry.corner[0, 2] <= grid.upper[2])
@@ -86,7 +92,7 @@ class Problem:
         depth = length if spectrum is None else length * cm_per(unit)
         inside = _snapped_grid(grid.normalised(grid.centre, length))
         outside = _snapped_geometry(geometry.normalised(grid.centre, length))
-        return cls(projections, outside, inside, grid.centre, length, depth, planar, spectrum, materials)
+        return cls(projections, outside, inside, grid.centre, length, depth, planar, spectrum, curves)
 
     @property
     def polychromatic(self) -> bool:
@@ -98,12 +104,20 @@ class Problem:
         """Shortest edge of a voxel, in the solver's coordinates."""
         return float(self.grid.voxel_size[: 2 if self.planar else 3].min())
 
-    def start_volume(self, device: torch.device) -> tuple[np.ndarray, dict[str, Any]]:
-        """First reconstruction and what was done: ``depth`` times g/cm3 of water, or times an attenuation."""
+    def soft_attenuation(self) -> float:
+        """Attenuation in 1/unit of a density of 1 at the volume's energy; 1 for a monochromatic model."""
+        if self.spectrum is None or self.materials is None:
+            return 1.0
+        per_gram = self.materials.mass_attenuation([self.spectrum.effective_energy])[0, 0]
+        return float(per_gram) * self.depth / self.length
+
+    def start_volume(self, device: torch.device) -> tuple[np.ndarray, str]:
+        """First reconstruction, ``depth`` times g/cm3 of water or times an attenuation, and how it was made."""
         values = self.projections
         if self.spectrum is not None:
             values = water_equivalent(values, self.spectrum).astype(np.float32)
-        return initial_volume(values, self.geometry, self.grid, device=device.type)
+        volume, done = initial_volume(values, self.geometry, self.grid, device=device.type)
+        return volume, f"{done['method'].upper()}: {done['reason']}"
 
     def scene(self, plan: Plan, settings: Settings, device: torch.device) -> FitScene:
         """The forward model."""

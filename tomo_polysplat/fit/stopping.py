@@ -44,6 +44,12 @@ class FitState:
     share: float
     volume: Callable[[], np.ndarray]
 
+    def describe(self) -> str:
+        """A few words for a progress bar."""
+        if math.isnan(self.held_out):
+            return f"error {self.loss:.2e}"
+        return f"held-out error {self.held_out:.2e}"
+
     def record(self) -> dict[str, Any]:
         """The numbers, for the history."""
         names = ("seconds", "iteration", "loss", "held_out", "gaussians")
