@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
-from tomo_polysplat.checks import fail, require_choice
+from tomo_polysplat.checks import fail, require_choice, require_number
 
 __all__ = ["PRESETS", "Settings", "make_settings"]
 
@@ -86,6 +86,20 @@ class Settings:
     """Nodes of the spectrum; 0 takes as few as keep the error of P small."""
     kernel: str = "auto"
     """"auto", "triton", "numba" or "reference"."""
+
+    def __post_init__(self) -> None:
+        require_choice("settings['loss']", self.loss, ("huber", "weighted-l1", "l1"))
+        for field in fields(self):
+            name, value = f"settings[{field.name!r}]", getattr(self, field.name)
+            if isinstance(field.default, str):
+                continue
+            # Material numbers reach a little below the first curve.
+            number = require_number(name, value, at_least=-1.0 if field.name.endswith("_u") else 0.0)
+            if isinstance(field.default, int):
+                if number != int(number):
+                    raise fail(name, "a whole number", repr(value))
+                object.__setattr__(self, field.name, int(number))
+        require_number("settings['held_out']", self.held_out, at_most=0.5)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values by name."""
