@@ -26,7 +26,7 @@ __all__ = ["run_demo"]
 
 # Small enough for a laptop's patience, large enough to see.
 _SIZE, _VIEWS = 64, 120
-_PASSES = 5.0
+_SETTINGS = {"passes": 4.0, "max_gaussians": 30_000}
 
 
 def run_demo(
@@ -68,7 +68,7 @@ def run_demo(
             unit=scan.unit,
             seed=seed,
             device=device,
-            settings={"passes": _PASSES},
+            settings=_SETTINGS,
             progress=lambda share, _: progress(first + share * (last - first), words),
         )
 
