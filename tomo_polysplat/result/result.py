@@ -43,7 +43,7 @@ class Result:
         The spectrum of the model.
     gaussians : mapping of arrays
         ``position`` (n, 3) and ``scale`` (n, 3) in `unit`, ``rotation`` (n, 4) unit quaternions (w, x, y, z),
-        ``density`` (n,) in g/cm3 (1/`unit` when monochromatic), ``u`` (n,) material in [0, 1].
+        ``density`` (n,) in g/cm3 (1/`unit` when monochromatic), ``u`` (n,) material, -0.1 to 1.
     history : list of dict
         ``seconds``, ``iteration``, ``loss``, ``held_out``, ``gaussians``, ``stage``: speed against error.
     plan, counts, settings : dict
