@@ -46,13 +46,13 @@ def seed_gaussians(
     """
     dims = 2 if planar else 3
     start = _sharpened(start, settings.metal_level)
-    points, step, value = _lattices(start, grid, spacing, dims, settings)
+    points, size, cell, value = _lattices(start, grid, spacing, dims, settings)
     reach = settings.free_radius * float(grid.voxel_size[:dims].min())
     own, shared, group = _materials(start, points, value, grid, reach, settings, polychromatic)
-    # A lattice of Gaussians of this height averages to the wanted value: the cell's integral over the
-    # Gaussian's.
-    width = settings.seed_width
-    attenuation = value / (math.sqrt(2 * math.pi) * width) ** dims
+    # Round, whatever the cell: thinner than the rays are apart, a Gaussian would be held by none. At this
+    # height a lattice of them averages to the wanted value: the cell's integral over the Gaussian's.
+    width = settings.seed_width * size
+    attenuation = value * cell / (math.sqrt(2 * math.pi) * width) ** dims
 
     def tensor(array: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32, device=device)
@@ -61,7 +61,7 @@ def seed_gaussians(
     rotation[:, 0] = 1.0
     gaussians = Gaussians(
         tensor(points),
-        tensor(np.log(width * step)),
+        tensor(np.repeat(np.log(width)[:, None], dims, axis=1)),
         tensor(rotation),
         tensor(attenuation),
         tensor(own),
@@ -93,18 +93,19 @@ def _sharpened(start: np.ndarray, level: float) -> np.ndarray:
 
 def _lattices(
     start: np.ndarray, grid: VolumeGrid, spacing: float, dims: int, settings: Settings
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points (n, 3) on the support, the lattice's steps (n, dims) and the start's mean over the cell of each."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Points (n, 3) on the support; spacing, volume of the cell and the start's mean over it, (n,) each."""
     coarse, step = _lattice(grid, spacing, dims)
     metal = _reaches(start, coarse, grid, settings.metal_level, spacing)
     parts = []
-    for points, cell in ((coarse[~metal], step), (_split(coarse[metal], step), step / 2)):
-        value, nearby = _sample(start, points, grid, cell)
+    for points, share in ((coarse[~metal], 1.0), (_split(coarse[metal], step), 0.5)):
+        value, nearby = _sample(start, points, grid, share * step)
         keep = nearby > settings.support_level
-        cells = np.tile(cell, (int(keep.sum()), 1))
-        parts.append((points[keep], cells, np.maximum(value[keep], _LEAST)))
-    points, steps, values = (np.concatenate(arrays) for arrays in zip(*parts))
-    return points, steps, values
+        every = np.ones(int(keep.sum()))
+        cell = float(np.prod(share * step))
+        parts.append((points[keep], share * spacing * every, cell * every, np.maximum(value[keep], _LEAST)))
+    points, sizes, cells, values = (np.concatenate(arrays) for arrays in zip(*parts))
+    return points, sizes, cells, values
 
 
 def _lattice(grid: VolumeGrid, spacing: float, dims: int) -> tuple[np.ndarray, np.ndarray]:
