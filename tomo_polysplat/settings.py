@@ -74,6 +74,10 @@ class Settings:
     """Edge in voxels of the random box whose total variation is taken."""
     tv_box_planar: int = 256
     """The same for a single slice."""
+    relocated: float = 0.03
+    """Largest share of the Gaussians that, once a pass, moves from where it holds nothing to where it is wanted."""
+    relocate_until: float = 0.5
+    """Share of the run after which no Gaussian is moved: the new ones need time to settle."""
     held_out: float = 0.01
     """Share of the rays kept from the fit to tell when it stops improving."""
     patience: int = 4

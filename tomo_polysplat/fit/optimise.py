@@ -15,7 +15,9 @@ import torch
 from tomo_polysplat.fit.loss import misfit, roughness
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.similarity import dissimilarity
 from tomo_polysplat.fit.stopping import Clock, FitState, Watch
+from tomo_polysplat.model.density_control import relocate
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 
@@ -87,6 +89,8 @@ class _Fitter:
             math.log(settings.largest_scale * spacing),
         )
         self.order = np.empty(0, int)
+        self.pull = torch.zeros_like(gaussians.attenuation)
+        self.relocated = 0
 
     def passes(self, batch: int, clock: Clock) -> Iterator[_Pass]:
         """Step until the clock runs out; what each pass over the views gave, the last perhaps a part of one."""
@@ -98,6 +102,8 @@ class _Fitter:
             if len(record.steps) == steps:
                 yield record
                 record = _Pass()
+                if share < self.settings.relocate_until:
+                    self._relocate()
         if record.steps:
             yield record
 
@@ -114,16 +120,14 @@ class _Fitter:
         views, measured, weight, aside = self.rays.batch(self._next_views(batch))
         predicted, skipped = self.scene.projections(self.gaussians, views)
         fitted = misfit(predicted, measured, weight, self.settings)
-        loss = fitted
-        if self.settings.tv_weight:
-            loss = loss + self.settings.tv_weight * roughness(
-                self.gaussians, self.scene, self.settings, self.rng
-            )
+        loss = fitted + self._regularisation(predicted, measured, weight)
         self.optimiser.zero_grad(set_to_none=True)
         # On this thread: autograd's own would be woken and waited for at every step.
         with torch.autograd.set_multithreading_enabled(False):
             loss.backward()
         self._hold_materials(share)
+        if (moved := self.gaussians.position.grad) is not None:
+            self.pull += moved.norm(dim=1)
         self.optimiser.step()
         with torch.no_grad():
             self.gaussians.attenuation.clamp_(min=0.0)
@@ -137,6 +141,29 @@ class _Fitter:
                 weight,
                 skipped,
             )
+
+    def _regularisation(
+        self, predicted: torch.Tensor, measured: torch.Tensor, weight: torch.Tensor
+    ) -> torch.Tensor | float:
+        """What is added to the misfit: total variation, and the dissimilarity of the projections if asked for."""
+        settings = self.settings
+        total: torch.Tensor | float = 0.0
+        if settings.tv_weight:
+            total = total + settings.tv_weight * roughness(self.gaussians, self.scene, settings, self.rng)
+        if settings.ssim_weight:
+            total = total + settings.ssim_weight * dissimilarity(predicted, measured, weight)
+        return total
+
+    def _relocate(self) -> None:
+        """Put Gaussians that hold nothing where they are wanted, with a fresh memory of the optimiser."""
+        changed = relocate(self.gaussians, self.pull, self.settings.relocated)
+        self.pull.zero_()
+        if len(changed):
+            self.relocated += len(changed) // 2
+            for name, tensor in self.gaussians.parameters().items():
+                if name != "shared_material":
+                    for memory in ("exp_avg", "exp_avg_sq"):
+                        self.optimiser.state[tensor][memory][changed] = 0.0
 
     def _hold_materials(self, share: float) -> None:
         """Keep the soft matter's number, and for a while the metals': while edges are blurred they would drift.
