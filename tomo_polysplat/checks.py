@@ -14,7 +14,9 @@ import numpy as np
 __all__ = ["fail", "require_array", "require_choice", "require_number", "require_shape"]
 
 
-def fail(argument: str, expected: str, got: Any, remedy: str = "", error: type[Exception] = ValueError) -> Exception:
+def fail(
+    argument: str, expected: str, got: Any, remedy: str = "", error: type[Exception] = ValueError
+) -> Exception:
     """The exception to raise: ``raise fail("angles", "radians", "degrees", "use numpy.deg2rad")``."""
     message = f"{argument}: expected {expected}, got {got}"
     return error(f"{message}; {remedy}" if remedy else message)
@@ -63,7 +65,9 @@ def require_array(argument: str, value: Any, ndim: int | None = None, remedy: st
     return array
 
 
-def require_shape(argument: str, array: np.ndarray, shape: tuple[int, ...], meaning: str, remedy: str = "") -> None:
+def require_shape(
+    argument: str, array: np.ndarray, shape: tuple[int, ...], meaning: str, remedy: str = ""
+) -> None:
     """An exact shape; ``meaning`` names its axes, such as ``"(rows, views, columns)"``."""
     if tuple(array.shape) != tuple(shape):
         raise fail(argument, f"shape {tuple(shape)} {meaning}", f"{tuple(array.shape)}", remedy)

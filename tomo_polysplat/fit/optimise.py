@@ -161,9 +161,11 @@ class _Fitter:
         if len(changed):
             self.relocated += len(changed) // 2
             for name, tensor in self.gaussians.parameters().items():
-                if name != "shared_material":
-                    for memory in ("exp_avg", "exp_avg_sq"):
-                        self.optimiser.state[tensor][memory][changed] = 0.0
+                # A parameter that the model does not use has no memory.
+                memory = {} if name == "shared_material" else self.optimiser.state.get(tensor, {})
+                for moment in ("exp_avg", "exp_avg_sq"):
+                    if moment in memory:
+                        memory[moment][changed] = 0.0
 
     def _hold_materials(self, share: float) -> None:
         """Keep the soft matter's number, and for a while the metals': while edges are blurred they would drift.
