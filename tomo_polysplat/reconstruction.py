@@ -199,6 +199,7 @@ def _counts(outcome: FitOutcome) -> dict[str, int]:
     return {
         "gaussians": len(gaussians),
         "gaussians_at_zero": int((gaussians.attenuation <= 0).sum()),
+        "gaussians_relocated": outcome.relocated,
         "pairs_skipped_at_source": outcome.skipped_pairs,
     }
 

@@ -38,6 +38,7 @@ class FitOutcome:
     gaussians: Gaussians
     history: list[dict[str, Any]] = field(default_factory=list)
     skipped_pairs: int = 0
+    relocated: int = 0
     reason: str = ""
 
 
@@ -216,6 +217,7 @@ def fit(
         for record in fitter.passes(batch, clock):
             loss, held_out, skipped = record.read()
             outcome.skipped_pairs += skipped
+            outcome.relocated = fitter.relocated
             state = FitState(
                 time.perf_counter() - started,
                 clock.done,
