@@ -6,11 +6,12 @@ import numpy as np
 import torch
 
 from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.render.renderer import VOXEL_CUTOFF
 from tomo_polysplat.settings import Settings
 
-__all__ = ["misfit", "roughness", "total_variation", "weighted_huber", "weighted_l1"]
+__all__ = ["misfit", "random_box", "roughness", "total_variation", "weighted_huber", "weighted_l1"]
 
 
 def misfit(
@@ -40,16 +41,18 @@ def weighted_huber(
     return value.sum() / weight.sum().clamp(min=1e-12)
 
 
-def roughness(
-    gaussians: Gaussians, scene: FitScene, settings: Settings, rng: np.random.Generator
-) -> torch.Tensor:
-    """Total variation of the volume in a random box of ``settings.tv_box`` voxels an edge."""
-    edges = [settings.tv_box] * 3 if scene.box.shape[0] > 1 else [1, *[settings.tv_box_planar] * 2]
-    nz, ny, nx = (min(edge, n) for edge, n in zip(edges, scene.box.shape))
-    z, y, x = (int(rng.integers(0, n - m + 1)) for n, m in zip(scene.box.shape, (nz, ny, nx)))
-    box = scene.box.part((z, y, x), (nz, ny, nx))
+def random_box(whole: VoxelBox, settings: Settings, rng: np.random.Generator) -> VoxelBox:
+    """A box of ``settings.tv_box`` voxels an edge anywhere in the volume; its shape is always the same."""
+    edges = [settings.tv_box] * 3 if whole.shape[0] > 1 else [1, *[settings.tv_box_planar] * 2]
+    nz, ny, nx = (min(edge, n) for edge, n in zip(edges, whole.shape))
+    z, y, x = (int(rng.integers(0, n - m + 1)) for n, m in zip(whole.shape, (nz, ny, nx)))
+    return whole.part((z, y, x), (nz, ny, nx))
+
+
+def roughness(gaussians: Gaussians, scene: FitScene, settings: Settings, box: VoxelBox) -> torch.Tensor:
+    """Total variation of the volume in a box."""
     lower = gaussians.position.new_tensor(box.first)
-    upper = gaussians.position.new_tensor(box.first + (np.array([nx, ny, nz]) - 1) * box.spacing)
+    upper = gaussians.position.new_tensor(box.first + (np.array(box.shape[::-1]) - 1) * box.spacing)
     with torch.no_grad():
         reach = VOXEL_CUTOFF * gaussians.log_scale.amax(dim=1, keepdim=True).exp()
         near = ((gaussians.position + reach >= lower) & (gaussians.position - reach <= upper)).all(dim=1)

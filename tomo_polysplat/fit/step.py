@@ -1,0 +1,172 @@
+"""One step of the optimiser through torch's autograd: on the CPU, and where no CUDA graph can be captured."""
+
+from __future__ import annotations
+
+import math
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from tomo_polysplat.fit.loss import misfit, roughness
+from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.similarity import dissimilarity
+from tomo_polysplat.kernels.voxelise.box import VoxelBox
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.settings import Settings
+
+__all__ = ["EPSILON", "LEAST_U", "EagerStep", "Moments", "Step", "log_scale_bounds", "step_rates"]
+
+# Fat and plastics harden a beam less than water does: their curve is the mixture's continued a little below 0.
+LEAST_U = -0.1
+# Of Adam, so small that gradients of any unit give the same steps.
+EPSILON = 1e-15
+# Fewer held-out rays in a pass, counted by weight, go up and down by chance.
+_FEWEST_HELD_OUT = 10.0
+
+# Adam's first and second moment of each parameter by name.
+Moments = dict[str, tuple[torch.Tensor, torch.Tensor]]
+
+
+class Step(Protocol):
+    """A step of the optimiser on Gaussians, which it changes in place.
+
+    Attributes
+    ----------
+    pull : (n,) tensor
+        Lengths of the loss's gradients by position, added up; the caller sets them back to zero.
+    moments : dict of name to (exp_avg, exp_avg_sq)
+        Adam's memory, to be changed in place only.
+    done : int
+        Steps made; Adam's bias correction counts with it.
+    """
+
+    pull: torch.Tensor
+    moments: Moments
+    done: int
+
+    def __call__(self, views: np.ndarray, box: VoxelBox, share: float) -> None:
+        """Step towards the rays of these views and a smooth box; ``share`` of the run is done, 0 to 1."""
+
+    def read(self) -> tuple[float, float, int]:
+        """Since the last call: mean misfit of the fitted rays and of those held out, and pairs skipped.
+
+        The misfit of the held-out rays is NaN where they are too few to say anything.
+        """
+
+
+def step_rates(settings: Settings, spacing: float) -> dict[str, float]:
+    """Learning rate of each parameter at the start of a run; ``spacing`` of the seeds."""
+    return {
+        "position": settings.learning_rate_position * spacing,
+        "log_scale": settings.learning_rate_scale,
+        "rotation": settings.learning_rate_rotation,
+        "attenuation": settings.learning_rate_attenuation,
+        "own_material": settings.learning_rate_material,
+        "shared_material": settings.learning_rate_shared,
+    }
+
+
+def log_scale_bounds(
+    scene: FitScene, spacing: float, planar: bool, settings: Settings
+) -> tuple[float, float]:
+    """Smallest and largest logarithm of a Gaussian's deviation."""
+    voxel = float(scene.box.spacing[: 2 if planar else 3].min())
+    return math.log(settings.smallest_scale * voxel), math.log(settings.largest_scale * spacing)
+
+
+class EagerStep:
+    """The step as torch runs it, operation by operation; see `Step`."""
+
+    def __init__(
+        self, gaussians: Gaussians, spacing: float, rays: Rays, scene: FitScene, settings: Settings
+    ) -> None:
+        self.gaussians, self.rays, self.scene, self.settings = gaussians, rays, scene, settings
+        self.bounds = log_scale_bounds(scene, spacing, gaussians.planar, settings)
+        self.pull = torch.zeros_like(gaussians.attenuation)
+        parameters = gaussians.parameters()
+        rates = step_rates(settings, spacing)
+        groups = [{"params": [parameters[k].requires_grad_()], "lr": v, "rate": v} for k, v in rates.items()]
+        self.optimiser = torch.optim.Adam(groups, eps=EPSILON, fused=True)
+        self.moments = {k: (torch.zeros_like(t), torch.zeros_like(t)) for k, t in parameters.items()}
+        for name, tensor in parameters.items():
+            first, second = self.moments[name]
+            count = torch.zeros((), dtype=torch.float32, device=tensor.device)
+            self.optimiser.state[tensor] = {"step": count, "exp_avg": first, "exp_avg_sq": second}
+        self._sums: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor, int | torch.Tensor]] = []
+        self._done = 0
+
+    @property
+    def done(self) -> int:
+        """Steps made."""
+        return self._done
+
+    @done.setter
+    def done(self, steps: int) -> None:
+        self._done = steps
+        for memory in self.optimiser.state.values():
+            memory["step"].fill_(steps)
+
+    def __call__(self, views: np.ndarray, box: VoxelBox, share: float) -> None:
+        """One step; see `Step`."""
+        for group in self.optimiser.param_groups:
+            group["lr"] = group["rate"] * self.settings.final_rate**share
+        chosen, measured, weight, aside = self.rays.batch(views)
+        predicted, skipped = self.scene.projections(self.gaussians, chosen)
+        fitted = misfit(predicted, measured, weight, self.settings)
+        loss = fitted + self._regularisation(predicted, measured, weight, box)
+        self.optimiser.zero_grad(set_to_none=True)
+        # On this thread: autograd's own would be woken and waited for at every step.
+        with torch.autograd.set_multithreading_enabled(False):
+            loss.backward()
+        self._hold_materials(share)
+        if (moved := self.gaussians.position.grad) is not None:
+            self.pull += moved.norm(dim=1)
+        self.optimiser.step()
+        self._done += 1
+        self._bound()
+        with torch.no_grad():
+            weight = aside.sum()
+            held_out = misfit(predicted, measured, aside, self.settings) * weight
+            self._sums.append((fitted.detach(), held_out, weight, skipped))
+
+    @torch.no_grad()
+    def _bound(self) -> None:
+        self.gaussians.attenuation.clamp_(min=0.0)
+        self.gaussians.own_material.clamp_(LEAST_U, 1.0)
+        self.gaussians.shared_material.clamp_(LEAST_U, 1.0)
+        self.gaussians.log_scale.clamp_(*self.bounds)
+
+    def read(self) -> tuple[float, float, int]:
+        """Means since the last call; see `Step`."""
+        fitted, held_out, weight, skipped = (float(sum(values)) for values in zip(*self._sums))
+        steps, self._sums = len(self._sums), []
+        return fitted / steps, held_out_mean(held_out, weight), round(skipped)
+
+    def _regularisation(
+        self, predicted: torch.Tensor, measured: torch.Tensor, weight: torch.Tensor, box: VoxelBox
+    ) -> torch.Tensor | float:
+        """What is added to the misfit: total variation, and the dissimilarity of the projections if asked for."""
+        settings = self.settings
+        total: torch.Tensor | float = 0.0
+        if settings.tv_weight:
+            total = total + settings.tv_weight * roughness(self.gaussians, self.scene, settings, box)
+        if settings.ssim_weight:
+            total = total + settings.ssim_weight * dissimilarity(predicted, measured, weight)
+        return total
+
+    def _hold_materials(self, share: float) -> None:
+        """Keep the soft matter's number, and for a while the metals': while edges are blurred they would drift.
+
+        A little cupping and a little hardening look alike, so a soft number that is free trades one for the
+        other; held at the first curve the two stay apart.
+        """
+        gradient = self.gaussians.shared_material.grad
+        if gradient is not None:
+            gradient[: 1 if share >= self.settings.material_from else None] = 0.0
+
+
+def held_out_mean(total: float, weight: float) -> float:
+    """Mean misfit of the held-out rays from its sum and their weight."""
+    return total / weight if weight >= _FEWEST_HELD_OUT else math.nan
