@@ -12,14 +12,12 @@ import numpy as np
 import torch
 
 from tomo_polysplat.bench.methods import Method, Options, Task
+from tomo_polysplat.bench.peers import Skipped
 from tomo_polysplat.fit.optimise import FitState
 from tomo_polysplat.result.metrics import psnr
 from tomo_polysplat.scan.scan import Scan
 
 __all__ = ["Run", "error_history", "measure"]
-
-# A point of an error curve is taken when so much more time has passed since the last one.
-_SPACING = 1.15
 
 
 @dataclass
@@ -35,13 +33,16 @@ class Run:
         Bytes: on CUDA the most that torch held during the run, without ASTRA's own; on the CPU the most that
         the whole process ever held until then.
     about : dict
-        What the method says of the run, or ``error``.
+        What the method says of the run, or ``error`` after a failure, or ``skipped`` with the reason.
+    cpu_seconds : float or None
+        Of all threads of the process meanwhile: what the run costs however busy the machine is otherwise.
     """
 
     volume: np.ndarray | None
     seconds: float | None
     peak_memory: int | None
     about: dict[str, Any] = field(default_factory=dict)
+    cpu_seconds: float | None = None
 
 
 def measure(method: Method, task: Task, options: Options) -> Run:
@@ -52,16 +53,18 @@ def measure(method: Method, task: Task, options: Options) -> Run:
         # ASTRA allocates beside torch, which would otherwise keep what it no longer uses.
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
-    started = time.perf_counter()
+    started, worked = time.perf_counter(), time.process_time()
     try:
         volume, about = method.run(task, options)
+    except Skipped as reason:
+        return Run(None, None, None, {"skipped": str(reason)})
     except Exception as error:
         return Run(None, None, None, {"error": f"{type(error).__name__}: {error}"})
-    seconds = time.perf_counter() - started
+    seconds, cpu_seconds = time.perf_counter() - started, time.process_time() - worked
     peak = torch.cuda.max_memory_allocated() if cuda else _peak_of_process()
     if not np.isfinite(volume).all():
         return Run(None, None, peak, {**about, "error": "the volume is not finite"})
-    return Run(volume, seconds, peak, about)
+    return Run(volume, seconds, peak, about, cpu_seconds)
 
 
 def _peak_of_process() -> int | None:
@@ -74,8 +77,8 @@ def _peak_of_process() -> int | None:
 
 
 def error_history(
-    method: Method, task: Task, settings: dict[str, Any], longest: float | None
-) -> list[dict[str, float]]:
+    method: Method, task: Task, settings: dict[str, Any], longest: float | None, spacing: float = 1.15
+) -> list[dict[str, Any]]:
     """Errors against the truth as a run goes on, the time it takes to find them left out.
 
     Parameters
@@ -88,21 +91,25 @@ def error_history(
         Changes of the solver's settings.
     longest : float or None
         Seconds after which the run is ended. It gets no time budget, by which it would hurry.
+    spacing : float
+        A point is taken when so many times the seconds of the last one have passed; 0 takes every pass.
 
     Returns
     -------
     list of dict
-        ``seconds``, ``psnr``, ``psnr_all``, ``rmse``; see :func:`tomo_polysplat.result.metrics.compare`.
+        ``seconds``, ``psnr``, ``psnr_all``, ``rmse``, see :func:`tomo_polysplat.result.metrics.compare`;
+        ``iteration``, and ``loss`` and ``held_out`` of the rays (None where they are not finite).
     """
-    history: list[dict[str, float]] = []
+    history: list[dict[str, Any]] = []
     watching = 0.0
 
     def watch(state: FitState) -> bool:
         nonlocal watching
         entered = time.perf_counter()
         seconds = state.seconds - watching
-        if not history or seconds > _SPACING * history[-1]["seconds"]:
-            history.append({"seconds": seconds, **_errors(state.volume(), task.scan)})
+        if not history or seconds > spacing * history[-1]["seconds"]:
+            rays = {key: state.record()[key] for key in ("iteration", "loss", "held_out")}
+            history.append({"seconds": seconds, **_errors(state.volume(), task.scan), **rays})
         watching += time.perf_counter() - entered
         return longest is not None and seconds >= longest
 

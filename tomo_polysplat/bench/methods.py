@@ -15,6 +15,7 @@ from tomo_polysplat.baselines.nmar import nmar
 from tomo_polysplat.baselines.sirt import sirt
 from tomo_polysplat.baselines.voxel_poly import voxel_poly
 from tomo_polysplat.baselines.water_bhc import water_bhc
+from tomo_polysplat.bench import peers
 from tomo_polysplat.fit.optimise import FitState
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.reconstruction import reconstruct
@@ -160,6 +161,9 @@ METHODS = {
     "sirt-200": Method("SIRT, 200 iterations", _direct(sirt, iterations=200)),
     "limar": Method("LIMAR after water correction", _direct(limar, spectrum=True)),
     "nmar": Method("NMAR after water correction", _direct(nmar, spectrum=True)),
+    "mbir": Method("mbirtorch", peers.mbirtorch_recon),
+    "mbir-mar": Method("mbirtorch, low weights in metal", peers.mbirtorch_mar),
+    "mbir-metal": Method("mbirtorch, plastic and metal", peers.mbirtorch_plastic_metal),
     "voxel-poly": Method("polychromatic voxels", _voxel_poly, improves=True),
     "mono": Method("Gaussians, one energy", _mono, improves=True),
     "polysplat": Method("tomo-polysplat", _polysplat, improves=True),

@@ -7,15 +7,28 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tomo_polysplat.bench.methods import METHODS
+from tomo_polysplat.bench.runs import without_figures
 from tomo_polysplat.files import replacing
 from tomo_polysplat.report.style import ACCENT, OURS, QUIET
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
-__all__ = ["as_text", "write_figures"]
+__all__ = ["as_text", "error_figure", "machine", "write_figures"]
 
-_COLOURS = ("#9a9a9a", "#5f5f5f", "#c77c2e", "#8a5fa8", "#2f6fb0", "#b04a4a", "#7a8b2f", "#3f8f8f")
+_COLOURS = (
+    "#9a9a9a",
+    "#5f5f5f",
+    "#c77c2e",
+    "#8a5fa8",
+    "#2f6fb0",
+    "#b04a4a",
+    "#7a8b2f",
+    "#3f8f8f",
+    "#d08bb0",
+    "#8c6d4f",
+)
 _FORM = "{:<8} {:>5} {:<11} {:>7} {:>8} {:>8} {:>8} {:>7} {:>9} {:>8}"
 
 
@@ -27,7 +40,7 @@ def as_text(record: Mapping[str, Any]) -> str:
         budget = "-" if run["budget"] is None else f"{run['budget']:g}"
         if run["seconds"] is None:
             line = f"{run['scene']:<8} {run['size']:>5} {run['method']:<11} {budget:>7}"
-            lines.append(f"{line} failed: {run['about']['error']}")
+            lines.append(f"{line} {without_figures(run)}")
             continue
         memory = "-" if run["peak_memory_bytes"] is None else f"{run['peak_memory_bytes'] / 2**30:.2f}"
         numbers = (f"{run['seconds']:.2f}", f"{run['psnr']:.2f}", f"{run['psnr_all']:.2f}")
@@ -48,13 +61,17 @@ def _seconds(value: float | None) -> str:
 def write_figures(folder: Path, record: Mapping[str, Any]) -> list[Path]:
     """Error against seconds for every scan, and seconds against size for every scene; the files written."""
     scans = list(dict.fromkeys((run["scene"], run["size"]) for run in record["runs"]))
-    written = [_error_figure(folder, record, scene, size) for scene, size in scans]
+    written = [
+        _save(error_figure(record, scene, size), folder / f"recon-error-{scene}-{size}.png")
+        for scene, size in scans
+    ]
     if len({size for _, size in scans}) > 1:
         written += [_size_figure(folder, record, scene) for scene in dict.fromkeys(s for s, _ in scans)]
     return written
 
 
-def _error_figure(folder: Path, record: Mapping[str, Any], scene: str, size: int) -> Path:
+def error_figure(record: Mapping[str, Any], scene: str, size: int) -> Figure:
+    """Errors without metal and everywhere against seconds, of one scan."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10.6, 4.2), layout="constrained")
@@ -72,11 +89,12 @@ def _error_figure(folder: Path, record: Mapping[str, Any], scene: str, size: int
                 )
         axis.set(xscale="log", xlabel="seconds, from projections to volume", ylabel=f"PSNR {label} (dB)")
         _dress(axis)
-    axis.legend(frameon=False, fontsize=8)
+    if axis.lines:
+        axis.legend(frameon=False, fontsize=8)
     figure.suptitle(
-        f"{scene}, {size}³ voxels, {record['bench']['views']} views; {_machine(record)}", fontsize=10
+        f"{scene}, {size}³ voxels, {record['bench']['views']} views; {machine(record)}", fontsize=10
     )
-    return _save(figure, folder / f"recon-error-{scene}-{size}.png")
+    return figure
 
 
 def _size_figure(folder: Path, record: Mapping[str, Any], scene: str) -> Path:
@@ -98,7 +116,7 @@ def _size_figure(folder: Path, record: Mapping[str, Any], scene: str) -> Path:
     axis.minorticks_off()
     _dress(axis)
     figure.legend(loc="outside right center", frameon=False, fontsize=8)
-    figure.suptitle(f"{scene}; {_machine(record)}", fontsize=10)
+    figure.suptitle(f"{scene}; {machine(record)}", fontsize=10)
     return _save(figure, folder / f"recon-seconds-{scene}.png")
 
 
@@ -120,7 +138,8 @@ def _colour(name: str, record: Mapping[str, Any]) -> str:
     return ACCENT if name == OURS else _COLOURS[others.index(name) % len(_COLOURS)]
 
 
-def _machine(record: Mapping[str, Any]) -> str:
+def machine(record: Mapping[str, Any]) -> str:
+    """What a record was measured on."""
     environment = record["environment"]
     if record["bench"]["device"].startswith("cuda") and environment["gpus"]:
         return environment["gpus"][0]
