@@ -18,6 +18,7 @@ __all__ = [
     "require_plausible_size",
     "require_replaceable",
     "require_room",
+    "require_writable",
 ]
 
 # Deflate, the strongest compression met in these formats, cannot shrink data by more than 1032.
@@ -63,7 +64,7 @@ def replacing(path: str | os.PathLike, *, overwrite: bool, needed_bytes: int = 0
             temporary.unlink()
 
 
-def require_replaceable(target: Path, overwrite: bool) -> None:
+def require_replaceable(target: Path, overwrite: bool, remedy: str = "pass overwrite=True") -> None:
     """Refuse a file that could not be written: a folder, one in a missing folder, or one that must stay."""
     if target.is_dir():
         raise fail("path", "a file", f"the folder {target}", error=IsADirectoryError)
@@ -72,7 +73,19 @@ def require_replaceable(target: Path, overwrite: bool) -> None:
             "path", "a file in an existing folder", str(target), "create the folder", FileNotFoundError
         )
     if target.exists() and not overwrite:
-        raise fail("path", "a new file", f"{target}, which exists", "pass overwrite=True", FileExistsError)
+        raise fail("path", "a new file", f"{target}, which exists", remedy, FileExistsError)
+
+
+def require_writable(folder: str | os.PathLike) -> None:
+    """Refuse a folder in which no file can be made, by making one: permissions alone do not tell."""
+    try:
+        with tempfile.TemporaryFile(dir=folder or "."):
+            pass
+    except OSError as error:
+        remedy = "change its permissions or choose another folder"
+        raise fail(
+            "path", "a folder that can be written to", f"{folder} ({error})", remedy, type(error)
+        ) from error
 
 
 def _flush(path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.checks import fail, require_array, require_number, require_shape
+from tomo_polysplat.fit.checkpoint import Checkpoint
 from tomo_polysplat.fit.optimise import FitOutcome, FitState, fit
 from tomo_polysplat.fit.plan import Plan, make_plan
 from tomo_polysplat.fit.problem import Problem
@@ -53,6 +55,8 @@ def reconstruct(
     callbacks: Sequence[Callable[[FitState], Any]] = (),
     progress: bool | Callable[[float, str], Any] | None = None,
     settings: Settings | Mapping[str, Any] | None = None,
+    checkpoint: str | os.PathLike | None = None,
+    resume: bool = False,
 ) -> Result:
     """Reconstruct a scan as a cloud of Gaussians, through a polychromatic model of its rays.
 
@@ -85,33 +89,47 @@ def reconstruct(
         A bar on standard error (True, or None on a terminal), or a function of (share, words).
     settings : Settings or mapping, optional
         Changes of single settings by name.
+    checkpoint : path, optional
+        A file (``.npz``) that keeps the fit, written between passes over the views for at most 5 % of the time.
+    resume : bool
+        Go on from ``checkpoint`` where it exists, which must be of the same scan and options, and begin anew
+        where it does not. On the same device the result is that of a run without interruption. A time budget
+        counts the seconds of both.
 
     Returns
     -------
     Result
-        On KeyboardInterrupt, the best state so far.
+        After Ctrl-C, the best state so far.
 
     Raises
     ------
     ValueError, TypeError
         For input that does not fit together; the message names the argument and the remedy.
+    FileExistsError
+        For a checkpoint that exists, without ``resume``.
+    OSError
+        For a checkpoint that cannot be written.
+    KeyboardInterrupt
+        After Ctrl-C before the fit has begun, or a second one after it.
     """
     started = time.perf_counter()
     chosen = make_settings(quality, settings)
-    deadline = None if time_budget is None else started + require_number("time_budget", time_budget, above=0)
+    if time_budget is not None:
+        time_budget = require_number("time_budget", time_budget, above=0)
     rng, target, callbacks = _generator(seed), pick_device(device), _functions(callbacks)
     geometry, grid = from_astra(proj_geom, vol_geom)
     values, counts = _usable(projections, proj_geom, valid)
     problem = Problem.of(values, geometry, grid, unit, spectrum, materials)
     flipped = is_planar_geometry(proj_geom)
+    options = chosen.to_dict() | {"seed": int(seed), "time_budget": time_budget}
+    saved = _checkpoint(checkpoint, resume, problem, options)
+    started -= 0.0 if saved is None else saved.seconds
     with one_torch_thread(target), progress_reports(progress) as report:
         report(0.0, "start volume")
-        start, why = problem.start_volume(target)
-        plan = make_plan(start, problem, chosen, target.type)
-        plan.reasons["start"] = why
+        plan, gaussians = _begin(problem, chosen, target, saved)
         scene, rays = problem.scene(plan, chosen, target), problem.rays(plan, chosen, target)
         outcome = fit(
-            problem.seeds(start, plan, chosen, target),
+            gaussians,
             plan.spacing * problem.voxel,
             rays,
             scene,
@@ -119,9 +137,10 @@ def reconstruct(
             views_per_step=plan.views_per_step,
             rng=rng,
             started=started,
-            deadline=deadline,
+            deadline=None if time_budget is None else started + time_budget,
             volume=_volume_of(scene, plan, problem, flipped),
             callbacks=[lambda state: report(state.share, state.describe()), *callbacks],
+            checkpoint=saved,
         )
         report(1.0, "volume")
         plan.reasons["stop"] = outcome.reason
@@ -136,6 +155,31 @@ def reconstruct(
     result.seconds = time.perf_counter() - started
     logger.info("Reconstructed in %.1f s: %s; %s", result.seconds, outcome.reason, result.counts)
     return result
+
+
+def _checkpoint(
+    path: str | os.PathLike | None, resume: bool, problem: Problem, options: Mapping[str, Any]
+) -> Checkpoint | None:
+    if path is None:
+        if resume:
+            raise fail("resume", "a checkpoint to go on from", "none", "pass checkpoint= as well")
+        return None
+    return Checkpoint(path, problem, options, resume=resume)
+
+
+def _begin(
+    problem: Problem, settings: Settings, device: torch.device, saved: Checkpoint | None
+) -> tuple[Plan, Gaussians]:
+    """The plan and Gaussians to go on with: those of a checkpoint, or seeds of a start volume."""
+    if saved is not None and saved.snapshot is not None and saved.plan is not None:
+        return saved.plan, saved.snapshot.gaussians.to(device)
+    start, why = problem.start_volume(device)
+    plan = make_plan(start, problem, settings, device.type)
+    plan.reasons["start"] = why
+    gaussians = problem.seeds(start, plan, settings, device)
+    if saved is not None:
+        saved.plan = plan
+    return plan, gaussians
 
 
 def _generator(seed: Any) -> np.random.Generator:

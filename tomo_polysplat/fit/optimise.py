@@ -10,7 +10,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import torch
 
+from tomo_polysplat.fit.checkpoint import Checkpoint, Snapshot
 from tomo_polysplat.fit.loss import random_box
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
@@ -52,6 +54,7 @@ class _Fitter:
         self.step: Step = EagerStep(gaussians, spacing, rays, scene, settings)
         self.order = np.empty(0, int)
         self.relocated = 0
+        self.relocation_due = False
 
     def passes(self, batch: int, clock: Clock) -> Iterator[tuple[float, float, int]]:
         """Step until the clock runs out; what each pass over the views gave, the last perhaps a part of one.
@@ -60,20 +63,46 @@ class _Fitter:
         """
         steps, made = max(1, round(len(self.rays.views) / batch)), 0
         while (share := clock.share()) < 1:
+            if self.relocation_due:
+                self._relocate()
             views = self._next_views(batch)
             self.step(views, random_box(self.scene.box, self.settings, self.rng), share)
             clock.done += 1
             made += 1
             if made == steps:
+                self.relocation_due = share < self.settings.relocate_until
                 yield self.step.read()
                 made = 0
-                if share < self.settings.relocate_until:
-                    self._relocate()
         if made:
             yield self.step.read()
 
+    def snapshot(self, best: Gaussians | None, numbers: dict[str, Any]) -> Snapshot:
+        """Where the fit stands between two passes; ``numbers`` of the run are kept with it."""
+        own = {
+            "steps_made": self.step.done,
+            "relocated": self.relocated,
+            "relocation_due": self.relocation_due,
+            "random": self.rng.bit_generator.state,
+        }
+        first, second = ({k: pair[j] for k, pair in self.step.moments.items()} for j in (0, 1))
+        return Snapshot(self.gaussians, best, first, second, self.step.pull, self.order, own | numbers)
+
+    @torch.no_grad()
+    def restore(self, kept: Snapshot) -> None:
+        """Go on from a snapshot, with whose Gaussians this was made."""
+        for name, (first, second) in self.step.moments.items():
+            first.copy_(kept.first[name])
+            second.copy_(kept.second[name])
+        self.step.pull.copy_(kept.pull)
+        self.order = kept.order
+        self.step.done = int(kept.numbers["steps_made"])
+        self.relocated = int(kept.numbers["relocated"])
+        self.relocation_due = bool(kept.numbers["relocation_due"])
+        self.rng.bit_generator.state = kept.numbers["random"]
+
     def _relocate(self) -> None:
         """Put Gaussians that hold nothing where they are wanted, with a fresh memory of the optimiser."""
+        self.relocation_due = False
         changed = relocate(self.gaussians, self.step.pull, self.settings.relocated)
         self.step.pull.zero_()
         if len(changed):
@@ -91,6 +120,51 @@ class _Fitter:
         return chosen
 
 
+@dataclass
+class _Run:
+    """All that changes during a run, and the file that keeps it, if there is one."""
+
+    fitter: _Fitter
+    outcome: FitOutcome
+    watch: Watch
+    clock: Clock
+    started: float
+    checkpoint: Checkpoint | None
+
+    def keep(self, *, now: bool) -> None:
+        """Offer the checkpoint the state between two passes."""
+        if self.checkpoint is not None:
+            self.checkpoint.offer(lambda: self.fitter.snapshot(self.watch.best, self._numbers()), now=now)
+
+    def _numbers(self) -> dict[str, Any]:
+        outcome, watch, clock = self.outcome, self.watch, self.clock
+        return {
+            "steps": clock.done,
+            "seconds": time.perf_counter() - self.started,
+            "begun": clock.begun - self.started,
+            "lowest": watch.lowest,
+            "waited": watch.waited,
+            "history": outcome.history,
+            "skipped_pairs": outcome.skipped_pairs,
+            "reason": outcome.reason,
+        }
+
+    def restore(self) -> None:
+        """Go on from the checkpoint's snapshot, where there is one."""
+        if self.checkpoint is None or self.checkpoint.snapshot is None:
+            return
+        kept, self.checkpoint.snapshot = self.checkpoint.snapshot, None
+        numbers, gaussians = kept.numbers, self.fitter.gaussians
+        self.fitter.restore(kept)
+        self.clock.done, self.clock.begun = numbers["steps"], self.started + numbers["begun"]
+        self.watch.lowest, self.watch.waited = numbers["lowest"], numbers["waited"]
+        if kept.best is not None:
+            self.watch.best = kept.best.to(gaussians.position.device)
+        self.outcome.history, self.outcome.reason = numbers["history"], numbers["reason"]
+        self.outcome.skipped_pairs = numbers["skipped_pairs"]
+        self.outcome.relocated = self.fitter.relocated
+
+
 def fit(
     gaussians: Gaussians,
     spacing: float,
@@ -104,12 +178,14 @@ def fit(
     deadline: float | None = None,
     volume: Callable[[Gaussians], np.ndarray],
     callbacks: Sequence[Callable[[FitState], Any]] = (),
+    checkpoint: Checkpoint | None = None,
 ) -> FitOutcome:
     """Fit Gaussians to rays.
 
     Stops after ``settings.passes`` over the views, at ``deadline`` (``time.perf_counter`` seconds), when the
     held-out rays have not improved for ``settings.patience`` passes, when a callback returns True, or on
-    KeyboardInterrupt; returns the Gaussians of the pass whose held-out rays fitted best.
+    KeyboardInterrupt; returns the Gaussians of the pass whose held-out rays fitted best. Where ``checkpoint``
+    holds a snapshot, ``gaussians`` are its own and the fit goes on from there.
     """
     if not len(gaussians):
         logger.warning("The start volume is empty: no Gaussians, a volume of zeros.")
@@ -118,9 +194,10 @@ def fit(
     outcome, watch = FitOutcome(gaussians), Watch(settings)
     batch = min(views_per_step, len(rays.views))
     clock = Clock(max(1, math.ceil(settings.passes * len(rays.views) / batch)), deadline)
+    run = _Run(fitter, outcome, watch, clock, started, checkpoint)
+    run.restore()
     try:
-        for record in fitter.passes(batch, clock):
-            loss, held_out, skipped = record
+        for loss, held_out, skipped in () if outcome.reason else fitter.passes(batch, clock):
             outcome.skipped_pairs += skipped
             outcome.relocated = fitter.relocated
             state = FitState(
@@ -134,7 +211,9 @@ def fit(
             )
             outcome.history.append(state.record())
             outcome.reason = watch.judge(state, gaussians)
+            run.keep(now=bool(outcome.reason) or clock.share() >= 1)
             if any([_is_true(callback(state)) for callback in callbacks]):
+                run.keep(now=True)
                 outcome.reason = "a callback ended it"
             if outcome.reason:
                 break

@@ -54,9 +54,12 @@ class Gaussians:
 
     def copy(self) -> Gaussians:
         """Detached copies of everything."""
-        return Gaussians(
-            **{k: t.detach().clone() for k, t in self.parameters().items()}, group=self.group.clone()
-        )
+        return self.to(self.position.device)
+
+    def to(self, device: torch.device) -> Gaussians:
+        """Detached copies of everything on a device."""
+        parts = {field.name: getattr(self, field.name) for field in fields(self)}
+        return Gaussians(**{name: tensor.detach().to(device, copy=True) for name, tensor in parts.items()})
 
     def select(self, chosen: torch.Tensor) -> Gaussians:
         """The Gaussians of these (m,) int64 indices, still attached to the graph."""

@@ -1,0 +1,231 @@
+"""A run that was interrupted and resumed is the run that was not; a checkpoint of anything else is refused."""
+
+import json
+import os
+import time
+import zipfile
+
+import numpy as np
+import pytest
+from small_scans import QUICK, cone, fan, reconstruct
+
+from tomo_polysplat.fit.checkpoint import Checkpoint
+
+# Relocation falls between the passes, metals are freed after two of five, and the state changes in all its parts.
+LONG = QUICK | {"passes": 5.0, "relocate_until": 1.0}
+
+
+class Killed(Exception):
+    """What no part of the package catches, as it catches no SIGKILL."""
+
+
+def killed_after(passes, scan, path, **options):
+    """Run up to a pass, and die there."""
+
+    def die(state):
+        if state.iteration >= passes * 5:
+            raise Killed
+
+    with pytest.raises(Killed):
+        reconstruct(scan, checkpoint=path, callbacks=[die], **options)
+
+
+@pytest.fixture(autouse=True)
+def every_pass(monkeypatch):
+    """Small scans take less time than a file: write nevertheless."""
+    monkeypatch.setattr("tomo_polysplat.fit.checkpoint._LARGEST_SHARE", 1e9)
+
+
+def without_seconds(history):
+    return [{name: value for name, value in record.items() if name != "seconds"} for record in history]
+
+
+@pytest.mark.parametrize("spectrum", [True, False])
+def test_a_resumed_run_is_the_uninterrupted_one(tmp_path, spectrum):
+    scan, path = fan(), tmp_path / "fit.npz"
+    options = {"settings": LONG} | ({} if spectrum else {"spectrum": None})
+    whole = reconstruct(scan, **options)
+    killed_after(3, scan, path, **options)
+    resumed = reconstruct(scan, checkpoint=path, resume=True, **options)
+    assert np.array_equal(resumed.volume, whole.volume)
+    assert all(np.array_equal(resumed.gaussians[name], whole.gaussians[name]) for name in whole.gaussians)
+    assert without_seconds(resumed.history) == without_seconds(whole.history)
+    assert resumed.counts == whole.counts and resumed.plan == whole.plan
+    assert whole.counts["gaussians_relocated"] > 0 or not spectrum
+
+
+def test_a_run_resumed_at_every_pass_is_the_uninterrupted_one(tmp_path):
+    scan, path = cone(), tmp_path / "fit.npz"
+    whole = reconstruct(scan, settings=LONG)
+    for passes in range(1, 5):
+        killed_after(passes, scan, path, settings=LONG, resume=passes > 1)
+    resumed = reconstruct(scan, settings=LONG, checkpoint=path, resume=True)
+    assert np.array_equal(resumed.volume, whole.volume) and len(resumed.history) == 5
+    seconds = [record["seconds"] for record in resumed.history]
+    assert seconds == sorted(seconds) and resumed.seconds > seconds[-1], "the clock goes on too"
+
+
+def test_the_start_volume_is_made_once(tmp_path, monkeypatch):
+    path = tmp_path / "fit.npz"
+    killed_after(1, fan(), path, settings=LONG)
+
+    def again(*_):
+        raise AssertionError("the start volume was made again")
+
+    monkeypatch.setattr("tomo_polysplat.fit.problem.Problem.start_volume", again)
+    assert "passes" in reconstruct(fan(), checkpoint=path, resume=True, settings=LONG).plan["stop"]
+
+
+def test_resuming_a_finished_run_only_makes_the_volume(tmp_path):
+    path = tmp_path / "fit.npz"
+    patient = {"settings": QUICK | {"passes": 40.0, "patience": 1}}
+    whole = reconstruct(fan(), checkpoint=path, **patient)
+    assert "held-out" in whole.plan["stop"] and len(whole.history) < 40
+    seen = []
+    again = reconstruct(fan(), checkpoint=path, resume=True, callbacks=[seen.append], **patient)
+    assert not seen and np.array_equal(again.volume, whole.volume) and again.plan == whole.plan
+
+
+def test_a_run_that_a_callback_ended_goes_on(tmp_path):
+    path = tmp_path / "fit.npz"
+    whole = reconstruct(fan(), settings=LONG)
+    paused = reconstruct(fan(), settings=LONG, checkpoint=path, callbacks=[lambda state: state.share > 0.3])
+    assert "callback" in paused.plan["stop"] and len(paused.history) == 2
+    resumed = reconstruct(fan(), settings=LONG, checkpoint=path, resume=True)
+    assert np.array_equal(resumed.volume, whole.volume)
+
+
+def test_the_time_budget_counts_both_parts(tmp_path):
+    path, long = tmp_path / "fit.npz", QUICK | {"passes": 1e5, "patience": 10**6}
+    reconstruct(fan())  # compiled and warm
+    options = {"settings": long, "time_budget": 1.0}
+    killed_after(3, fan(), path, **options)
+    begun = time.perf_counter()
+    resumed = reconstruct(fan(), checkpoint=path, resume=True, **options)
+    used = time.perf_counter() - begun
+    assert "time budget" in resumed.plan["stop"] and len(resumed.history) > 3
+    assert resumed.seconds > 1.0 and resumed.seconds - used > 0.05, (
+        "the first part's seconds are in the second's"
+    )
+    assert resumed.history[-1]["seconds"] < 1.6
+
+
+def test_resume_begins_anew_without_a_file_and_checkpoint_never_replaces_one(tmp_path):
+    path = tmp_path / "fit.npz"
+    reconstruct(fan(), checkpoint=path, resume=True)
+    before = path.read_bytes()
+    with pytest.raises(FileExistsError, match="resume=True"):
+        reconstruct(fan(), checkpoint=path)
+    assert path.read_bytes() == before and os.listdir(tmp_path) == ["fit.npz"]
+    with pytest.raises(ValueError, match="resume: expected a checkpoint"):
+        reconstruct(fan(), resume=True)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"seed": 5}, "'seed': 5"),
+        ({"settings": LONG | {"tv_weight": 0.5}}, "'tv_weight': 0.5"),
+        ({"time_budget": 100.0}, "time_budget"),
+        ({"unit": "mm"}, "another scan"),
+        ({"spectrum": None}, "another scan"),
+        ({"materials": ("pmma", "aluminium", "iron")}, "another scan"),
+    ],
+)
+def test_another_run_is_refused(tmp_path, change, named):
+    path = tmp_path / "fit.npz"
+    options = {"settings": LONG}
+    killed_after(1, fan(), path, **options)
+    with pytest.raises(ValueError, match=named):
+        reconstruct(fan(), checkpoint=path, resume=True, **(options | change))
+
+
+def test_a_single_other_ray_is_another_scan(tmp_path):
+    path = tmp_path / "fit.npz"
+    killed_after(1, fan(), path, settings=LONG)
+    projections = fan().projections.copy()
+    projections[0, 3, 5] = np.nextafter(projections[0, 3, 5], np.float32(9))
+    with pytest.raises(ValueError, match="another scan"):
+        reconstruct(fan(), projections, checkpoint=path, resume=True, settings=LONG)
+
+
+def rewritten(path, **changes):
+    with np.load(path) as file:
+        arrays = dict(file)
+    np.savez(path, **{name: value for name, value in (arrays | changes).items() if value is not None})
+
+
+def with_numbers(path, **changes):
+    with np.load(path) as file:
+        about = json.loads(file["about"].tobytes())
+    about["numbers"] |= changes
+    return np.frombuffer(json.dumps(about).encode(), np.uint8)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda path: path.write_bytes(path.read_bytes()[:-100]),
+        lambda path: path.write_bytes(b"not an archive"),
+        lambda path: rewritten(path, pull=None),
+        lambda path: rewritten(path, pull=np.zeros(3, np.float32)),
+        lambda path: rewritten(path, **{"gaussians/position": np.full((4, 3), np.nan, np.float32)}),
+        lambda path: rewritten(path, **{"gaussians/group": np.array([2**40])}),
+        lambda path: rewritten(path, order=np.array([10**6])),
+        lambda path: rewritten(path, order=np.array([{}], dtype=object)),
+        lambda path: rewritten(path, about=np.frombuffer(b"[" * 100_000, np.uint8)),
+        lambda path: rewritten(path, about=np.frombuffer(b"{}", np.uint8)),
+        lambda path: rewritten(path, about=with_numbers(path, steps=-1)),
+        lambda path: rewritten(path, about=with_numbers(path, random={"bit_generator": "MT19937"})),
+        lambda path: rewritten(path, about=with_numbers(path, seconds=float("nan"))),
+    ],
+)
+def test_a_damaged_file_is_refused(tmp_path, damage):
+    path = tmp_path / "fit.npz"
+    killed_after(1, fan(), path, settings=LONG)
+    damage(path)
+    with pytest.raises(ValueError, match="checkpoint|path|order"):
+        reconstruct(fan(), checkpoint=path, resume=True, settings=LONG)
+
+
+def test_nothing_in_the_file_is_pickled(tmp_path):
+    path = tmp_path / "fit.npz"
+    killed_after(1, fan(), path, settings=LONG)
+    with np.load(path, allow_pickle=False) as file:
+        assert all(file[name].dtype.kind in "fiu" for name in file.files) and len(file.files) > 20
+    with zipfile.ZipFile(path) as archive:
+        assert archive.testzip() is None
+
+
+def test_a_disk_that_fills_up_ends_no_run(tmp_path, monkeypatch, caplog):
+    path = tmp_path / "fit.npz"
+
+    def full(folder, needed):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr("tomo_polysplat.files.require_room", full)
+    result = reconstruct(fan(), checkpoint=path)
+    assert "passes" in result.plan["stop"] and "No space left" in caplog.text and not path.exists()
+
+
+def test_writing_takes_a_small_share_of_the_time(tmp_path, monkeypatch):
+    """With a clock of its own: passes of 1 s, files that take 0.13 s to write."""
+    import tomo_polysplat.fit.checkpoint as module
+
+    now, written = [100.0], []
+    monkeypatch.setattr(module, "_LARGEST_SHARE", 0.05)
+    monkeypatch.setattr(module.time, "perf_counter", lambda: now[0])
+    keeper = Checkpoint.__new__(Checkpoint)
+    keeper.path, keeper._written, keeper._took = tmp_path / "fit.npz", 0.0, 0.0
+
+    def write(snapshot):
+        now[0] += 0.13
+        written.append(snapshot)
+
+    monkeypatch.setattr(keeper, "_write", write)
+    for number in range(20):
+        now[0] += 1.0
+        keeper.offer(lambda number=number: number, now=False)
+    assert written == [0, 3, 6, 9, 12, 15, 18]
+    keeper.offer(lambda: "last", now=True)
+    assert written[-1] == "last"

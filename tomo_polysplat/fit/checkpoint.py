@@ -1,0 +1,267 @@
+"""A fit in a file, from which an interrupted run goes on as if nothing had happened.
+
+The file is an ``.npz`` archive without pickled objects: the Gaussians with the optimiser's memory of them, the
+best ones so far, and in ``about`` (JSON in UTF-8) the plan, the random numbers' state, the history, and what
+scan and options all that belongs to.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import math
+import os
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from tomo_polysplat.checks import fail
+from tomo_polysplat.files import replacing, require_replaceable, require_writable
+from tomo_polysplat.fit.plan import Plan
+from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.scan.npz import read_archive
+
+__all__ = ["Checkpoint", "Snapshot"]
+
+logger = logging.getLogger(__name__)
+
+FORMAT = 1
+# Writing takes at most this share of the time.
+_LARGEST_SHARE = 0.05
+_PARTS = tuple(field.name for field in fields(Gaussians))
+_FITTED = tuple(name for name in _PARTS if name != "group")
+# What taking apart something else than the expected raises.
+_DAMAGES = (KeyError, TypeError, AttributeError, RecursionError, OverflowError)
+_NAMES = (
+    *(f"{kind}/{name}" for kind in ("gaussians", "best") for name in _PARTS),
+    *(f"{moment}/{name}" for moment in ("first", "second") for name in _FITTED),
+    *("pull", "order", "about"),
+)
+
+
+@dataclass
+class Snapshot:
+    """A fit between two passes over the views.
+
+    Attributes
+    ----------
+    gaussians, best : Gaussians
+        As they are fitted, and as the held-out rays liked them best; ``best`` is None before the first pass.
+    first, second : dict of name to tensor
+        Adam's moments of the fitted parameters.
+    pull : (n,) tensor
+        Lengths of the gradients of the positions since the last relocation.
+    order : int array
+        Views still to be used before any is used again.
+    numbers : dict
+        What JSON can hold: steps, clock, history, and the state of the random numbers.
+    """
+
+    gaussians: Gaussians
+    best: Gaussians | None
+    first: dict[str, torch.Tensor]
+    second: dict[str, torch.Tensor]
+    pull: torch.Tensor
+    order: np.ndarray
+    numbers: dict[str, Any]
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Everything but the numbers, by its name in the file."""
+        found: dict[str, Any] = {"pull": self.pull, "order": torch.as_tensor(self.order)}
+        for kind, cloud in (("gaussians", self.gaussians), ("best", self.best)):
+            if cloud is not None:
+                found |= {f"{kind}/{name}": getattr(cloud, name) for name in _PARTS}
+        for kind, moments in (("first", self.first), ("second", self.second)):
+            found |= {f"{kind}/{name}": tensor for name, tensor in moments.items()}
+        return {name: tensor.detach().cpu().numpy() for name, tensor in found.items()}
+
+
+class Checkpoint:
+    """The file of one run.
+
+    Parameters
+    ----------
+    path : path
+    problem : Problem
+        The scan.
+    options : mapping
+        Everything else that the result depends on, in what JSON can hold.
+    resume : bool
+        Go on from the file if it exists; without it a file that exists is refused.
+
+    Raises
+    ------
+    FileExistsError
+        If the file exists and ``resume`` is false.
+    ValueError
+        If it is damaged, or belongs to another scan or to other options.
+    OSError
+        If it could not be written.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike, problem: Problem, options: Mapping[str, Any], *, resume: bool
+    ) -> None:
+        self.path = Path(path)
+        remedy = "pass resume=True to go on from it, or remove it"
+        require_replaceable(self.path, resume, remedy)
+        require_writable(self.path.parent)
+        self._views = len(problem.projections)
+        self.scan, self.options = _digest(problem), json.loads(json.dumps(dict(options)))
+        self.plan: Plan | None = None
+        self.snapshot: Snapshot | None = None
+        self._written, self._took = 0.0, 0.0
+        if self.path.exists():
+            self._read()
+
+    @property
+    def seconds(self) -> float:
+        """What the run has taken so far."""
+        return 0.0 if self.snapshot is None else self.snapshot.numbers["seconds"]
+
+    def offer(self, make: Callable[[], Snapshot], *, now: bool) -> None:
+        """Write what ``make`` returns, unless that has only just been done; ``now`` writes it in any case.
+
+        A disk that fills up in the middle of a run does not end the run: the last file that was complete stays.
+        """
+        begun = time.perf_counter()
+        if not now and (begun - self._written) * _LARGEST_SHARE < self._took:
+            return
+        try:
+            self._write(make())
+        except OSError as error:
+            logger.warning("The checkpoint was not written, and the run goes on: %s", error)
+        self._written = time.perf_counter()
+        self._took = self._written - begun
+
+    def _write(self, snapshot: Snapshot) -> None:
+        assert self.plan is not None
+        about = {"format": FORMAT, "scan": self.scan, "options": self.options, "plan": asdict(self.plan)}
+        text = json.dumps(about | {"numbers": snapshot.numbers}, default=str)
+        arrays = snapshot.arrays() | {"about": np.frombuffer(text.encode(), np.uint8)}
+        needed = sum(array.nbytes for array in arrays.values())
+        with (
+            replacing(self.path, overwrite=True, needed_bytes=needed) as temporary,
+            open(temporary, "wb") as file,
+        ):
+            np.savez(file, **arrays)  # type: ignore[arg-type]  # its stubs know only NumPy 2.1 and later
+
+    def _read(self) -> None:
+        arrays = read_archive(self.path, _NAMES)
+        try:
+            about = _content(arrays["about"])
+            self._require_same(about)
+            self.plan = _plan(about["plan"])
+            self.snapshot = _snapshot(arrays, dict(about["numbers"]), self._views)
+        except _DAMAGES as error:
+            raise self._damaged(f"{type(error).__name__} {error}") from error
+        logger.info("Going on after %s steps from %s", self.snapshot.numbers.get("steps"), self.path)
+
+    def _damaged(self, why: str) -> Exception:
+        return fail("checkpoint", "a complete checkpoint", f"{self.path} ({why})", "remove it and begin anew")
+
+    def _require_same(self, about: dict[str, Any]) -> None:
+        remedy = "remove the file or name another one"
+        if about["format"] != FORMAT:
+            raise fail("checkpoint", f"a file of format {FORMAT}", f"{about['format']!r}", remedy)
+        if about["scan"] != self.scan:
+            raise fail(
+                "checkpoint", "one of this scan", f"{self.path}, which another scan left behind", remedy
+            )
+        names = sorted(self.options.keys() | about["options"].keys())
+        other = [name for name in names if self.options.get(name) != about["options"].get(name)]
+        if other:
+            mine, its = (
+                {name: known.get(name) for name in other} for known in (self.options, about["options"])
+            )
+            raise fail("checkpoint", f"one made with {mine}", f"{its} in {self.path}", remedy)
+
+
+def _digest(problem: Problem) -> str:
+    """What tells this scan, in these coordinates, from any other."""
+    geometry, grid = problem.geometry, problem.grid
+    spectrum, materials = problem.spectrum, problem.materials
+    digest = hashlib.sha256()
+    arrays = [problem.projections, geometry.origin, geometry.corner, geometry.u, geometry.v]
+    arrays += [np.array(grid.shape), grid.lower, grid.upper, problem.centre]
+    if spectrum is not None and materials is not None:
+        arrays += [spectrum.energies, spectrum.weights, materials.mass_attenuation(spectrum.energies)]
+    for array in arrays:
+        digest.update(f"{array.shape}{array.dtype}".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    digest.update(repr((geometry.beam, float(problem.length), float(problem.depth), problem.planar)).encode())
+    return digest.hexdigest()
+
+
+def _content(about: np.ndarray) -> dict[str, Any]:
+    try:
+        return json.loads(about.tobytes())
+    except ValueError as error:
+        raise TypeError(f"no JSON: {error}") from error
+
+
+def _plan(parts: dict[str, Any]) -> Plan:
+    plan = Plan(**parts)
+    above_zero = plan.reference > 0 and plan.spacing > 0 and plan.views_per_step > 0
+    if not (above_zero and isinstance(plan.views_per_step, int) and isinstance(plan.reasons, dict)):
+        raise TypeError(f"a plan, got {parts}")
+    return plan
+
+
+def _snapshot(arrays: dict[str, np.ndarray], numbers: dict[str, Any], views: int) -> Snapshot:
+    """The snapshot of a file, its parts checked against each other."""
+    gaussians = _cloud(arrays, "gaussians", arrays["gaussians/attenuation"].shape)
+    best = _cloud(arrays, "best", gaussians.attenuation.shape) if "best/position" in arrays else None
+    shapes = {name: tuple(tensor.shape) for name, tensor in gaussians.parameters().items()}
+    first, second = (
+        {name: _tensor(arrays[f"{kind}/{name}"], shape) for name, shape in shapes.items()}
+        for kind in ("first", "second")
+    )
+    pull = _tensor(arrays["pull"], shapes["attenuation"])
+    order = arrays["order"]
+    if order.ndim != 1 or order.dtype.kind != "i" or ((order < 0) | (order >= views)).any():
+        raise TypeError("order of the views")
+    _require_numbers(numbers)
+    return Snapshot(gaussians, best, first, second, pull, order, numbers)
+
+
+def _require_numbers(numbers: dict[str, Any]) -> None:
+    counts = ("steps", "steps_made", "waited", "skipped_pairs", "relocated")
+    if any(not isinstance(numbers[name], int) or numbers[name] < 0 for name in counts):
+        raise TypeError(f"whole numbers for {', '.join(counts)}")
+    if any(not math.isfinite(numbers[name]) for name in ("seconds", "begun")) or math.isnan(
+        numbers["lowest"]
+    ):
+        raise TypeError("finite times")
+    if not isinstance(numbers["history"], list) or not isinstance(numbers["reason"], str):
+        raise TypeError("a history and a reason")
+    try:
+        np.random.default_rng().bit_generator.state = numbers["random"]
+    except ValueError as error:
+        raise TypeError(f"random numbers: {error}") from error
+
+
+def _cloud(arrays: dict[str, np.ndarray], kind: str, count: tuple[int, ...]) -> Gaussians:
+    """Gaussians of the file, ``count`` (n,) of them."""
+    dims, groups = arrays[f"{kind}/log_scale"].shape[-1], arrays[f"{kind}/shared_material"].shape[-1]
+    tails: dict[str, tuple[int, ...]] = {"position": (3,), "log_scale": (dims,), "rotation": (4,)}
+    parts = {name: _tensor(arrays[f"{kind}/{name}"], (*count, *tails.get(name, ()))) for name in _FITTED[:-1]}
+    shared = _tensor(arrays[f"{kind}/shared_material"], (groups,))
+    group = arrays[f"{kind}/group"]
+    whole = group.dtype == np.int64 and group.shape == count
+    if len(count) != 1 or dims not in (2, 3) or not whole or (group < -1).any() or (group >= groups).any():
+        raise TypeError(f"{kind} of shape {count}")
+    return Gaussians(**parts, shared_material=shared, group=torch.from_numpy(group))
+
+
+def _tensor(array: np.ndarray, shape: tuple[int, ...]) -> torch.Tensor:
+    if array.dtype != np.float32 or array.shape != shape or not np.isfinite(array).all():
+        raise TypeError(f"finite float32 of shape {shape}, got {array.dtype} of shape {array.shape}")
+    return torch.from_numpy(array)
