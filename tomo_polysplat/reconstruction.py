@@ -21,6 +21,7 @@ from tomo_polysplat.kernels.device import one_torch_thread, pick_device
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.physics.water_correction import describe_polynomial, undo_water_correction
 from tomo_polysplat.progress import progress_reports
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import (
@@ -52,6 +53,7 @@ def reconstruct(
     seed: int = 0,
     device: str = "auto",
     valid: Any = None,
+    water_correction: Sequence[float] | None = None,
     callbacks: Sequence[Callable[[FitState], Any]] = (),
     progress: bool | Callable[[float, str], Any] | None = None,
     settings: Settings | Mapping[str, Any] | None = None,
@@ -82,6 +84,10 @@ def reconstruct(
     device : {"auto", "cpu", "cuda", "cuda:N"}
     valid : bool array, shape of ``projections``, optional
         False for rays that must not be used.
+    water_correction : sequence of float, optional
+        Coefficients c_0 = 0, c_1, ... of the polynomial ``sum_k c_k P^k`` that the scanner has put its
+        -log(I/I0) through; it is undone first, so that every ray keeps the noise of its counts. With a
+        spectrum only.
     callbacks : sequence of callables
         Each gets a :class:`~tomo_polysplat.fit.optimise.FitState` once a pass over the views; returning True
         ends the fit.
@@ -119,6 +125,7 @@ def reconstruct(
     rng, target, callbacks = _generator(seed), pick_device(device), _functions(callbacks)
     geometry, grid = from_astra(proj_geom, vol_geom)
     values, counts = _usable(projections, proj_geom, valid)
+    values = _uncorrected(values, water_correction, spectrum)
     problem = Problem.of(values, geometry, grid, unit, spectrum, materials)
     flipped = is_planar_geometry(proj_geom)
     options = chosen.to_dict() | {"seed": int(seed), "time_budget": time_budget}
@@ -127,6 +134,8 @@ def reconstruct(
     with one_torch_thread(target), progress_reports(progress) as report:
         report(0.0, "start volume")
         plan, gaussians = _begin(problem, chosen, target, saved)
+        if water_correction is not None:
+            plan.reasons["water_correction"] = f"undone: {describe_polynomial(water_correction)}"
         scene, rays = problem.scene(plan, chosen, target), problem.rays(plan, chosen, target)
         outcome = fit(
             gaussians,
@@ -221,6 +230,18 @@ def _usable(projections: Any, proj_geom: Mapping[str, Any], valid: Any) -> tuple
         remedy = "give -log(I/I0), not intensities, and check the flat fields and the mask"
         raise fail("projections", "at least one usable ray", "none", remedy)
     return values, counts
+
+
+def _uncorrected(
+    values: np.ndarray, water_correction: Sequence[float] | None, spectrum: Spectrum | None
+) -> np.ndarray:
+    """The projections before the scanner's water correction."""
+    if water_correction is None:
+        return values
+    if spectrum is None:
+        remedy = "a monochromatic model wants the values as they are: leave water_correction out"
+        raise fail("water_correction", "a spectrum beside it", "none", remedy)
+    return undo_water_correction(values, water_correction).astype(np.float32)
 
 
 def _volume_of(

@@ -117,6 +117,13 @@ def add_scan_options(parser: argparse.ArgumentParser) -> None:
         help="what /exchange/data holds (default: by its attribute or its open-beam images)",
     )
     group.add_argument(
+        "--water-correction",
+        nargs="+",
+        type=float,
+        metavar="C",
+        help="polynomial that the scanner put -log(I/I0) through, as 0 C1 C2 ... in ascending powers",
+    )
+    group.add_argument(
         "--saturation", type=float, metavar="COUNTS", help="counts at which the detector saturates"
     )
 
@@ -133,6 +140,7 @@ def scan_from(arguments: argparse.Namespace, spectrum: Spectrum | None = None) -
         pixel_size=arguments.pixel_size,
         input=arguments.input,
         saturation=arguments.saturation,
+        water_correction=arguments.water_correction,
     )
 
 

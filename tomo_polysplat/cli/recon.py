@@ -86,6 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
             seed=arguments.seed,
             device=arguments.device,
             valid=scan.valid,
+            water_correction=None if spectrum is None else scan.water_correction,
             progress=progress,
             settings=dict(_setting(text) for text in arguments.set) or None,
         )

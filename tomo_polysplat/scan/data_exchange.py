@@ -8,7 +8,7 @@ in a group of our own, ``/polysplat``:
   ymin, ymax, zmin, zmax);
 - ``spectrum``: datasets ``energies`` (keV) and ``weights``;
 - ``truth`` (z, y, x) in 1/unit with attribute ``energy_kev``; ``metal_mask`` (z, y, x);
-  ``valid`` (like data).
+  ``valid`` (like data); ``water_correction``, the coefficients of ``Scan``.
 
 The attribute ``input`` of ``/exchange/data`` tells counts, transmission and attenuation apart.
 """
@@ -234,11 +234,12 @@ def _pixel_size(file: h5py.File, options: ReadOptions) -> tuple[float, str]:
 
 
 def _knowledge(file: h5py.File, options: ReadOptions) -> dict[str, Any]:
-    """Spectrum, truth and metal mask, where the file has them."""
-    group = file.get("polysplat")
-    if group is None:
-        return {"spectrum": options.spectrum}
+    """Spectrum, water correction, truth and metal mask, where the file has them."""
+    group = file.get("polysplat", {})
     known: dict[str, Any] = {"spectrum": options.spectrum or read_spectrum(group)}
+    known["water_correction"] = options.water_correction
+    if options.water_correction is None and "water_correction" in group:
+        known["water_correction"] = read_numbers(group, "water_correction")
     if options.vol_geom is None and "truth" in group:
         energy = group["truth"].attrs.get("energy_kev")
         known |= {
@@ -284,6 +285,8 @@ def _write_knowledge(group: h5py.Group, scan: Scan) -> None:
     write_spectrum(group, scan.spectrum)
     if scan.valid is not None:
         group["valid"] = scan.valid.transpose(1, 0, 2)
+    if scan.water_correction is not None:
+        group["water_correction"] = np.array(scan.water_correction)
     if scan.metal_mask is not None:
         group["metal_mask"] = scan.metal_mask
     if scan.truth is not None:

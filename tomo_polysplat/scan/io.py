@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +33,7 @@ def load_scan(
     saturation: float | None = None,
     proj_geom: Mapping[str, Any] | None = None,
     vol_geom: Mapping[str, Any] | None = None,
+    water_correction: Sequence[float] | None = None,
 ) -> Scan:
     """Read a scan from a Data Exchange HDF5 file or an ``.npz`` scan.
 
@@ -64,6 +65,8 @@ def load_scan(
     proj_geom, vol_geom : dict or None
         ASTRA geometries (three-dimensional types) instead of the file's; `vol_geom` may be given alone, and
         then no truth is read.
+    water_correction : sequence of float or None
+        Polynomial that the projections have been put through, instead of the file's; see :class:`Scan`.
 
     Returns
     -------
@@ -79,7 +82,8 @@ def load_scan(
     MemoryError
         If an array is larger than the free memory.
     """
-    options = ReadOptions(spectrum, unit, centre, pixel_size, theta, input, saturation, proj_geom, vol_geom)
+    stated = (spectrum, unit, centre, pixel_size, theta, input, saturation, proj_geom, vol_geom)
+    options = ReadOptions(*stated, water_correction)
     file = existing_file(path)
     if zipfile.is_zipfile(file):
         return scan_from_npz(file, options)

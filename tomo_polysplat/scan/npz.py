@@ -4,7 +4,7 @@
 ``astra_type`` says otherwise; ``vol_shape`` (nz, ny, nx);
 ``vol_window`` (xmin, xmax, ymin, ymax, zmin, zmax); optional ``unit`` (cm if absent), ``energies`` (keV) with
 ``spectrum``, ``truth_mu`` and ``metal_mask`` (z, y, x), ``e_ref`` or ``e_eff`` (keV, energy of the truth) and
-``valid`` (like the projections).
+``valid`` (like the projections) and ``water_correction`` (coefficients of ``Scan``).
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ __all__ = ["read_archive", "scan_from_npz", "write_npz"]
 NAMES = (
     *("projections", "valid", "astra_type", "vectors", "vol_shape", "vol_window", "unit"),
     *("energies", "spectrum", "spectrum_label", "truth_mu", "metal_mask", "e_ref", "e_eff"),
+    "water_correction",
 )
 
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
@@ -113,6 +114,7 @@ def scan_from_npz(path: Path, options: ReadOptions) -> Scan:
         metal_mask=arrays.get("metal_mask") if own_volume else None,
         truth_energy_kev=_number(arrays, "e_ref", "e_eff"),
         name=path.stem,
+        water_correction=_water_correction(arrays, options),
         notes={"input": "attenuation", "rays": counts},
         **_geometry(arrays, (rows, views, columns), options),
     )
@@ -141,6 +143,12 @@ def _spectrum(arrays: dict[str, np.ndarray]) -> Spectrum | None:
     )
 
 
+def _water_correction(arrays: dict[str, np.ndarray], options: ReadOptions) -> tuple[float, ...] | None:
+    if options.water_correction is not None:
+        return tuple(options.water_correction)
+    return tuple(arrays["water_correction"]) if "water_correction" in arrays else None
+
+
 def _number(arrays: dict[str, np.ndarray], *names: str) -> float | None:
     """The first of the named numbers that is there."""
     present = [name for name in names if name in arrays]
@@ -164,6 +172,7 @@ def write_npz(scan: Scan, path: str | Path, *, overwrite: bool = False) -> None:
         "truth_mu": scan.truth,
         "metal_mask": scan.metal_mask,
         "e_ref": scan.truth_energy_kev,
+        "water_correction": scan.water_correction,
         "valid": None if scan.valid is None else scan.valid.transpose(1, 0, 2),
     }
     if scan.spectrum is not None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tomo_polysplat.checks import fail, require_array, require_shape
+from tomo_polysplat.physics.water_correction import require_water_correction
 
 if TYPE_CHECKING:
     from tomo_polysplat.physics.spectrum import Spectrum
@@ -45,6 +46,9 @@ class Scan:
         A name for reports.
     valid : bool array, shape (rows, views, columns), or None
         False where a ray was not measured properly; None when every ray is good.
+    water_correction : tuple of float or None
+        Coefficients c_0 = 0, c_1, ... of the polynomial in -log(I/I0) that the scanner has put
+        ``projections`` through; None when it did not.
     notes : dict
         Counts and choices made while reading, such as the number of rays without light.
     """
@@ -59,6 +63,7 @@ class Scan:
     truth_energy_kev: float | None = None
     name: str = "scan"
     valid: np.ndarray | None = None
+    water_correction: tuple[float, ...] | None = None
     notes: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -69,6 +74,8 @@ class Scan:
         if self.valid is not None:
             self.valid = np.ascontiguousarray(self.valid, bool)
             require_shape("valid", self.valid, self.projections.shape, "(rows, views, columns)")
+        if self.water_correction is not None:
+            self.water_correction = require_water_correction(self.water_correction)
         if self.truth is not None:
             self.truth = np.ascontiguousarray(require_array("truth", self.truth, 3), np.float32)
             require_shape("truth", self.truth, self.volume_shape, "(z, y, x)")
