@@ -21,6 +21,7 @@ from splat_scenes import (
     run_voxelise,
     voxel_box,
 )
+from step_scenes import compare_steps
 
 CASES = {}
 
@@ -209,6 +210,36 @@ def wrong_inputs_are_refused(device):
                 assert name in str(problem)
             else:
                 raise AssertionError(f"{operation.__name__} took a wrong {name}")
+
+
+def _fused(*problem):
+    from tomo_polysplat.fit.fused_step import FusedStep
+
+    return FusedStep(*problem[:-1])
+
+
+@case
+def a_step_of_our_kernels_is_that_of_autograd(device):
+    moved = compare_steps(_fused, device, ("cpu", "numba"))
+    # Every kind of parameter moved, but for the held number of the soft matter.
+    assert all(bool(t.any()) for t in moved.values())
+    assert float(moved["shared_material"][0]) == 0 != float(moved["shared_material"][1])
+
+
+@case
+def a_step_of_a_monochromatic_parallel_scan(device):
+    moved = compare_steps(_fused, device, ("cpu", "numba"), "parallel", False, loss="weighted-l1")
+    assert not moved["own_material"].any() and not moved["shared_material"].any()
+
+
+@case
+def a_step_in_two_dimensions(device):
+    compare_steps(_fused, device, ("cpu", "numba"), "fan", material_from=2.0)
+
+
+@case
+def a_step_without_smoothing_or_held_out_rays(device):
+    compare_steps(_fused, device, ("cpu", "numba"), tv_weight=0.0, held_out=0.0)
 
 
 def poison() -> None:

@@ -13,10 +13,10 @@ import numpy as np
 import torch
 
 from tomo_polysplat.fit.checkpoint import Checkpoint, Snapshot
+from tomo_polysplat.fit.choose_step import make_step
 from tomo_polysplat.fit.loss import random_box
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.fit.step import EagerStep, Step
 from tomo_polysplat.fit.stopping import Clock, FitState, Watch
 from tomo_polysplat.model.density_control import relocate
 from tomo_polysplat.model.gaussians import Gaussians
@@ -48,24 +48,27 @@ class _Fitter:
         rays: Rays,
         scene: FitScene,
         settings: Settings,
+        batch: int,
         rng: np.random.Generator,
     ) -> None:
         self.gaussians, self.rays, self.scene, self.settings, self.rng = gaussians, rays, scene, settings, rng
-        self.step: Step = EagerStep(gaussians, spacing, rays, scene, settings)
-        self.order = np.empty(0, int)
+        # Its shape is that of every box.
+        box = random_box(scene.box, settings, np.random.default_rng(0))
+        self.step = make_step(gaussians, spacing, rays, scene, settings, batch=batch, box=box)
+        self.batch, self.order = batch, np.empty(0, int)
         self.relocated = 0
         self.relocation_due = False
 
-    def passes(self, batch: int, clock: Clock) -> Iterator[tuple[float, float, int]]:
+    def passes(self, clock: Clock) -> Iterator[tuple[float, float, int]]:
         """Step until the clock runs out; what each pass over the views gave, the last perhaps a part of one.
 
         That is the mean misfit of the fitted rays and of those held out, and the pairs skipped.
         """
-        steps, made = max(1, round(len(self.rays.views) / batch)), 0
+        steps, made = max(1, round(len(self.rays.views) / self.batch)), 0
         while (share := clock.share()) < 1:
             if self.relocation_due:
                 self._relocate()
-            views = self._next_views(batch)
+            views = self._next_views(self.batch)
             self.step(views, random_box(self.scene.box, self.settings, self.rng), share)
             clock.done += 1
             made += 1
@@ -190,14 +193,14 @@ def fit(
     if not len(gaussians):
         logger.warning("The start volume is empty: no Gaussians, a volume of zeros.")
         return FitOutcome(gaussians, reason="nothing to fit: the start volume is empty")
-    fitter = _Fitter(gaussians, spacing, rays, scene, settings, rng)
-    outcome, watch = FitOutcome(gaussians), Watch(settings)
     batch = min(views_per_step, len(rays.views))
+    fitter = _Fitter(gaussians, spacing, rays, scene, settings, batch, rng)
+    outcome, watch = FitOutcome(gaussians), Watch(settings)
     clock = Clock(max(1, math.ceil(settings.passes * len(rays.views) / batch)), deadline)
     run = _Run(fitter, outcome, watch, clock, started, checkpoint)
     run.restore()
     try:
-        for loss, held_out, skipped in () if outcome.reason else fitter.passes(batch, clock):
+        for loss, held_out, skipped in () if outcome.reason else fitter.passes(clock):
             outcome.skipped_pairs += skipped
             outcome.relocated = fitter.relocated
             state = FitState(

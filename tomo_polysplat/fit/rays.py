@@ -11,6 +11,9 @@ from tomo_polysplat.kernels.views import DetectorViews
 
 __all__ = ["Rays"]
 
+# Views whose weights are added up at once.
+_CHUNK = 8
+
 
 @dataclass
 class Rays:
@@ -28,6 +31,8 @@ class Rays:
         Error of P that the model itself is allowed, which keeps quiet rays from outweighing the rest.
     held_out : float
         Share of the rays kept from the fit.
+    device : torch.device, optional
+        Where batches go, for projections that stay on the host because they do not fit there.
     """
 
     projections: torch.Tensor
@@ -35,6 +40,23 @@ class Rays:
     photons: float
     model_error: float
     held_out: float
+    device: torch.device | None = None
+
+    @property
+    def target(self) -> torch.device:
+        """Where batches go."""
+        return self.projections.device if self.device is None else self.device
+
+    @property
+    def noise(self) -> float:
+        """Variance of an unattenuated ray over that of the model's error."""
+        allowed = self.photons * self.model_error**2
+        return 1 / allowed if allowed else float("inf")
+
+    @property
+    def threshold(self) -> int:
+        """Of 65536 rays, so many are held out."""
+        return int(self.held_out * 65536)
 
     def batch(self, chosen: np.ndarray) -> tuple[DetectorViews, torch.Tensor, torch.Tensor, torch.Tensor]:
         """Views, values (0 where unusable), fit weights and held-out weights of the chosen views.
@@ -43,21 +65,30 @@ class Rays:
         weight is the inverse deviation, 1 for a ray without noise.
         """
         # Stacked view by view: an index tensor would have to travel to a GPU, which waits for it.
-        values = torch.stack([self.projections[view] for view in chosen.tolist()])
+        values = torch.stack([self.projections[view] for view in chosen.tolist()]).to(self.target)
         usable = torch.isfinite(values)
         values = torch.where(usable, values, torch.zeros_like(values))
         weight = usable.to(values.dtype)
-        weight = weight * torch.rsqrt(1 + torch.exp(values) / (self.photons * self.model_error**2))
+        if self.noise:
+            weight = weight * torch.rsqrt(1 + torch.exp(values) * self.noise)
         aside = self._aside(chosen, values.shape[1:])
         return self.views.select(chosen), values, weight * ~aside, weight * aside
 
+    def totals(self) -> torch.Tensor:
+        """(views,) weight of the fitted rays of each view."""
+        sums = []
+        for first in range(0, len(self.views), _CHUNK):
+            _, _, weight, _ = self.batch(np.arange(first, min(first + _CHUNK, len(self.views))))
+            sums.append(weight.sum(dim=(1, 2)))
+        return torch.cat(sums)
+
     def _aside(self, chosen: np.ndarray, shape: torch.Size) -> torch.Tensor:
         """Pixels held out: a fixed pseudo-random choice, different in every view, that needs no memory."""
-        device = self.projections.device
+        device = self.target
         if not self.held_out:
             return torch.zeros((len(chosen), *shape), dtype=torch.bool, device=device)
         pixel = torch.arange(shape.numel(), device=device, dtype=torch.int64).reshape(shape) * 2654435761
         # One round of a multiplicative hash (Knuth) over the pair, to 16 even bits.
         mixed = torch.stack([(pixel + (view * 40503 + 12345)) & 0xFFFFFFFF for view in chosen.tolist()])
         mixed = ((mixed ^ (mixed >> 15)) * 2246822519) & 0xFFFFFFFF
-        return (mixed >> 16) < int(self.held_out * 65536)
+        return (mixed >> 16) < self.threshold

@@ -16,7 +16,17 @@ from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 
-__all__ = ["EPSILON", "LEAST_U", "EagerStep", "Moments", "Step", "log_scale_bounds", "step_rates"]
+__all__ = [
+    "EPSILON",
+    "LEAST_U",
+    "EagerStep",
+    "Moments",
+    "Step",
+    "held_out_mean",
+    "log_scale_bounds",
+    "new_moments",
+    "step_rates",
+]
 
 # Fat and plastics harden a beam less than water does: their curve is the mixture's continued a little below 0.
 LEAST_U = -0.1
@@ -76,6 +86,16 @@ def log_scale_bounds(
     return math.log(settings.smallest_scale * voxel), math.log(settings.largest_scale * spacing)
 
 
+def new_moments(parameters: dict[str, torch.Tensor]) -> Moments:
+    """Adam's memory before its first step."""
+    return {name: (torch.zeros_like(t), torch.zeros_like(t)) for name, t in parameters.items()}
+
+
+def held_out_mean(total: float, weight: float) -> float:
+    """Mean misfit of the held-out rays from its sum and their weight."""
+    return total / weight if weight >= _FEWEST_HELD_OUT else math.nan
+
+
 class EagerStep:
     """The step as torch runs it, operation by operation; see `Step`."""
 
@@ -89,7 +109,7 @@ class EagerStep:
         rates = step_rates(settings, spacing)
         groups = [{"params": [parameters[k].requires_grad_()], "lr": v, "rate": v} for k, v in rates.items()]
         self.optimiser = torch.optim.Adam(groups, eps=EPSILON, fused=True)
-        self.moments = {k: (torch.zeros_like(t), torch.zeros_like(t)) for k, t in parameters.items()}
+        self.moments = new_moments(parameters)
         for name, tensor in parameters.items():
             first, second = self.moments[name]
             count = torch.zeros((), dtype=torch.float32, device=tensor.device)
@@ -165,8 +185,3 @@ class EagerStep:
         gradient = self.gaussians.shared_material.grad
         if gradient is not None:
             gradient[: 1 if share >= self.settings.material_from else None] = 0.0
-
-
-def held_out_mean(total: float, weight: float) -> float:
-    """Mean misfit of the held-out rays from its sum and their weight."""
-    return total / weight if weight >= _FEWEST_HELD_OUT else math.nan

@@ -75,9 +75,14 @@ class DetectorViews:
             whole, indices = self._chosen_from
             table = whole.table(device)
             return torch.cat([table[k : k + 1] for k in indices.tolist()])
-        parts = [self.origin, self.inverse.reshape(count, 9), self.matrix.reshape(count, 9)]
         # From ordinary memory the copy is staged at once: it neither waits for the device nor races with numpy.
-        return torch.from_numpy(np.concatenate(parts, axis=1)).to(device, non_blocking=True)
+        return torch.from_numpy(self.host_table()).to(device, non_blocking=True)
+
+    def host_table(self) -> np.ndarray:
+        """(views, 21) float64 origin, inverse and matrix, row by row."""
+        count = len(self)
+        parts = [self.origin, self.inverse.reshape(count, 9), self.matrix.reshape(count, 9)]
+        return np.concatenate(parts, axis=1)
 
     @property
     def inverse(self) -> np.ndarray:

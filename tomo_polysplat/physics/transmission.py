@@ -12,7 +12,7 @@ from tomo_polysplat.checks import fail
 from tomo_polysplat.physics import beer_lambert
 from tomo_polysplat.physics.quadrature import Quadrature
 
-__all__ = ["polychromatic_projection", "polychromatic_projection_numpy"]
+__all__ = ["nodes_on", "polychromatic_projection", "polychromatic_projection_numpy"]
 
 
 def polychromatic_projection(areal: torch.Tensor, quadrature: Quadrature) -> torch.Tensor:
@@ -45,7 +45,7 @@ def polychromatic_projection(areal: torch.Tensor, quadrature: Quadrature) -> tor
         raise fail("areal", "shape (3, ...), one channel per base material", f"{tuple(areal.shape)}")
     if areal.dtype not in (torch.float32, torch.float64):
         raise fail("areal", "float32 or float64", f"{areal.dtype}")
-    log_weights, attenuation = _constants(quadrature, areal.dtype, areal.device)
+    log_weights, attenuation = nodes_on(quadrature, areal.dtype, areal.device)
     return _Projection.apply(areal, log_weights, attenuation)
 
 
@@ -58,7 +58,7 @@ def polychromatic_projection_numpy(areal: np.ndarray, quadrature: Quadrature) ->
 
 
 @lru_cache(maxsize=16)
-def _constants(
+def nodes_on(
     quadrature: Quadrature, dtype: torch.dtype, device: torch.device
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Log weights ``(n, 1)`` and attenuation ``(n, 3)`` where they are needed, copied there once."""

@@ -9,13 +9,13 @@ import torch
 import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
-from tomo_polysplat.kernels.project.triton_image import lay_out_gradient, spread
+from tomo_polysplat.kernels.project.triton_image import spread
 from tomo_polysplat.kernels.project.triton_setup import RECORD
 from tomo_polysplat.kernels.triton_lanes import SUMS, half_sums, load_four
 from tomo_polysplat.kernels.triton_maths import HALF_LOG2E, on_device
 from tomo_polysplat.kernels.views import DetectorViews
 
-__all__ = ["BLOCK", "sum_moments"]
+__all__ = ["BLOCK", "beyond", "sum_moments"]
 
 BLOCK = (8, 2)  # rows and columns of the lanes that walk along the rows of a footprint
 _PLANAR_BLOCK = (1, 16)
@@ -136,18 +136,22 @@ def _moments_kernel(
         tl.store(moments + (view * count + n) * SUMS + lane % 16, total, mask=n < count)
 
 
+def beyond(views: DetectorViews) -> int:
+    """Pixels read after the last: a footprint's row starts on the detector and is walked for its width at most."""
+    return 2 * views.columns + 32
+
+
 def sum_moments(
-    record, grad_image: torch.Tensor, table: torch.Tensor, views: DetectorViews, cutoff: float
+    record, pixels: torch.Tensor, channels: int, views: DetectorViews, cutoff: float
 ) -> torch.Tensor:
     """(views, count, 16) sums over each footprint, with t = r11 x + r12 y and u = r22 y of the record.
 
     First of h (t, u, t^2, tu, u^2), from 5 of s (1, t, u, t^2, tu, u^2), from 11 of f dL/df by channel, where
-    dL/d(distance^2 |e|^2) = -h / 2 and dL/d|e|^2 = -s / 2, all in units of |e_centre|.
+    dL/d(distance^2 |e|^2) = -h / 2 and dL/d|e|^2 = -s / 2, all in units of |e_centre|. ``pixels`` is the gradient
+    of the image of as many ``channels`` in the kernels' layout, with `beyond` zero pixels after it.
     """
-    channels, (many, count) = len(grad_image), record.shape[:2]
+    many, count = record.shape[:2]
     moments = record.new_empty((many, count, SUMS.value))
-    # A row of a footprint starts within the detector and is walked for no more columns than that has.
-    pixels = lay_out_gradient(grad_image, table, views, 2 * views.columns + 32)
     block = _PLANAR_BLOCK if views.rows == 1 else BLOCK
     with on_device(record):
         _moments_kernel[(triton.cdiv(count, 2 * _RUN), many)](

@@ -18,7 +18,7 @@ from tomo_polysplat.kernels.triton_lanes import load_four, store_four
 from tomo_polysplat.kernels.triton_maths import on_device
 from tomo_polysplat.kernels.views import DetectorViews
 
-__all__ = ["finish_image", "lay_out_gradient", "spread"]
+__all__ = ["finish_image", "lay_out_gradient", "pixel_factor", "spread"]
 
 _BLOCK = 256
 _ROOT_TWO_PI = tl.constexpr(math.sqrt(2 * math.pi))
@@ -30,7 +30,8 @@ def spread(channels: int) -> int:
 
 
 @triton.jit
-def _factor(views, view, pixel, columns, CONE: tl.constexpr):
+def pixel_factor(views, view, pixel, columns, CONE: tl.constexpr):
+    """sqrt(2 pi) times the length of the ray of each pixel, counted row by row."""
     at = views + view * VIEW
     d0, d1, d2 = tl.load(at + 14), tl.load(at + 17), tl.load(at + 20)
     if CONE:
@@ -50,7 +51,7 @@ def _finish_kernel(
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = pixel < area
     pixel = tl.minimum(pixel, area - 1)
-    factor = _factor(views, view, pixel, columns, CONE)
+    factor = pixel_factor(views, view, pixel, columns, CONE)
     at = view * area + pixel
     plane = tl.num_programs(1).to(tl.int64) * area
     if CHANNELS == 1:
@@ -95,7 +96,7 @@ def _lay_out_kernel(
     inside = pixel < area
     last = view == tl.num_programs(1) - 1
     live = pixel < tl.where(last, area + beyond, area)
-    factor = _factor(views, view, pixel, columns, CONE)
+    factor = pixel_factor(views, view, pixel, columns, CONE)
     at = view * area + pixel
     plane = tl.num_programs(1).to(tl.int64) * area
     g0 = tl.load(grad + at, mask=inside, other=0.0) * factor

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import torch
 
-from tomo_polysplat.kernels.project.triton_backward import sum_moments
+from tomo_polysplat.kernels.project.triton_backward import beyond, sum_moments
 from tomo_polysplat.kernels.project.triton_forward import splat
-from tomo_polysplat.kernels.project.triton_image import finish_image
+from tomo_polysplat.kernels.project.triton_image import finish_image, lay_out_gradient
 from tomo_polysplat.kernels.project.triton_pull_back import pull_back
 from tomo_polysplat.kernels.project.triton_setup import footprints
 from tomo_polysplat.kernels.triton_maths import require_scene
@@ -52,7 +52,8 @@ class _Project(torch.autograd.Function):
             t.detach().contiguous() for t in (position, scale, rotation, weight)
         )
         table = views.table(position.device)
-        record, skipped = footprints(position, scale, rotation, weight, views, table, cutoff)
+        skipped = torch.zeros((), dtype=torch.int64, device=position.device)
+        record = footprints(position, scale, rotation, weight, views, table, cutoff, skipped)
         image = finish_image(splat(record, len(weight), views, cutoff), table, len(weight), views)
         ctx.save_for_backward(position, scale, rotation, weight, table, record)
         ctx.views, ctx.cutoff = views, cutoff
@@ -64,6 +65,7 @@ class _Project(torch.autograd.Function):
         position, scale, rotation, weight, table, record = ctx.saved_tensors
         if not (record.numel() and grad_image.numel()):
             return (*map(torch.zeros_like, (position, scale, rotation, weight)), None, None)
-        moments = sum_moments(record, grad_image, table, ctx.views, ctx.cutoff)
+        pixels = lay_out_gradient(grad_image, table, ctx.views, beyond(ctx.views))
+        moments = sum_moments(record, pixels, len(grad_image), ctx.views, ctx.cutoff)
         grads = pull_back(position, scale, rotation, weight, table, ctx.views, record, moments)
         return (*grads, None, None)

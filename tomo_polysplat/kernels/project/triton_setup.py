@@ -194,16 +194,22 @@ def _footprint_kernel(
 
 
 def footprints(
-    position, scale, rotation, weight, views: DetectorViews, table: torch.Tensor, cutoff: float
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """``record`` of the module docstring and the number of skipped pairs, 0-dim int64."""
+    position,
+    scale,
+    rotation,
+    weight,
+    views: DetectorViews,
+    table: torch.Tensor,
+    cutoff: float,
+    skipped: torch.Tensor,
+) -> torch.Tensor:
+    """``record`` of the module docstring; the number of skipped pairs is added to ``skipped``, 0-dim int64."""
     count, many = len(position), len(views)
     record = position.new_empty((many, count, RECORD.value))
-    skipped = torch.zeros((), dtype=torch.int64, device=position.device)
     if count and many:
         with on_device(position):
             _footprint_kernel[(triton.cdiv(count, _BLOCK), many)](
                 position, scale, rotation, weight, table, record, skipped, count, views.rows, views.columns,
                 cutoff, CHANNELS=len(weight), CONE=views.cone, PLANAR=views.planar, BLOCK=_BLOCK, num_warps=4,
             )  # fmt: skip
-    return record, skipped
+    return record

@@ -43,14 +43,15 @@ def _moments_kernel(
         at = record + tl.minimum(n, count - 1).to(tl.int64) * RECORD
         xc, yc, zc, r11 = load_four(at)
         r12, r13, r22, r23 = load_four(at + 4)
-        r33, _, half_y, half_z = load_four(at + 8)
+        r33, half_x, half_y, half_z = load_four(at + 8)
         w0, w1, w2, w3 = load_four(at + 12)
         ht, hu, hv, htt, htu = zero, zero, zero, zero, zero
         htv, huu, huv, hvv = zero, zero, zero, zero
         c0, c1, c2, c3 = zero, zero, zero, zero
         first_y, rows = _indices(yc, half_y, ny)
         first_z, slices = _indices(zc, half_z, nz)
-        lines, rows = rows * slices, tl.maximum(rows, 1)
+        _, columns = _indices(xc, half_x, nx)
+        lines, rows = tl.where(columns > 0, rows * slices, 0), tl.maximum(rows, 1)
         for first in range(0, tl.max(lines, 0), BLOCK_H):
             line = first + down
             known = line < lines

@@ -1,0 +1,122 @@
+"""The forms of the optimiser's step: the same mathematics, whichever runs.
+
+The kernels themselves are compared with autograd in tests/kernels, in Triton's interpreter too.
+"""
+
+import logging
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tomo_polysplat.fit.choose_step import make_step, why_eager
+from tomo_polysplat.fit.loss import random_box
+from tomo_polysplat.fit.step import EagerStep
+
+sys.path.append(str(Path(__file__).parents[1] / "kernels"))
+from step_scenes import BATCH, compare_steps, fit_problem
+
+
+def test_a_random_box_is_inside_and_always_of_one_shape():
+    whole = fit_problem("cone", True, "cpu", "numba")[-1].refined(np.array([4, 4, 4]))
+    settings = fit_problem("cone", True, "cpu", "numba", tv_box=20)[4]
+    rng, starts = np.random.default_rng(1), set()
+    for _ in range(20):
+        box = random_box(whole, settings, rng)
+        assert box.shape == (20, 20, 20)
+        start = np.rint((box.first - whole.first) / whole.spacing).astype(int)
+        assert (start >= 0).all() and (start + 20 <= whole.shape[::-1]).all()
+        starts.add(tuple(start))
+    assert len(starts) > 10
+
+
+def test_the_cpu_steps_through_autograd():
+    problem = fit_problem("cone", True, "cpu", "numba")
+    step = make_step(*problem[:-1], batch=BATCH, box=problem[-1])
+    assert isinstance(step, EagerStep)
+    assert "numba" in why_eager(problem[3], problem[4])
+
+
+def test_the_memory_of_a_step_can_be_put_back():
+    """Two steps in one go, and with everything copied in between, end at the same bits."""
+    ends = []
+    for interrupted in (False, True):
+        problem = fit_problem("cone", True, "cpu", "numba")
+        step = EagerStep(*problem[:-1])
+        step(np.array([0, 1]), problem[-1], 0.0)
+        if interrupted:
+            gaussians = problem[0].copy()
+            again = EagerStep(gaussians, *problem[1:-1])
+            for name, moments in again.moments.items():
+                for new, old in zip(moments, step.moments[name]):
+                    new.copy_(old)
+            again.done = step.done
+            step, problem = again, (gaussians, *problem[1:])
+        step(np.array([2, 3]), problem[-1], 0.7)
+        ends.append(problem[0].copy().parameters())
+    assert all(torch.equal(ends[0][name], ends[1][name]) for name in ends[0])
+
+
+def test_totals_are_the_weights_of_the_fitted_rays():
+    rays = fit_problem("cone", True, "cpu", "numba")[2]
+    _, _, weight, _ = rays.batch(np.arange(5))
+    torch.testing.assert_close(rays.totals(), weight.sum(dim=(1, 2)))
+    # 400 is more than float32's exponential holds.
+    assert bool(torch.isfinite(weight).all())
+
+
+def graph_step(*problem):
+    from tomo_polysplat.fit.graph_step import GraphStep
+
+    return GraphStep(*problem)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize(
+    ("kind", "polychromatic", "changes"),
+    [
+        ("cone", True, {}),
+        ("parallel", False, {"loss": "weighted-l1"}),
+        ("fan", True, {}),
+        ("cone", True, {"tv_weight": 0.0, "held_out": 0.0}),
+    ],
+)
+def test_a_graph_steps_like_autograd(kind, polychromatic, changes):
+    compare_steps(graph_step, "cuda", ("cuda", "triton"), kind, polychromatic, **changes)
+
+
+@pytest.mark.gpu
+def test_projections_on_the_host_give_the_same_steps():
+    """Views streamed to the GPU step by step, against views that are there."""
+    ends = []
+    for streamed in (False, True):
+        problem = fit_problem("cone", True, "cuda", "triton")
+        if streamed:
+            rays = problem[2]
+            rays.device, rays.projections = torch.device("cuda", 0), rays.projections.cpu().pin_memory()
+        step = graph_step(*problem[:-1], BATCH, problem[-1])
+        for k in range(9):
+            step(np.array([k % 5, (k + 2) % 5]), problem[-1], 0.1 * k)
+        ends.append((step.read(), problem[0].position.cpu()))
+    np.testing.assert_allclose(ends[0][0], ends[1][0], rtol=1e-5)
+    torch.testing.assert_close(ends[0][1], ends[1][1], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.gpu
+def test_a_graph_that_cannot_be_recorded_is_said_and_replaced(monkeypatch, caplog):
+    problem = fit_problem("cone", True, "cuda", "triton")
+    before = problem[0].copy()
+
+    def refuse(*_, **__):
+        raise RuntimeError("no graphs here")
+
+    monkeypatch.setattr(torch.cuda, "graph", refuse)
+    with caplog.at_level(logging.WARNING):
+        step = make_step(*problem[:-1], batch=BATCH, box=problem[-1])
+    assert isinstance(step, EagerStep) and "no graphs here" in caplog.text
+    for name, tensor in problem[0].parameters().items():
+        assert torch.equal(tensor, before.parameters()[name]), name
+    step(np.array([0, 1]), problem[-1], 0.0)
+    assert np.isfinite(step.read()[0])

@@ -1,0 +1,90 @@
+"""A small fit to step through, and the comparison of two forms of the optimiser's step on it."""
+
+import numpy as np
+import torch
+from splat_scenes import cone_views, gaussians, parallel_views, planar_views
+
+from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.step import EagerStep
+from tomo_polysplat.kernels.voxelise.box import VoxelBox
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.physics.quadrature import Quadrature
+from tomo_polysplat.settings import Settings
+
+STEPS = 2
+BATCH = 2
+CURVES = torch.tensor([[1.0, 2.1, 6.0], [0.8, 1.5, 3.5]])
+
+
+def fit_problem(kind, polychromatic, device, kernel, count=29, **changes):
+    """Gaussians, spacing, rays, scene, settings and box of a fit that has far to go."""
+    views, planar = {
+        "cone": (cone_views, False),
+        "parallel": (parallel_views, False),
+        "fan": (planar_views, True),
+    }[kind]
+    views = views(True, 5, 41) if planar else views(5, 11, 21, pixel=(0.2, 0.25))
+    generator = torch.Generator().manual_seed(3)
+    values = 1.5 * torch.rand((5, views.rows, views.columns), generator=generator) - 0.1
+    values[1, 0, 3:6] = float("nan")
+    values[:, -1, 7] = 400.0
+    settings = Settings(**({"held_out": 0.2, "tv_weight": 0.3, "material_from": 0.5} | changes))
+    rays = Rays(values.to(device), views, 1e3, settings.model_error, settings.held_out)
+    quadrature, curves = None, (None, None)
+    if polychromatic:
+        weights = np.log([0.2, 0.5, 0.3])
+        quadrature = Quadrature(
+            weights, CURVES.T.double().numpy() @ np.ones((2, 3)) * [3.0, 1.0, 0.4], 0, 0, 0, 5
+        )
+        curves = CURVES.to(device)
+    shape = (1, 9, 11) if planar else (6, 7, 9)
+    box = VoxelBox(np.array([-0.6, -0.5, 0.0 if planar else -0.4]), np.array([0.13, 0.15, 0.17]), shape)
+    scene = FitScene(box, quadrature, 0.7, *curves, kernel, 3.0, 0.0)
+    return _gaussians(count, planar, device), 0.2, rays, scene, settings, box
+
+
+def _gaussians(count, planar, device):
+    position, scale, rotation, weight = (t.float() for t in gaussians(count, size=0.15, planar=planar))
+    parts = [
+        position,
+        scale[:, : 2 if planar else 3].log(),
+        rotation,
+        weight[0],
+        0.5 * weight[1],
+        torch.tensor([0.0, 0.6, 0.7]),
+        torch.arange(count) % 4 - 1,
+    ]
+    return Gaussians(*(t.contiguous().to(device) for t in parts))
+
+
+def compare_steps(make, device, truth, kind="cone", polychromatic=True, **changes):
+    """Both forms, from the same start with the same views and boxes, must read and change the same."""
+    outcomes = []
+    for form, where, kernel in ((make, device, "triton"), (EagerStep, *truth)):
+        problem = fit_problem(kind, polychromatic, where, kernel, **changes)
+        gaussians, box = problem[0], problem[-1]
+        before = gaussians.copy()
+        step = form(*problem[:-1]) if form is EagerStep else form(*problem[:-1], BATCH, box)
+        for k in range(STEPS):
+            part = VoxelBox(box.first + 0.1 * k, box.spacing, box.shape)
+            step(np.array([k, 4 - k]), part, k / STEPS)
+        read = step.read()
+        after = {k: t.detach().cpu() for k, t in gaussians.parameters().items()}
+        moved = {k: t - before.parameters()[k].cpu() for k, t in after.items()}
+        outcomes.append((read, moved, step.moments, step.pull.cpu(), step.done))
+    (read, moved, moments, pull, done), (read_2, moved_2, moments_2, pull_2, done_2) = outcomes
+    np.testing.assert_allclose(read, read_2, rtol=1e-4)
+    assert done == done_2 == STEPS
+    _same(pull, pull_2, 1e-3, "pull")
+    for name, expected in moved_2.items():
+        _same(moved[name], expected, 2e-2, name)
+        for got, wanted in zip(moments[name], moments_2[name]):
+            _same(got.cpu(), wanted.cpu(), 2e-3, f"moment of {name}")
+    return moved
+
+
+def _same(got, expected, tolerance, what):
+    assert bool(torch.isfinite(got).all()), what
+    error = float((got - expected).norm())
+    assert error <= tolerance * float(expected.norm()), f"{what}: {error / float(expected.norm()):.1e}"

@@ -1,0 +1,57 @@
+"""Which form of the optimiser's step a run takes."""
+
+from __future__ import annotations
+
+import logging
+
+from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.step import EagerStep, Step
+from tomo_polysplat.kernels.voxelise.box import VoxelBox
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.settings import Settings
+
+__all__ = ["make_step", "why_eager"]
+
+logger = logging.getLogger(__name__)
+
+
+def why_eager(scene: FitScene, settings: Settings) -> str:
+    """Why a step cannot be one graph of our own kernels; nothing if it can."""
+    if scene.kernel != "triton":
+        return f"the {scene.kernel} kernel runs"
+    if settings.ssim_weight:
+        return "structural similarity is asked for"
+    return ""
+
+
+def make_step(
+    gaussians: Gaussians,
+    spacing: float,
+    rays: Rays,
+    scene: FitScene,
+    settings: Settings,
+    *,
+    batch: int,
+    box: VoxelBox,
+) -> Step:
+    """A CUDA graph where there can be one, else operation by operation.
+
+    Parameters
+    ----------
+    batch : int
+        Views of a step.
+    box : VoxelBox
+        Of the shape that every step will smooth.
+    """
+    reason = why_eager(scene, settings)
+    if not reason:
+        from tomo_polysplat.fit.graph_step import GraphStep
+
+        try:
+            return GraphStep(gaussians, spacing, rays, scene, settings, batch, box)
+        except RuntimeError as problem:  # of torch or the driver; the slower way gives the same result
+            logger.warning("Steps one operation at a time: no CUDA graph could be recorded: %s", problem)
+    else:
+        logger.info("Steps one operation at a time: %s.", reason)
+    return EagerStep(gaussians, spacing, rays, scene, settings)

@@ -1,0 +1,182 @@
+"""The step of the optimiser as a dozen CUDA kernels of our own, without autograd.
+
+The mathematics are those of `EagerStep`; what changes from step to step reaches the kernels through one small
+tensor, so that the same launches do for every step (`graph_step.py` records them once).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from tomo_polysplat.fit.feed import feed
+from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.step import EPSILON, LEAST_U, held_out_mean, log_scale_bounds, new_moments, step_rates
+from tomo_polysplat.kernels.project import triton_backward as rays_backward
+from tomo_polysplat.kernels.project import triton_forward as rays_forward
+from tomo_polysplat.kernels.project.triton_pull_back import pull_back as rays_pull_back
+from tomo_polysplat.kernels.project.triton_setup import footprints
+from tomo_polysplat.kernels.step.triton_activate import activate
+from tomo_polysplat.kernels.step.triton_misfit import Measurement, misfit_gradient
+from tomo_polysplat.kernels.step.triton_update import FIRST_DECAY, SECOND_DECAY, Bounds, update
+from tomo_polysplat.kernels.step.triton_variation import variation_gradient
+from tomo_polysplat.kernels.voxelise import triton_backward as box_backward
+from tomo_polysplat.kernels.voxelise import triton_forward as box_forward
+from tomo_polysplat.kernels.voxelise.box import VoxelBox
+from tomo_polysplat.kernels.voxelise.triton_setup import ellipsoids
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.physics.transmission import nodes_on
+from tomo_polysplat.render.renderer import VOXEL_CUTOFF
+from tomo_polysplat.settings import Settings
+
+__all__ = ["FusedStep"]
+
+# Of the control tensor: the update's three numbers, then a place to align what follows.
+_HEAD, _VIEW, _BOX = 4, 21, 6
+
+
+class FusedStep:
+    """The step kernel by kernel; see `fit.step.Step`.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        Changed in place; its tensors must keep their addresses.
+    spacing : float
+        Of the seeds.
+    rays : Rays
+    scene : FitScene
+    settings : Settings
+    batch : int
+        Views of a step.
+    """
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        spacing: float,
+        rays: Rays,
+        scene: FitScene,
+        settings: Settings,
+        batch: int,
+    ) -> None:
+        self.gaussians, self.rays, self.scene, self.settings = gaussians, rays, scene, settings
+        self.done, self._unread = 0, 0
+        parameters, device = gaussians.parameters(), gaussians.position.device
+        self.pull, self.moments = torch.zeros_like(gaussians.attenuation), new_moments(parameters)
+        self.feed = feed(rays.projections, rays.target, batch)
+        rates = step_rates(settings, spacing)
+        self._rates = torch.tensor([rates[k] for k in parameters], dtype=torch.float32, device=device)
+        bounds = log_scale_bounds(scene, spacing, gaussians.planar, settings)
+        self._bounds = Bounds(bounds, (LEAST_U, 1.0), EPSILON)
+        self._views, self._table = rays.views.select(np.arange(batch)), rays.views.host_table()
+        self._sums = torch.zeros(3, dtype=torch.float64, device=device)
+        self._skipped = torch.zeros((), dtype=torch.int64, device=device)
+        self._grad_shared = torch.zeros_like(gaussians.shared_material)
+        self._control = torch.zeros(_HEAD + batch * (_VIEW + 2) + _BOX, dtype=torch.float64, device=device)
+        self._curves = None
+        if scene.reference_curve is not None and scene.output_curve is not None:
+            self._curves = torch.cat([scene.reference_curve, scene.output_curve])
+        self._measurement = self._measure()
+        self._box: tuple[int, int, int] = (0, 0, 0)
+        self._no_box = tuple(
+            torch.zeros(shape, device=device) for shape in ((len(gaussians), 3),) * 2 + ((len(gaussians), 4),)
+        ) + (torch.zeros((1, len(gaussians)), device=device),)
+
+    def _measure(self) -> Measurement:
+        rays, scene, settings = self.rays, self.scene, self.settings
+        corner = settings.huber_corner * settings.model_error if settings.loss == "huber" else 0.0
+        nodes = None
+        if scene.quadrature is not None:
+            nodes = nodes_on(scene.quadrature, torch.float32, rays.target)
+        return Measurement(
+            self.feed.projections,
+            rays.totals(),
+            rays.noise,
+            rays.threshold,
+            corner,
+            scene.areal_scale,
+            nodes,
+        )
+
+    def __call__(self, views: np.ndarray, box: VoxelBox, share: float) -> None:
+        """One step; see `Step`."""
+        self._box = box.shape
+        values = self._next(views, box, share)
+        self._control.copy_(torch.from_numpy(values))
+        self._enqueue()
+        self.feed.used()
+
+    def read(self) -> tuple[float, float, int]:
+        """Means since the last call; see `Step`."""
+        fitted, held_out, weight = self._sums.tolist()
+        skipped, steps = int(self._skipped), self._unread
+        self._sums.zero_()
+        self._skipped.zero_()
+        self._unread = 0
+        return fitted / steps, held_out_mean(held_out, weight), skipped
+
+    def _next(self, views: np.ndarray, box: VoxelBox, share: float) -> np.ndarray:
+        """What the control tensor must hold for the next step."""
+        self.done += 1
+        self._unread += 1
+        rate = self.settings.final_rate**share / (1 - FIRST_DECAY**self.done)
+        root = math.sqrt(1 - SECOND_DECAY**self.done)
+        head = [rate, root, float(share >= self.settings.material_from), 0.0]
+        slots = self.feed.place(views)
+        return np.concatenate([head, self._table[views].ravel(), views, slots, box.first, box.spacing])
+
+    def _enqueue(self) -> None:
+        """All kernels of a step; what they read of it is in the control tensor."""
+        gaussians, batch = self.gaussians, len(self._views)
+        head, table, chosen, box = self._control.split([_HEAD, batch * _VIEW, 2 * batch, _BOX])
+        scale, weight, output = activate(
+            gaussians.log_scale,
+            gaussians.attenuation,
+            gaussians.own_material,
+            gaussians.shared_material,
+            gaussians.group,
+            self._curves,
+        )
+        drawn = (gaussians.position, scale, gaussians.rotation)
+        smooth = bool(self.settings.tv_weight)
+        of_box = self._box_gradients(*drawn, output, box) if smooth else self._no_box
+        of_rays = self._ray_gradients(*drawn, weight, table, chosen)
+        if smooth:
+            self._join()
+        update(
+            gaussians.parameters(),
+            gaussians.group,
+            self.moments,
+            (scale, self._curves),
+            of_rays,
+            of_box,
+            (self._grad_shared, self.pull, self._rates, head),
+            self._bounds,
+        )
+
+    def _ray_gradients(self, position, scale, rotation, weight, table, chosen) -> tuple[torch.Tensor, ...]:
+        """Gradients of the misfit by position, deviation, rotation and weights."""
+        views, cutoff, channels = self._views, self.scene.cutoff, len(weight)
+        drawn = (position, scale, rotation, weight)
+        record = footprints(*drawn, views, table, cutoff, self._skipped)
+        image = rays_forward.splat(record, channels, views, cutoff)
+        beyond = rays_backward.beyond(views)
+        pixels = misfit_gradient(image, table, chosen, views, self._measurement, self._sums, beyond)
+        moments = rays_backward.sum_moments(record, pixels, channels, views, cutoff)
+        return rays_pull_back(*drawn, table, views, record, moments)
+
+    def _join(self) -> None:
+        """Wait for the box's gradients, where they are made beside those of the rays."""
+
+    def _box_gradients(self, position, scale, rotation, output, table) -> tuple[torch.Tensor, ...]:
+        """Gradients of the total variation in the box, likewise."""
+        drawn, box = (position, scale, rotation, output), VoxelBox(np.zeros(3), np.ones(3), self._box)
+        record = ellipsoids(*drawn, table, VOXEL_CUTOFF)
+        volume = box_forward.splat(record, 1, box, VOXEL_CUTOFF)
+        slope = variation_gradient(volume, self.settings.tv_clip, self.settings.tv_weight)
+        moments = box_backward.sum_moments(record, slope, box, VOXEL_CUTOFF)
+        return box_backward.pull_back(*drawn, table, moments)

@@ -1,0 +1,185 @@
+"""Misfit of projections and its gradient, in one CUDA kernel after the splat and before its adjoint.
+
+What ``fit.loss.misfit`` of ``FitScene.projections`` against ``Rays.batch`` says, pixel by pixel: the factor of
+the pixel, the polychromatic projection, the weight of the ray, whether it is held out, the loss, and the way
+back to the base materials' line integrals.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import triton  # noqa: TID253 - imported only where a kernel runs
+import triton.language as tl  # noqa: TID253
+
+from tomo_polysplat.kernels.project.triton_image import pixel_factor, spread
+from tomo_polysplat.kernels.triton_lanes import load_four, store_four
+from tomo_polysplat.kernels.triton_maths import on_device
+from tomo_polysplat.kernels.views import DetectorViews
+
+__all__ = ["Measurement", "misfit_gradient"]
+
+_BLOCK = 256
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """The measured side of the misfit.
+
+    Parameters
+    ----------
+    projections : (slots, rows, columns) float32 tensor
+        -log(I/I0); NaN where a ray is not to be used.
+    totals : (views,) float32 tensor
+        Weight of the fitted rays of each view of the scan.
+    noise : float
+        Variance of an unattenuated ray over that of the model's error.
+    held_out : int
+        Of 65536 rays so many are held out.
+    corner : float
+        Residual over its deviation where the loss goes from squared to absolute; 0 for absolute everywhere.
+    areal_scale : float
+        Line integral of the kernels to g/cm2, or to -log(I/I0) without nodes.
+    nodes : pair of tensors or None
+        (n, 1) log weights and (n, 3) attenuation of the spectrum.
+    """
+
+    projections: torch.Tensor
+    totals: torch.Tensor
+    noise: float
+    held_out: int
+    corner: float
+    areal_scale: float
+    nodes: tuple[torch.Tensor, torch.Tensor] | None
+
+
+@triton.jit
+def _beer_lambert(a0, a1, a2, log_weights, attenuation, nodes):
+    """P and its derivatives by the three areal densities."""
+    largest = tl.full(a0.shape, float("-inf"), tl.float32)
+    for k in range(nodes):
+        b0, b1, b2 = (
+            tl.load(attenuation + 3 * k),
+            tl.load(attenuation + 3 * k + 1),
+            tl.load(attenuation + 3 * k + 2),
+        )
+        largest = tl.maximum(largest, tl.load(log_weights + k) - (a0 * b0 + a1 * b1 + a2 * b2))
+    total, d0, d1, d2 = tl.zeros_like(a0), tl.zeros_like(a0), tl.zeros_like(a0), tl.zeros_like(a0)
+    for k in range(nodes):
+        b0, b1, b2 = (
+            tl.load(attenuation + 3 * k),
+            tl.load(attenuation + 3 * k + 1),
+            tl.load(attenuation + 3 * k + 2),
+        )
+        term = tl.exp(tl.load(log_weights + k) - (a0 * b0 + a1 * b1 + a2 * b2) - largest)
+        total += term
+        d0 += term * b0
+        d1 += term * b1
+        d2 += term * b2
+    return -(largest + tl.log(total)), d0 / total, d1 / total, d2 / total
+
+
+@triton.jit
+def _is_held_out(view, pixel, held_out):
+    """The pseudo-random choice of ``Rays``: a multiplicative hash (Knuth) of view and pixel."""
+    mixed = (pixel.to(tl.int64) * 2654435761 + (view * 40503 + 12345)) & 0xFFFFFFFF
+    mixed = ((mixed ^ (mixed >> 15)) * 2246822519) & 0xFFFFFFFF
+    return (mixed >> 16) < held_out
+
+
+@triton.jit
+def _misfit_kernel(
+    raw, pixels, table, chosen, projections, totals, log_weights, attenuation, sums,
+    area, columns, beyond, nodes, noise, held_out, corner, areal_scale,
+    CHANNELS: tl.constexpr, CONE: tl.constexpr, HUBER: tl.constexpr, MANY: tl.constexpr,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    k = tl.program_id(1).to(tl.int64)
+    pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = pixel < area
+    live = pixel < tl.where(k == MANY - 1, area + beyond, area)
+    view, slot = tl.load(chosen + k).to(tl.int64), tl.load(chosen + MANY + k).to(tl.int64)
+    factor = pixel_factor(table, k, pixel, columns, CONE) * areal_scale
+    at = k * area + tl.minimum(pixel, area - 1)
+    d0, d1, d2 = (
+        tl.full([BLOCK], 1.0, tl.float32),
+        tl.zeros([BLOCK], tl.float32),
+        tl.zeros([BLOCK], tl.float32),
+    )
+    if CHANNELS == 1:
+        predicted = tl.load(raw + at) * factor
+    else:
+        a0, a1, a2, _ = load_four(raw + 4 * at)
+        predicted, d0, d1, d2 = _beer_lambert(
+            a0 * factor, a1 * factor, a2 * factor, log_weights, attenuation, nodes
+        )
+    value = tl.load(projections + slot * area + pixel, mask=inside, other=float("nan"))
+    usable = tl.abs(value) < float("inf")
+    value = tl.where(usable, value, 0.0)
+    # The exponential of an opaque ray may be infinite, which is not to be multiplied by zero.
+    variance = tl.where(noise > 0, tl.exp(value) * noise, 0.0)
+    weight = tl.where(usable, tl.math.rsqrt(1.0 + variance), 0.0)
+    aside = _is_held_out(view, pixel, held_out)
+    residual = predicted - value
+    scaled = tl.abs(residual) * weight
+    loss, slope = scaled, weight
+    if HUBER:
+        near = scaled < corner
+        loss = tl.where(near, scaled * scaled / (2 * corner), scaled - 0.5 * corner)
+        slope = tl.where(near, weight * scaled / corner, weight)
+    total = tl.zeros([], tl.float32)
+    for j in tl.static_range(MANY):
+        total += tl.load(totals + tl.load(chosen + j).to(tl.int64))
+    by_total = 1.0 / tl.maximum(total, 1e-12)
+    loss = tl.where(weight > 0, loss, 0.0)
+    tl.atomic_add(sums, (tl.sum(tl.where(aside, 0.0, loss), 0) * by_total).to(tl.float64), sem="relaxed")
+    tl.atomic_add(sums + 1, tl.sum(tl.where(aside, loss, 0.0), 0).to(tl.float64), sem="relaxed")
+    tl.atomic_add(sums + 2, tl.sum(tl.where(aside, weight, 0.0), 0).to(tl.float64), sem="relaxed")
+    slope = tl.where(residual > 0, slope, tl.where(residual < 0, -slope, 0.0))
+    slope = tl.where(aside | (weight == 0), 0.0, slope * by_total * factor)
+    to = k * area + pixel
+    if CHANNELS == 1:
+        tl.store(pixels + to, slope, mask=live)
+    else:
+        store_four(pixels + 4 * to, slope * d0, slope * d1, slope * d2, tl.zeros_like(slope), live)
+
+
+def misfit_gradient(
+    raw: torch.Tensor,
+    table: torch.Tensor,
+    chosen: torch.Tensor,
+    views: DetectorViews,
+    measurement: Measurement,
+    sums: torch.Tensor,
+    beyond: int,
+) -> torch.Tensor:
+    """The gradient of the misfit, laid out for the projection's adjoint, with ``beyond`` zero pixels after it.
+
+    Parameters
+    ----------
+    raw : (views, rows, columns, ...) tensor
+        Image of the splat.
+    table : (views, 21) float64 tensor
+    chosen : (2, views) float64 tensor
+        Number of each view in the scan, and its slot among the measured projections.
+    views : DetectorViews
+        As many views of the same detector; only its shape is read.
+    measurement : Measurement
+    sums : (3,) float64 tensor
+        To which the mean misfit of the fitted rays, the sum of that of the held-out rays, and their weight are
+        added.
+    """
+    many, area = len(views), views.rows * views.columns
+    channels = 1 if measurement.nodes is None else 3
+    pixels = raw.new_empty((many * area + beyond) * spread(channels))
+    log_weights, attenuation = measurement.nodes or (raw, raw)
+    with on_device(raw):
+        _misfit_kernel[(triton.cdiv(area + beyond, _BLOCK), many)](
+            raw, pixels, table, chosen, measurement.projections, measurement.totals, log_weights, attenuation,
+            sums, area, views.columns, beyond, 0 if measurement.nodes is None else len(log_weights),
+            measurement.noise, measurement.held_out, measurement.corner, measurement.areal_scale,
+            CHANNELS=channels, CONE=views.cone, HUBER=measurement.corner > 0, MANY=many, BLOCK=_BLOCK,
+            num_warps=4,
+        )  # fmt: skip
+    return pixels

@@ -1,0 +1,54 @@
+"""Gradient of the total variation of a volume, in one CUDA kernel."""
+
+from __future__ import annotations
+
+import torch
+import triton  # noqa: TID253 - imported only where a kernel runs
+import triton.language as tl  # noqa: TID253
+
+from tomo_polysplat.kernels.triton_maths import on_device
+
+__all__ = ["variation_gradient"]
+
+_BLOCK = 256
+
+
+@triton.jit
+def _sign(a, b):
+    return tl.where(a > b, 1.0, 0.0) - tl.where(a < b, 1.0, 0.0)
+
+
+@triton.jit
+def _along(volume, at, value, index, length, stride, live, ceiling):
+    """d/dvalue of the mean absolute difference of neighbours along an axis."""
+    before = tl.minimum(tl.load(volume + at - stride, mask=live & (index > 0), other=0.0), ceiling)
+    after = tl.minimum(tl.load(volume + at + stride, mask=live & (index < length - 1), other=0.0), ceiling)
+    slope = tl.where(index > 0, _sign(value, before), 0.0)
+    slope -= tl.where(index < length - 1, _sign(after, value), 0.0)
+    return slope
+
+
+@triton.jit
+def _variation_kernel(volume, grad, nz, ny, nx, ceiling, factor, BLOCK: tl.constexpr):
+    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    size = nz * ny * nx
+    live = at < size
+    line = at // nx
+    x, y, z = at - line * nx, line % ny, line // ny
+    raw = tl.load(volume + at, mask=live, other=0.0)
+    value = tl.minimum(raw, ceiling)
+    # The mean over an axis has a term less a line than the volume has voxels.
+    slope = _along(volume, at, value, x, nx, 1, live, ceiling) / tl.maximum(size - ny * nz, 1)
+    slope += _along(volume, at, value, y, ny, nx, live, ceiling) / tl.maximum(size - nx * nz, 1)
+    slope += _along(volume, at, value, z, nz, nx * ny, live, ceiling) / tl.maximum(size - nx * ny, 1)
+    tl.store(grad + at, tl.where(raw <= ceiling, slope * factor, 0.0), mask=live)
+
+
+def variation_gradient(volume: torch.Tensor, ceiling: float, factor: float) -> torch.Tensor:
+    """``factor`` times the gradient of ``fit.loss.total_variation`` of a volume (1, nz, ny, nx), so shaped."""
+    grad = torch.empty_like(volume)
+    with on_device(volume):
+        _variation_kernel[(triton.cdiv(volume.numel(), _BLOCK),)](
+            volume, grad, *volume.shape[1:], ceiling, factor, BLOCK=_BLOCK, num_warps=4
+        )
+    return grad
