@@ -12,7 +12,7 @@ __all__ = ["SOLVER_OPTIONS", "solver_options"]
 TUBE_OPTIONS = ("kvp", "anode", "filters", "detector")
 PASSED_ON = (
     *("spectrum", "materials", "unit", "quality", "time_budget", "seed", "device"),
-    *("callbacks", "progress", "settings", "water_correction"),
+    *("callbacks", "progress", "settings", "water_correction", "checkpoint", "resume"),
 )
 SOLVER_OPTIONS = (*PASSED_ON, *TUBE_OPTIONS)
 

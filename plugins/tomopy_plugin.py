@@ -49,8 +49,8 @@ def polysplat(
         - ``spectrum``, or ``kvp`` with ``filters`` (cm), ``anode`` and ``detector``; ``materials``;
         - ``pixel_size`` in ``unit`` (default cm), which a spectrum needs; then values are in 1/unit;
         - ``proj_geom`` and ``vol_geom``, ASTRA's in `unit`, with one slice per detector row;
-        - ``quality``, ``time_budget`` (seconds), ``seed``, ``device``, ``settings``, ``callbacks`` and
-          ``progress`` as for :func:`tomo_polysplat.reconstruct`;
+        - ``quality``, ``time_budget`` (seconds), ``seed``, ``device``, ``settings``, ``callbacks``,
+          ``progress``, ``checkpoint`` and ``resume`` as for :func:`tomo_polysplat.reconstruct`;
         - ``input="transmission"`` when no logarithm was taken; ``energy_kev`` of the slices;
         - ``on_result``: called with the :class:`~tomo_polysplat.Result` of each group of slices.
 
@@ -77,6 +77,9 @@ def polysplat(
             raise fail("center", "None beside proj_geom", f"{center[0]:g}", "proj_geom places the axis")
         _solve(tomo, recon, own["proj_geom"], own["vol_geom"], own, solver)
         return
+    if solver.get("checkpoint") is not None and len(np.unique(center)) > 1:
+        remedy = "slices with different centres are solved apart, and one file keeps one solve"
+        raise fail("options['checkpoint']", "one centre for all slices", "several", remedy)
     start = 0
     for centre, group in groupby(center.tolist()):
         part = slice(start, start := start + len(list(group)))

@@ -200,10 +200,14 @@ def test_demo_prints_the_table_it_is_given(tmp_path, monkeypatch, capsys):
     entry = {"name": "polysplat", "seconds": 1.0, "psnr": 30.0, "psnr_all": 40.0, "ssim": 0.9, "rmse": 0.01}
     module = ModuleType("tomo_polysplat.bench.demo")
     module.run_demo = lambda folder, **options: {"methods": [entry]}
+    module.FILES = ("demo.png", "demo.h5", "demo.json")
     monkeypatch.setitem(sys.modules, "tomo_polysplat.bench.demo", module)
     assert main(["demo", "-o", str(tmp_path / "new")]) == 0
     printed = capsys.readouterr().out
     assert "30.0" in printed and "demo.png" in printed
+    (tmp_path / "new" / "demo.h5").write_text("precious")
+    assert main(["demo", "-o", str(tmp_path / "new")]) == 2 and "--overwrite" in capsys.readouterr().err
+    assert main(["demo", "-o", str(tmp_path / "new"), "--overwrite"]) == 0
 
 
 def test_doctor_reports_versions_and_kernels(capsys):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -14,10 +14,12 @@ from tomo_polysplat.checks import fail
 __all__ = [
     "available_memory",
     "existing_file",
+    "existing_parent",
     "replacing",
     "require_plausible_size",
     "require_replaceable",
     "require_room",
+    "require_room_for",
     "require_writable",
 ]
 
@@ -79,7 +81,7 @@ def require_replaceable(target: Path, overwrite: bool, remedy: str = "pass overw
 def require_writable(folder: str | os.PathLike) -> None:
     """Refuse a folder in which no file can be made, by making one: permissions alone do not tell."""
     try:
-        with tempfile.TemporaryFile(dir=folder or "."):
+        with tempfile.TemporaryFile(dir=Path(folder)):
             pass
     except OSError as error:
         remedy = "change its permissions or choose another folder"
@@ -112,6 +114,22 @@ def require_room(folder: str | os.PathLike, needed_bytes: int) -> None:
             "free some space or choose another folder",
             OSError,
         )
+
+
+def require_room_for(needed: Mapping[Path, int]) -> None:
+    """Refuse work whose output, bytes by folder, the disks cannot hold; folders may share a disk."""
+    shared: dict[int, tuple[Path, int]] = {}
+    for folder, size in needed.items():
+        there = existing_parent(folder)
+        disk = there.stat().st_dev
+        shared[disk] = (there, shared.get(disk, (there, 0))[1] + size)
+    for there, size in shared.values():
+        require_room(there, size)
+
+
+def existing_parent(folder: Path) -> Path:
+    """The folder, or the nearest one above it that exists."""
+    return next(place for place in (folder, *folder.absolute().parents) if place.is_dir())
 
 
 def available_memory() -> int | None:

@@ -16,7 +16,9 @@ from tomo_polysplat.fit.checkpoint import Checkpoint
 from tomo_polysplat.fit.optimise import FitOutcome, FitState, fit
 from tomo_polysplat.fit.plan import Plan, make_plan
 from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.interrupts import postponed_interrupts
 from tomo_polysplat.kernels.device import one_torch_thread, pick_device
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.materials import Materials
@@ -133,10 +135,9 @@ def reconstruct(
     started -= 0.0 if saved is None else saved.seconds
     with one_torch_thread(target), progress_reports(progress) as report:
         report(0.0, "start volume")
-        plan, gaussians = _begin(problem, chosen, target, saved)
+        plan, gaussians, scene, rays = _begin(problem, chosen, target, saved)
         if water_correction is not None:
             plan.reasons["water_correction"] = f"undone: {describe_polynomial(water_correction)}"
-        scene, rays = problem.scene(plan, chosen, target), problem.rays(plan, chosen, target)
         outcome = fit(
             gaussians,
             plan.spacing * problem.voxel,
@@ -151,15 +152,16 @@ def reconstruct(
             callbacks=[lambda state: report(state.share, state.describe()), *callbacks],
             checkpoint=saved,
         )
-        report(1.0, "volume")
-        plan.reasons["stop"] = outcome.reason
-        about = {
-            "unit": unit,
-            "spectrum": spectrum,
-            "flipped_2d": flipped,
-            "counts": counts | _counts(outcome),
-        }
-        result = _result(outcome, scene, grid, problem, plan, **about)
+        with postponed_interrupts("the volume") as interruption:
+            report(1.0, "volume")
+            about = {
+                "unit": unit,
+                "spectrum": spectrum,
+                "flipped_2d": flipped,
+                "counts": counts | _counts(outcome),
+            }
+            result = _result(outcome, scene, grid, problem, plan, **about)
+    plan.reasons["stop"] = outcome.reason + (", then interrupted" if interruption.asked else "")
     result.settings = chosen.to_dict() | {"seed": seed, "quality": quality}
     result.seconds = time.perf_counter() - started
     logger.info("Reconstructed in %.1f s: %s; %s", result.seconds, outcome.reason, result.counts)
@@ -177,6 +179,17 @@ def _checkpoint(
 
 
 def _begin(
+    problem: Problem, settings: Settings, device: torch.device, saved: Checkpoint | None
+) -> tuple[Plan, Gaussians, FitScene, Rays]:
+    """All that a fit starts from."""
+    try:
+        plan, gaussians = _first_state(problem, settings, device, saved)
+        return plan, gaussians, problem.scene(plan, settings, device), problem.rays(plan, settings, device)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("interrupted before the fit had begun: there is no result yet") from None
+
+
+def _first_state(
     problem: Problem, settings: Settings, device: torch.device, saved: Checkpoint | None
 ) -> tuple[Plan, Gaussians]:
     """The plan and Gaussians to go on with: those of a checkpoint, or seeds of a start volume."""

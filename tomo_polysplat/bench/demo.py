@@ -22,7 +22,9 @@ from tomo_polysplat.scan.scan import Scan
 from tomo_polysplat.simulate.scenes import simulate_scan
 from tomo_polysplat.start.fdk import fdk
 
-__all__ = ["run_demo"]
+__all__ = ["FILES", "run_demo"]
+
+FILES = ("demo.png", "demo.h5", "demo.json")
 
 # Small enough for a laptop's patience, large enough to see.
 _SIZE, _VIEWS = 64, 120
@@ -38,7 +40,7 @@ def run_demo(
 ) -> dict[str, Any]:
     """Reconstruct the scene "pins" with FDK, FDK after a water correction, and mono- and polychromatic splats.
 
-    Writes ``demo.png``, ``demo.h5`` and ``demo.json`` into ``folder``, replacing its own earlier files.
+    Writes ``demo.png``, ``demo.h5`` and ``demo.json`` into ``folder``, replacing earlier ones.
 
     Returns
     -------

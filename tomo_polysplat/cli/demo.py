@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from tomo_polysplat.cli.options import ProgressBar, add_solver_options
+from tomo_polysplat.files import require_replaceable, require_writable
 
 NAME = "demo"
 HELP = "simulate a scan with metal, reconstruct it four ways, and write demo.png, demo.h5 and demo.json"
@@ -18,21 +19,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--output",
         default=".",
         metavar="FOLDER",
-        help="where to write; its own files are replaced (default: .)",
+        help="where to write (default: .)",
     )
+    parser.add_argument("--overwrite", action="store_true", help="replace files that exist")
     add_solver_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run it and print its table."""
-    from tomo_polysplat.bench.demo import run_demo
+    from tomo_polysplat.bench.demo import FILES, run_demo
     from tomo_polysplat.report.table import as_text
 
     folder = Path(arguments.output)
     folder.mkdir(parents=True, exist_ok=True)
+    for name in FILES:
+        require_replaceable(folder / name, arguments.overwrite, "pass --overwrite or another folder")
+    require_writable(folder)
     with ProgressBar() as progress:
         outcome = run_demo(folder, device=arguments.device, seed=arguments.seed, progress=progress)
     print(as_text(outcome["methods"], "cm"))
-    for name in ("demo.png", "demo.h5", "demo.json"):
+    for name in FILES:
         print(f"wrote {folder / name}")
     return 0

@@ -9,11 +9,12 @@ from collections.abc import Sequence
 
 import tomo_polysplat
 from tomo_polysplat.cli import bench, check, demo, doctor, recon, simulate
+from tomo_polysplat.cli.options import INTERRUPTED
 
 __all__ = ["main"]
 
 COMMANDS = (demo, recon, simulate, check, bench, doctor)
-BAD_INPUT, INTERRUPTED, FAILED = 2, 130, 1
+BAD_INPUT, FAILED = 2, 1
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -33,8 +34,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return arguments.run(arguments)
     except (ValueError, TypeError, OSError, MemoryError) as error:
         return _complain(str(error) or type(error).__name__, BAD_INPUT)
-    except KeyboardInterrupt:
-        return _complain("interrupted", INTERRUPTED)
+    except KeyboardInterrupt as error:
+        return _complain(str(error) or "interrupted", INTERRUPTED)
     except Exception as error:  # the last place that can still say it in one line
         return _complain(f"{type(error).__name__}: {error} (run again with --debug to see where)", FAILED)
 

@@ -16,9 +16,13 @@ if TYPE_CHECKING:
     from tomo_polysplat.physics.spectrum import Spectrum
 
 __all__ = [
-    *("ProgressBar", "add_scan_options", "add_solver_options", "add_spectrum_options"),
+    *("INTERRUPTED", "ProgressBar", "add_scan_options", "add_solver_options", "add_spectrum_options"),
     *("scan_from", "spectrum_from", "write_json"),
 ]
+
+
+# Exit status of a command that Ctrl-C has ended, as of a shell's.
+INTERRUPTED = 130
 
 
 def add_spectrum_options(parser: argparse.ArgumentParser) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import tomo_polysplat
 from tomo_polysplat.checks import fail
 from tomo_polysplat.cli.options import (
+    INTERRUPTED,
     ProgressBar,
     add_scan_options,
     add_solver_options,
@@ -19,7 +21,8 @@ from tomo_polysplat.cli.options import (
     spectrum_from,
     write_json,
 )
-from tomo_polysplat.files import require_replaceable
+from tomo_polysplat.files import require_replaceable, require_room_for, require_writable
+from tomo_polysplat.interrupts import postponed_interrupts
 
 if TYPE_CHECKING:
     from tomo_polysplat.result.result import Result
@@ -63,6 +66,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--set", action="append", default=[], metavar="NAME=VALUE", help="change one setting; may be repeated"
     )
     add_solver_options(group)
+    group.add_argument(
+        "--checkpoint",
+        metavar="FILE",
+        help="keep the fit there (.npz) while it runs, to go on from with --resume",
+    )
+    group.add_argument(
+        "--resume", action="store_true", help="go on from --checkpoint where that exists, else begin anew"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -72,6 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
     spectrum = None if arguments.mono else scan.spectrum
     if arguments.energy is not None and spectrum is None:
         raise fail("--energy", "a spectrum, from the file or from --kvp", "none")
+    _require_room(arguments, scan)
     print(scan)
     with ProgressBar() as progress:
         result = tomo_polysplat.reconstruct(
@@ -89,21 +101,48 @@ def run(arguments: argparse.Namespace) -> int:
             water_correction=None if spectrum is None else scan.water_correction,
             progress=progress,
             settings=dict(_setting(text) for text in arguments.set) or None,
+            checkpoint=arguments.checkpoint,
+            resume=arguments.resume,
         )
-    if arguments.energy is not None:
-        result = replace(result, energy_kev=arguments.energy)
-    print(result)
-    _write(result, scan, arguments)
-    return 0
+    with postponed_interrupts("writing") as interruption:
+        if arguments.energy is not None:
+            result = replace(result, energy_kev=arguments.energy)
+        print(result)
+        _write(result, scan, arguments)
+    interrupted = interruption.asked or "interrupted" in result.plan.get("stop", "")
+    return INTERRUPTED if interrupted else 0
 
 
 def _require_outputs(arguments: argparse.Namespace) -> None:
     """Find out before the work, not after it, that a result could not be written."""
+    from tomo_polysplat.result.files import require_slices_folder
+
     if Path(arguments.output).suffix.lower() not in OUTPUT_SUFFIXES:
         raise fail("--output", f"a name ending in {', '.join(OUTPUT_SUFFIXES)}", arguments.output)
+    if arguments.resume and arguments.checkpoint is None:
+        raise fail("--resume", "--checkpoint with it", "none")
     for path in (arguments.output, arguments.report, arguments.json):
         if path is not None:
             require_replaceable(Path(path), arguments.overwrite)
+            require_writable(Path(path).parent)
+    if arguments.tiff is not None:
+        require_slices_folder(arguments.tiff, overwrite=arguments.overwrite)
+    named = ("scan", "output", "report", "json", "tiff", "checkpoint")
+    files = [Path(path).resolve() for name in named if (path := getattr(arguments, name)) is not None]
+    if len(set(files)) < len(files):
+        raise fail("--output", "a file of its own for the scan and for everything written", "one file twice")
+
+
+def _require_room(arguments: argparse.Namespace, scan: Scan) -> None:
+    """Find out before the work that the disk is too full for the volume."""
+    volume = 4 * math.prod(scan.volume_shape)
+    # Three curves and the volume itself.
+    output = volume if Path(arguments.output).suffix.lower() == ".npy" else 4 * volume
+    needed = {Path(arguments.output).parent: output}
+    if arguments.tiff is not None:
+        folder = Path(arguments.tiff)
+        needed[folder] = needed.get(folder, 0) + volume
+    require_room_for(needed)
 
 
 def _setting(text: str) -> tuple[str, Any]:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from tomo_polysplat.cli.options import add_spectrum_options, spectrum_from
-from tomo_polysplat.files import require_replaceable
+from tomo_polysplat.files import require_replaceable, require_room, require_writable
 
 NAME = "simulate"
 HELP = "simulate a polychromatic scan of a known object, with its truth"
@@ -43,6 +43,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     output = Path(arguments.output)
     require_replaceable(output, arguments.overwrite)
+    require_writable(output.parent)
+    # The truth with its metal, and views of about as many pixels as a side of the volume has voxels.
+    require_room(output.parent, 5 * arguments.size**3 + 4 * arguments.views * arguments.size**2)
     scan = simulate_scan(
         arguments.scene,
         arguments.size,

@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.files import replacing, require_room
+from tomo_polysplat.files import existing_parent, replacing, require_room, require_writable
 from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.result.result import GAUSSIAN_PARTS, Result
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.scan.hdf5 import opened, read_json, read_numbers, read_spectrum, write_spectrum
 
-__all__ = ["load_hdf5", "plain", "save_hdf5", "save_npy", "save_tiff"]
+__all__ = ["load_hdf5", "plain", "require_slices_folder", "save_hdf5", "save_npy", "save_tiff"]
 
 FORMAT = 1
 JSON_PARTS = ("history", "plan", "counts", "settings")
@@ -132,12 +132,11 @@ def save_npy(result: Result, path: str | os.PathLike, *, overwrite: bool = False
         np.save(file, volume, allow_pickle=False)
 
 
-def save_tiff(result: Result, folder: str | os.PathLike, *, overwrite: bool = False) -> None:
-    """See :meth:`Result.save_tiff`."""
-    import tifffile
-
+def require_slices_folder(folder: str | os.PathLike, *, overwrite: bool) -> list[Path]:
+    """The slices in a folder; refused are slices that must stay, and folders that cannot be written to."""
     target = Path(folder)
-    target.mkdir(parents=True, exist_ok=True)
+    if target.exists() and not target.is_dir():
+        raise fail("folder", "a folder", f"the file {target}", error=NotADirectoryError)
     present = sorted(target.glob("slice_*.tif"))
     if present and not overwrite:
         raise fail(
@@ -147,6 +146,17 @@ def save_tiff(result: Result, folder: str | os.PathLike, *, overwrite: bool = Fa
             "pass overwrite=True",
             FileExistsError,
         )
+    require_writable(existing_parent(target))
+    return present
+
+
+def save_tiff(result: Result, folder: str | os.PathLike, *, overwrite: bool = False) -> None:
+    """See :meth:`Result.save_tiff`."""
+    import tifffile
+
+    target = Path(folder)
+    present = require_slices_folder(target, overwrite=overwrite)
+    target.mkdir(parents=True, exist_ok=True)
     volume = result.volume.reshape(result.grid.shape)
     require_room(target, volume.nbytes)
     about = {
