@@ -25,6 +25,8 @@ __all__ = [
 
 # Deflate, the strongest compression met in these formats, cannot shrink data by more than 1032.
 LARGEST_COMPRESSION = 1100
+# An array as it is read, in the order and type that are wanted, and at work.
+_COPIES = 3
 
 
 @contextmanager
@@ -157,10 +159,10 @@ def require_plausible_size(name: str, declared_bytes: int, stored_bytes: int) ->
             "the file is truncated or damaged: copy or write it again",
         )
     memory = available_memory()
-    if memory is not None and declared_bytes > memory:
+    if memory is not None and _COPIES * declared_bytes > memory:
         raise fail(
             name,
-            f"at most the {memory / 2**30:.1f} GiB of free memory",
+            f"at most a third of the {memory / 2**30:.1f} GiB of free memory, which its copies need",
             f"{declared_bytes / 2**30:.1f} GiB",
             "bin or crop the data",
             MemoryError,

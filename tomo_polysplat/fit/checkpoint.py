@@ -26,7 +26,7 @@ from tomo_polysplat.files import replacing, require_replaceable, require_writabl
 from tomo_polysplat.fit.plan import Plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.model.gaussians import Gaussians
-from tomo_polysplat.scan.npz import read_archive
+from tomo_polysplat.scan.archive import read_archive
 
 __all__ = ["Checkpoint", "Snapshot"]
 

@@ -17,12 +17,23 @@ from typing import Any
 
 import numpy as np
 
-from tomo_polysplat.checks import fail
+from tomo_polysplat.checks import fail, require_choice
 from tomo_polysplat.files import existing_parent, replacing, require_room, require_writable
 from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.result.result import GAUSSIAN_PARTS, Result
 from tomo_polysplat.scan.geometry import VolumeGrid
-from tomo_polysplat.scan.hdf5 import opened, read_json, read_numbers, read_spectrum, write_spectrum
+from tomo_polysplat.scan.hdf5 import (
+    find_group,
+    number_attribute,
+    opened,
+    read_attribute,
+    read_json,
+    read_numbers,
+    read_spectrum,
+    text_attribute,
+    write_spectrum,
+)
+from tomo_polysplat.units import LENGTH_UNITS
 
 __all__ = ["load_hdf5", "plain", "require_slices_folder", "save_hdf5", "save_npy", "save_tiff"]
 
@@ -92,34 +103,54 @@ def _write_model(group: Any, result: Result) -> None:
 def load_hdf5(path: str | os.PathLike) -> Result:
     """See :meth:`Result.load`."""
     with opened(Path(path)) as file:
-        group = file.get("polysplat")
-        if group is None or group.attrs.get("format") is None or "basis" not in group:
-            raise fail("path", "a file written by Result.save", f"{path} without /polysplat/basis")
-        if int(group.attrs["format"]) > FORMAT:
-            raise fail(
-                "path",
-                f"a file of format {FORMAT}",
-                f"format {group.attrs['format']}",
-                "update tomo-polysplat",
-            )
+        group = find_group(file, "polysplat")
+        if group is None or number_attribute(group, "format") is None:
+            raise fail("path", "a file written by Result.save", f"{path} without /polysplat and its format")
+        if (version := number_attribute(group, "format")) != FORMAT:
+            raise fail("path", f"a file of format {FORMAT}", f"format {version:g}", "update tomo-polysplat")
         basis = read_numbers(group, "basis")
-        gaussians = {
-            name: read_numbers(group, f"gaussians/{name}") for name in GAUSSIAN_PARTS if "gaussians" in group
-        }
-        materials = read_json(group, "materials", None)
-        energy = group.attrs.get("energy_kev")
+        if basis.ndim != 4:
+            raise fail("/polysplat/basis", "shape (channels, z, y, x)", f"{basis.shape}")
+        present = find_group(group, "gaussians") is not None
         return Result(
             basis=basis,
-            grid=VolumeGrid(basis.shape[1:], group.attrs["lower"], group.attrs["upper"]),
-            unit=str(group.attrs["unit"]),
-            energy_kev=None if energy is None else float(energy),
-            materials=None if materials is None else Materials(*materials),
+            grid=VolumeGrid(basis.shape[1:], read_attribute(group, "lower"), read_attribute(group, "upper")),
+            unit=require_choice("unit in the file", text_attribute(group, "unit"), LENGTH_UNITS),
+            energy_kev=number_attribute(group, "energy_kev"),
+            materials=_read_materials(group),
             spectrum=read_spectrum(group),
-            gaussians=gaussians,
-            **{name: read_json(group, name, [] if name == "history" else {}) for name in JSON_PARTS},
-            seconds=float(group.attrs["seconds"]),
-            flipped_2d=bool(group.attrs["flipped_2d"]),
+            gaussians={name: read_numbers(group, f"gaussians/{name}") for name in GAUSSIAN_PARTS if present},
+            **_read_parts(group),
+            seconds=number_attribute(group, "seconds") or 0.0,
+            flipped_2d=bool(number_attribute(group, "flipped_2d")),
         )
+
+
+def _read_materials(group: Any) -> Materials | None:
+    names = read_json(group, "materials", None)
+    if names is None:
+        return None
+    if not isinstance(names, list) or len(names) != 3:
+        raise fail("/polysplat/materials", "three materials", f"{names!r}"[:100])
+    return Materials(*names)
+
+
+def _read_parts(group: Any) -> dict[str, Any]:
+    """History, plan, counts and settings, of the types that a result has them in."""
+    parts = {name: read_json(group, name, [] if name == "history" else {}) for name in JSON_PARTS}
+    for name, content in parts.items():
+        good = isinstance(content, list) if name == "history" else isinstance(content, dict)
+        if good and name == "history":
+            good = all(isinstance(record, dict) and _numeric(record) for record in content)
+        if not good:
+            raise fail(f"/polysplat/{name}", "what Result.save writes", f"{content!r}"[:100])
+    return parts
+
+
+def _numeric(record: dict[str, Any]) -> bool:
+    """Whether everything in a record of the history but the name of its stage is a number or missing."""
+    numbers = (value for name, value in record.items() if name != "stage")
+    return all(value is None or isinstance(value, (int, float)) for value in numbers)
 
 
 def save_npy(result: Result, path: str | os.PathLike, *, overwrite: bool = False) -> None:

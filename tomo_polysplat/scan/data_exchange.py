@@ -22,25 +22,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tomo_polysplat.checks import fail, require_array, require_choice, require_shape
-from tomo_polysplat.files import replacing
 from tomo_polysplat.scan.centre import estimate_centre
 from tomo_polysplat.scan.defects import attenuation, fill_invalid, flat_and_dark
-from tomo_polysplat.scan.dxchange_host import read_block, write_first_array
+from tomo_polysplat.scan.dxchange_host import read_block
 from tomo_polysplat.scan.hdf5 import (
     find_array,
+    find_group,
+    number_attribute,
     opened,
     read_numbers,
     read_spectrum,
     read_text,
-    write_spectrum,
+    text_attribute,
 )
 from tomo_polysplat.scan.layout import (
     parallel_geometry,
     spatial_geometry,
-    vector_form,
     vector_geometry,
     volume_geometry,
-    window_of,
 )
 from tomo_polysplat.scan.reading import INPUT_KINDS, ReadOptions
 from tomo_polysplat.scan.scan import Scan
@@ -48,7 +47,7 @@ from tomo_polysplat.scan.scan import Scan
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["scan_from_hdf5", "write_hdf5"]
+__all__ = ["scan_from_hdf5"]
 
 logger = logging.getLogger(__name__)
 
@@ -63,15 +62,14 @@ LENGTH_NAMES |= dict.fromkeys(("micron", "microns", "micrometers"), "um")
 def scan_from_hdf5(path: Path, options: ReadOptions) -> Scan:
     """Read a scan; see :func:`tomo_polysplat.load_scan`."""
     with opened(path) as file:
-        exchange = file.get("exchange")
+        exchange = find_group(file, "exchange")
         data = None if exchange is None else find_array(exchange, "data")
         if exchange is None or data is None or data.ndim != 3 or 0 in data.shape:
             got = "no such dataset" if data is None else f"shape {data.shape}"
             raise fail("path", "a dataset /exchange/data of shape (views, rows, columns)", f"{got} in {path}")
         projections, valid, notes = _line_integrals(exchange, data, options)
-        own = file.get("polysplat/valid")
-        if own is not None:
-            stored = read_numbers(file["polysplat"], "valid", data.shape).astype(bool)
+        if find_array(file, "polysplat/valid") is not None:
+            stored = read_numbers(file, "polysplat/valid", data.shape).astype(bool)
             valid &= stored.transpose(1, 0, 2)
         _report_defects(notes["rays"], valid)
         geometry = _geometry(file, projections, valid, options, notes)
@@ -121,9 +119,8 @@ def _input_kind(data: h5py.Dataset, has_white: bool, stated: str | None) -> str:
     """What the numbers are: as the caller or the file states it, else as they look, with a warning."""
     if stated is not None:
         return stated
-    attribute = data.attrs.get("input")
+    attribute = text_attribute(data, "input")
     if attribute is not None:
-        attribute = attribute.decode() if isinstance(attribute, bytes) else attribute
         return require_choice("attribute 'input' of /exchange/data", attribute, INPUT_KINDS)
     if has_white:
         return "counts"
@@ -153,7 +150,7 @@ def _geometry(
     file: h5py.File, projections: np.ndarray, valid: np.ndarray, options: ReadOptions, notes: dict[str, Any]
 ) -> dict[str, Any]:
     """``proj_geom``, ``vol_geom`` and ``unit``: the caller's, the file's, or a parallel beam."""
-    group = file.get("polysplat/geometry")
+    group = find_group(file, "polysplat/geometry")
     if options.proj_geom is not None or group is not None:
         options.refuse_parallel_only()
     if options.proj_geom is not None:
@@ -183,20 +180,20 @@ def _geometry(
 
 
 def _attribute(group: h5py.Group, name: str) -> str:
-    value = group.attrs.get(name)
-    if not isinstance(value, (str, bytes)):
-        raise fail("path", f"an attribute '{name}' of {group.name}", repr(value))
-    return value.decode() if isinstance(value, bytes) else value
+    value = text_attribute(group, name)
+    if value is None:
+        raise fail("path", f"a text as attribute '{name}' of {group.name}", "none")
+    return value
 
 
 def _angles(file: h5py.File, views: int, given: Any) -> np.ndarray:
     """View angles in radians."""
     in_radians = False
     if given is None:
-        dataset = find_array(file["exchange"], "theta")
+        dataset = find_array(file, "exchange/theta")
         if dataset is None:
             raise _missing_theta(views)
-        in_radians = str(dataset.attrs.get("units", "")).strip("b'\"").lower().startswith("rad")
+        in_radians = (text_attribute(dataset, "units") or "").lower().startswith("rad")
         given = read_block(dataset)
     theta = require_array("theta", given, 1).astype(np.float64)
     require_shape("theta", theta, (views,), "(views,)")
@@ -223,7 +220,7 @@ def _pixel_size(file: h5py.File, options: ReadOptions) -> tuple[float, str]:
     for path in PIXEL_SIZE_PATHS:
         dataset = find_array(file, path)
         if dataset is not None and dataset.size == 1:
-            unit = LENGTH_NAMES.get(str(dataset.attrs.get("units", "")).strip("b'\"").lower())
+            unit = LENGTH_NAMES.get((text_attribute(dataset, "units") or "").lower())
             if unit is not None:
                 return float(np.asarray(dataset[()]).reshape(())), options.settled_unit(unit, unit)
     if options.unit not in (None, "pixel"):
@@ -235,67 +232,16 @@ def _pixel_size(file: h5py.File, options: ReadOptions) -> tuple[float, str]:
 
 def _knowledge(file: h5py.File, options: ReadOptions) -> dict[str, Any]:
     """Spectrum, water correction, truth and metal mask, where the file has them."""
-    group = file.get("polysplat", {})
-    known: dict[str, Any] = {"spectrum": options.spectrum or read_spectrum(group)}
-    known["water_correction"] = options.water_correction
-    if options.water_correction is None and "water_correction" in group:
+    known: dict[str, Any] = {"spectrum": options.spectrum, "water_correction": options.water_correction}
+    group = find_group(file, "polysplat")
+    if group is None:
+        return known
+    known["spectrum"] = options.spectrum or read_spectrum(group)
+    if options.water_correction is None and find_array(group, "water_correction") is not None:
         known["water_correction"] = read_numbers(group, "water_correction")
-    if options.vol_geom is None and "truth" in group:
-        energy = group["truth"].attrs.get("energy_kev")
-        known |= {
-            "truth": read_numbers(group, "truth"),
-            "truth_energy_kev": None if energy is None else float(energy),
-            "metal_mask": read_numbers(group, "metal_mask") if "metal_mask" in group else None,
-        }
+    truth = find_array(group, "truth")
+    if options.vol_geom is None and truth is not None:
+        known["truth"], known["truth_energy_kev"] = truth[()], number_attribute(truth, "energy_kev")
+        if find_array(group, "metal_mask") is not None:
+            known["metal_mask"] = read_numbers(group, "metal_mask")
     return known
-
-
-def write_hdf5(scan: Scan, path: str | Path, *, overwrite: bool = False) -> None:
-    """Write a scan as Data Exchange with the group ``/polysplat`` described above."""
-    import h5py
-
-    needed = sum(
-        a.nbytes for a in (scan.projections, scan.truth, scan.metal_mask, scan.valid) if a is not None
-    )
-    with replacing(path, overwrite=overwrite, needed_bytes=needed) as temporary:
-        write_first_array(temporary, "exchange", "data", scan.projections.transpose(1, 0, 2))
-        with h5py.File(temporary, "r+") as file:
-            _describe(file, scan)
-
-
-def _describe(file: h5py.File, scan: Scan) -> None:
-    """Add to a file that holds the projections what else there is to know."""
-    if "implements" in file:
-        del file["implements"]
-    file["implements"] = "exchange:measurement:polysplat"
-    file["measurement/sample/name"] = scan.name
-    description = {"description": "attenuation", "axes": "theta:y:x", "units": "1"}
-    file["exchange/data"].attrs.update(input="attenuation", **description)
-    geometry = vector_form(scan.proj_geom)
-    theta = file.create_dataset("exchange/theta", data=_theta_degrees(geometry["Vectors"]))
-    theta.attrs["units"] = "degrees"
-    group = file.create_group("polysplat/geometry")
-    group.attrs.update(astra_type=geometry["type"], unit=scan.unit)
-    group["vectors"] = geometry["Vectors"]
-    group["volume_shape"], group["volume_window"] = np.array(scan.volume_shape), window_of(scan.vol_geom)
-    _write_knowledge(file["polysplat"], scan)
-
-
-def _write_knowledge(group: h5py.Group, scan: Scan) -> None:
-    write_spectrum(group, scan.spectrum)
-    if scan.valid is not None:
-        group["valid"] = scan.valid.transpose(1, 0, 2)
-    if scan.water_correction is not None:
-        group["water_correction"] = np.array(scan.water_correction)
-    if scan.metal_mask is not None:
-        group["metal_mask"] = scan.metal_mask
-    if scan.truth is not None:
-        group["truth"] = scan.truth
-        group["truth"].attrs["unit"] = f"1/{scan.unit}"
-        if scan.truth_energy_kev is not None:
-            group["truth"].attrs["energy_kev"] = scan.truth_energy_kev
-
-
-def _theta_degrees(vectors: np.ndarray) -> np.ndarray:
-    """Azimuth of the source (or of a parallel beam's direction) as ASTRA counts angles: 0 is at -y."""
-    return np.rad2deg(np.unwrap(np.arctan2(vectors[:, 0], -vectors[:, 1])))

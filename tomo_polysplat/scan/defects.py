@@ -63,7 +63,12 @@ def attenuation(
     usable = np.isfinite(values)
     counts = {"not_finite": int(values.size - np.count_nonzero(usable))}
     if kind == "attenuation":
-        return np.where(usable, values, 0).astype(np.float32), usable, counts
+        # What float32 cannot hold is as infinite as what the file calls so.
+        with np.errstate(over="ignore"):
+            narrow = np.where(usable, values, 0).astype(np.float32)
+        usable &= np.isfinite(narrow)
+        counts = {"not_finite": int(values.size - np.count_nonzero(usable))}
+        return np.where(usable, narrow, np.float32(0)), usable, counts
     if kind == "counts":
         if flat is None or dark is None:
             raise fail(

@@ -1,8 +1,13 @@
-"""Reading HDF5 files that may be damaged, truncated or something else altogether."""
+"""Reading HDF5 files that may be damaged, truncated or something else altogether.
+
+Everything is looked up link by link: nothing outside the file is opened, and no size is believed before it is
+compared with what the file stores.
+"""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,14 +24,15 @@ if TYPE_CHECKING:
     from tomo_polysplat.physics.spectrum import Spectrum
 
 __all__ = [
-    "find_array",
-    "opened",
-    "read_json",
-    "read_numbers",
-    "read_spectrum",
-    "read_text",
-    "write_spectrum",
+    *("find_array", "find_group", "number_attribute", "opened", "read_attribute", "read_json"),
+    *("read_numbers", "read_spectrum", "read_text", "text_attribute", "write_spectrum"),
 ]
+
+_MOST_LINKS = 16
+_LARGEST_ATTRIBUTE = 2**16
+# What h5py raises for files that HDF5 cannot make sense of.
+_BROKEN = (OSError, RuntimeError, KeyError, UnicodeDecodeError)
+_OUTSIDE = "copy the data into one file: h5repack does, and so does h5py"
 
 
 @contextmanager
@@ -38,11 +44,56 @@ def opened(path: str | Path) -> Iterator[h5py.File]:
     try:
         with h5py.File(file, "r") as handle:
             yield handle
-    except OSError as error:
+    except _BROKEN as error:
         remedy = (
             "it is not HDF5, is truncated, or needs a compression plugin (python -m pip install hdf5plugin)"
         )
         raise fail("path", "a readable HDF5 file", f"{file} ({error})", remedy) from error
+
+
+def _member(group: h5py.Group, path: str, links: int = _MOST_LINKS) -> Any:
+    """The object at a path below a group, or None.
+
+    Raises
+    ------
+    ValueError
+        For a link out of the file, or one that leads round in circles.
+    """
+    import h5py
+
+    here: Any = group.file if path.startswith("/") else group
+    for part in filter(None, path.split("/")):
+        name = part.encode("utf-8", "surrogateescape")
+        # Asked of the link itself: h5py's own look-ups follow it first, to whatever file it names.
+        if not isinstance(here, h5py.Group) or not here.id.links.exists(name):
+            return None
+        kind = here.id.links.get_info(name).type
+        if kind == h5py.h5l.TYPE_SOFT:
+            if not links:
+                raise fail(f"{here.name}/{part}", f"at most {_MOST_LINKS} links to the data", "more")
+            target = here.id.links.get_val(name).decode("utf-8", "surrogateescape")
+            here = _member(here, target, links - 1)
+        elif kind == h5py.h5l.TYPE_HARD:
+            here = here[part]
+        else:
+            raise fail(f"{here.name}/{part}", "data in the file", "a link to another file", _OUTSIDE)
+    return here
+
+
+def find_group(group: h5py.Group, path: str) -> h5py.Group | None:
+    """The group at a path, or None.
+
+    Raises
+    ------
+    ValueError
+        If something else than a group is there.
+    """
+    import h5py
+
+    found = _member(group, path)
+    if found is not None and not isinstance(found, h5py.Group):
+        raise fail(f"{group.name}/{path}", "a group", repr(found))
+    return found
 
 
 def find_array(group: h5py.Group, name: str) -> h5py.Dataset | None:
@@ -51,21 +102,40 @@ def find_array(group: h5py.Group, name: str) -> h5py.Dataset | None:
     Raises
     ------
     ValueError
-        If it holds no numbers, or declares more data than the file stores.
+        If it holds no numbers, lies outside the file, or declares more data than the file stores.
     MemoryError
-        If it is larger than the free memory.
+        If it is too large for the free memory.
     """
-    import h5py
-
-    dataset = group.get(name)
+    dataset = _member(group, name)
     if dataset is None:
         return None
-    if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "fiub" or dataset.shape is None:
-        raise fail(f"{group.name}/{name}", "a dataset of numbers", repr(dataset))
-    declared = int(np.prod(dataset.shape, dtype=object)) * dataset.dtype.itemsize
-    stored = declared if dataset.is_virtual or dataset.external else dataset.id.get_storage_size()
-    require_plausible_size(f"{group.name}/{name}", declared, stored)
+    where = f"{group.name}/{name}"
+    dtype = _type_of(dataset)
+    if dtype is None or dtype.kind not in "fiub" or dataset.shape is None:
+        raise fail(where, "a dataset of numbers", repr(dataset))
+    if dataset.is_virtual or dataset.external:
+        raise fail(where, "data in the file", "a dataset that only refers to other files", _OUTSIDE)
+    _require_stored(where, dataset, math.prod(dataset.shape) * dtype.itemsize)
+    if dataset.chunks:
+        _require_stored(where, dataset, math.prod(dataset.chunks) * dtype.itemsize)
     return dataset
+
+
+def _type_of(dataset: Any) -> np.dtype | None:
+    """NumPy's type of a dataset; None for anything else and for types that NumPy does not have."""
+    import h5py
+
+    if not isinstance(dataset, h5py.Dataset):
+        return None
+    try:
+        return dataset.dtype
+    except (TypeError, ValueError):
+        return None
+
+
+def _require_stored(where: str, dataset: h5py.Dataset, declared: int) -> None:
+    file_size = Path(dataset.file.filename).stat().st_size
+    require_plausible_size(where, declared, min(dataset.id.get_storage_size(), file_size))
 
 
 def read_numbers(group: h5py.Group, name: str, shape: tuple[int, ...] | None = None) -> np.ndarray:
@@ -82,15 +152,61 @@ def read_text(group: h5py.Group, name: str, default: str = "") -> str:
     """A string dataset (also one of a single element, as Data Exchange writes them)."""
     import h5py
 
-    dataset = group.get(name)
-    if (
-        not isinstance(dataset, h5py.Dataset)
-        or h5py.check_string_dtype(dataset.dtype) is None
-        or dataset.size != 1
-    ):
+    dataset = _member(group, name)
+    dtype = _type_of(dataset)
+    if dtype is None or h5py.check_string_dtype(dtype) is None or dataset.size != 1:
         return default
-    value = np.asarray(dataset[()]).reshape(-1)[0]
-    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+    _require_stored(f"{group.name}/{name}", dataset, dtype.itemsize)
+    return _text(np.asarray(dataset[()]).reshape(-1)[0])
+
+
+def _text(value: Any) -> str:
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else _writable(str(value))
+
+
+def _writable(text: str) -> str:
+    # Half of a surrogate pair could not be written to a report.
+    return text.encode("utf-8", "replace").decode("utf-8")
+
+
+def read_attribute(item: h5py.HLObject, name: str) -> Any:
+    """An attribute, or None.
+
+    Raises
+    ------
+    ValueError
+        If it is of a type that NumPy does not have, or large.
+    """
+    if name not in item.attrs:
+        return None
+    try:
+        about = item.attrs.get_id(name)
+        size = math.prod(about.shape or ()) * about.dtype.itemsize
+        value = item.attrs[name] if size <= _LARGEST_ATTRIBUTE else None
+    except (TypeError, ValueError) as error:
+        raise fail(f"attribute '{name}' of {item.name}", "a number or a text", str(error)) from error
+    if value is None:
+        raise fail(f"attribute '{name}' of {item.name}", "a number or a text", f"{size} bytes")
+    return value
+
+
+def text_attribute(item: h5py.HLObject, name: str) -> str | None:
+    """An attribute that is one text; None for anything else."""
+    value = read_attribute(item, name)
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.reshape(-1)[0]
+    return _text(value) if isinstance(value, (str, bytes)) else None
+
+
+def number_attribute(item: h5py.HLObject, name: str) -> float | None:
+    """An attribute that is one finite number, or None where there is none."""
+    value = read_attribute(item, name)
+    if value is None:
+        return None
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiub" or array.size != 1 or not np.isfinite(array).all():
+        raise fail(f"attribute '{name}' of {item.name}", "one finite number", repr(value)[:100])
+    return float(array.reshape(()))
 
 
 def read_json(group: h5py.Group, name: str, default: Any) -> Any:
@@ -98,7 +214,7 @@ def read_json(group: h5py.Group, name: str, default: Any) -> Any:
     text = read_text(group, name)
     try:
         return json.loads(text) if text else default
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise fail(f"{group.name}/{name}", "JSON text", f"{text[:40]!r}") from error
 
 
@@ -114,8 +230,8 @@ def read_spectrum(group: h5py.Group) -> Spectrum | None:
     """What :func:`write_spectrum` kept, or None."""
     from tomo_polysplat.physics.spectrum import Spectrum
 
-    lines = group.get("spectrum")
+    lines = find_group(group, "spectrum")
     if lines is None:
         return None
-    label = str(lines.attrs.get("label", "measured spectrum"))
+    label = text_attribute(lines, "label") or "measured spectrum"
     return Spectrum(read_numbers(lines, "energies"), read_numbers(lines, "weights"), label)

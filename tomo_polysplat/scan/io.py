@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from tomo_polysplat.checks import fail
 from tomo_polysplat.files import existing_file
-from tomo_polysplat.scan.data_exchange import scan_from_hdf5, write_hdf5
+from tomo_polysplat.scan.data_exchange import scan_from_hdf5
+from tomo_polysplat.scan.data_exchange_writer import write_hdf5
 from tomo_polysplat.scan.npz import scan_from_npz, write_npz
 from tomo_polysplat.scan.reading import ReadOptions
 from tomo_polysplat.scan.scan import Scan

@@ -40,7 +40,8 @@ def volume_geometry(shape: np.ndarray, window: np.ndarray) -> dict[str, Any]:
     shape, window = require_array("volume shape", shape, 1), require_array("volume window", window, 1)
     require_shape("volume shape", shape, (3,), "(nz, ny, nx)")
     require_shape("volume window", window, (6,), "(xmin, xmax, ymin, ymax, zmin, zmax)")
-    if not (np.all(shape >= 1) and np.isfinite(window).all() and np.all(window[1::2] > window[::2])):
+    counts = np.isfinite(shape).all() and np.all((shape >= 1) & (shape == np.floor(shape)))
+    if not (counts and np.isfinite(window).all() and np.all(window[1::2] > window[::2])):
         raise fail("volume", "positive counts and a window with minimum < maximum", f"{shape} in {window}")
     nz, ny, nx = (int(n) for n in shape)
     return astra.create_vol_geom(ny, nx, nz, *(float(w) for w in window))

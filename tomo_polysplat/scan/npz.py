@@ -4,21 +4,20 @@
 ``astra_type`` says otherwise; ``vol_shape`` (nz, ny, nx);
 ``vol_window`` (xmin, xmax, ymin, ymax, zmin, zmax); optional ``unit`` (cm if absent), ``energies`` (keV) with
 ``spectrum``, ``truth_mu`` and ``metal_mask`` (z, y, x), ``e_ref`` or ``e_eff`` (keV, energy of the truth) and
-``valid`` (like the projections) and ``water_correction`` (coefficients of ``Scan``).
+``valid`` (like the projections) and ``carries_water_correction`` (coefficients of ``Scan.water_correction``; a key
+``water_correction`` without "carries" is found in files whose correction was undone, and is not read).
 """
 
 from __future__ import annotations
 
-import zipfile
-import zlib
-from collections.abc import Iterable
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tomo_polysplat.checks import fail, require_array, require_shape
-from tomo_polysplat.files import existing_file, replacing, require_plausible_size
+from tomo_polysplat.files import replacing
+from tomo_polysplat.scan.archive import archived_number, archived_text, read_archive
 from tomo_polysplat.scan.defects import attenuation
 from tomo_polysplat.scan.layout import (
     spatial_geometry,
@@ -33,59 +32,13 @@ from tomo_polysplat.scan.scan import Scan
 if TYPE_CHECKING:
     from tomo_polysplat.physics.spectrum import Spectrum
 
-__all__ = ["read_archive", "scan_from_npz", "write_npz"]
+__all__ = ["scan_from_npz", "write_npz"]
 
 NAMES = (
     *("projections", "valid", "astra_type", "vectors", "vol_shape", "vol_window", "unit"),
     *("energies", "spectrum", "spectrum_label", "truth_mu", "metal_mask", "e_ref", "e_eff"),
-    "water_correction",
+    "carries_water_correction",
 )
-
-_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-
-
-def read_archive(path: str | Path, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """Arrays called `names` of a NumPy archive, those that it has.
-
-    Nothing is unpickled, and each header is compared with what is stored before memory is taken.
-
-    Raises
-    ------
-    ValueError
-        If the file is not such an archive, is truncated, or a header does not fit its data.
-    """
-    file = existing_file(path)
-    try:
-        with zipfile.ZipFile(file) as archive:
-            members = {info.filename: info for info in archive.infolist()}
-            chosen = [name for name in names if f"{name}.npy" in members]
-            return {name: _read_member(archive, members[f"{name}.npy"]) for name in chosen}
-    except (zipfile.BadZipFile, EOFError, OSError, zlib.error) as error:
-        raise fail(
-            "path", "a readable .npz archive", f"{file} ({error})", "copy or write the file again"
-        ) from error
-
-
-def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    with archive.open(info) as stream:
-        _check_header(stream, info)
-    with archive.open(info) as stream:
-        return np.lib.format.read_array(stream, allow_pickle=False)
-
-
-def _check_header(stream: IO[bytes], info: zipfile.ZipInfo) -> None:
-    version = np.lib.format.read_magic(stream)
-    if version not in _HEADERS:
-        raise fail(info.filename, "a NumPy array of format 1.0 or 2.0", f"format {version}")
-    shape, _, dtype = _HEADERS[version](stream)
-    if dtype.hasobject:
-        raise fail(info.filename, "an array of numbers", "pickled objects, which are never loaded")
-    declared = int(np.prod(shape, dtype=object)) * dtype.itemsize
-    if declared > info.file_size:
-        raise fail(
-            info.filename, f"{declared} bytes as its header declares", f"{info.file_size}", "damaged file"
-        )
-    require_plausible_size(info.filename, declared, info.compress_size)
 
 
 def scan_from_npz(path: Path, options: ReadOptions) -> Scan:
@@ -102,8 +55,9 @@ def scan_from_npz(path: Path, options: ReadOptions) -> Scan:
         raise fail("input", "'attenuation', which an .npz scan holds", repr(options.input))
     integrals, valid, counts = attenuation(values, "attenuation")
     if "valid" in arrays:
-        require_shape("valid", arrays["valid"], values.shape, "(views, rows, columns)")
-        valid &= arrays["valid"].astype(bool)
+        stored = require_array("valid", arrays["valid"])
+        require_shape("valid", stored, values.shape, "(views, rows, columns)")
+        valid &= stored.astype(bool)
     views, rows, columns = values.shape
     own_volume = options.vol_geom is None
     return Scan(
@@ -112,7 +66,7 @@ def scan_from_npz(path: Path, options: ReadOptions) -> Scan:
         spectrum=options.spectrum or _spectrum(arrays),
         truth=arrays.get("truth_mu") if own_volume else None,
         metal_mask=arrays.get("metal_mask") if own_volume else None,
-        truth_energy_kev=_number(arrays, "e_ref", "e_eff"),
+        truth_energy_kev=archived_number(arrays, "e_ref", "e_eff"),
         name=path.stem,
         water_correction=_water_correction(arrays, options),
         notes={"input": "attenuation", "rays": counts},
@@ -127,9 +81,11 @@ def _geometry(
     if options.proj_geom is not None:
         proj_geom = spatial_geometry(dict(options.proj_geom))
     else:
-        proj_geom = vector_geometry(_text(arrays, "astra_type") or "cone_vec", arrays["vectors"], shape)
+        proj_geom = vector_geometry(
+            archived_text(arrays, "astra_type") or "cone_vec", arrays["vectors"], shape
+        )
     vol_geom = dict(options.vol_geom or volume_geometry(arrays["vol_shape"], arrays["vol_window"]))
-    stated = _text(arrays, "unit") if options.proj_geom is None else None
+    stated = archived_text(arrays, "unit") if options.proj_geom is None else None
     return {"proj_geom": proj_geom, "vol_geom": vol_geom, "unit": options.settled_unit(stated, "cm")}
 
 
@@ -139,24 +95,14 @@ def _spectrum(arrays: dict[str, np.ndarray]) -> Spectrum | None:
     from tomo_polysplat.physics.spectrum import Spectrum
 
     return Spectrum(
-        arrays["energies"], arrays["spectrum"], _text(arrays, "spectrum_label") or "measured spectrum"
+        arrays["energies"], arrays["spectrum"], archived_text(arrays, "spectrum_label") or "measured spectrum"
     )
 
 
 def _water_correction(arrays: dict[str, np.ndarray], options: ReadOptions) -> tuple[float, ...] | None:
     if options.water_correction is not None:
         return tuple(options.water_correction)
-    return tuple(arrays["water_correction"]) if "water_correction" in arrays else None
-
-
-def _number(arrays: dict[str, np.ndarray], *names: str) -> float | None:
-    """The first of the named numbers that is there."""
-    present = [name for name in names if name in arrays]
-    return float(require_array(present[0], arrays[present[0]]).reshape(())) if present else None
-
-
-def _text(arrays: dict[str, np.ndarray], name: str) -> str | None:
-    return str(arrays[name]) if name in arrays else None
+    return tuple(arrays["carries_water_correction"]) if "carries_water_correction" in arrays else None
 
 
 def write_npz(scan: Scan, path: str | Path, *, overwrite: bool = False) -> None:
@@ -172,7 +118,7 @@ def write_npz(scan: Scan, path: str | Path, *, overwrite: bool = False) -> None:
         "truth_mu": scan.truth,
         "metal_mask": scan.metal_mask,
         "e_ref": scan.truth_energy_kev,
-        "water_correction": scan.water_correction,
+        "carries_water_correction": scan.water_correction,
         "valid": None if scan.valid is None else scan.valid.transpose(1, 0, 2),
     }
     if scan.spectrum is not None:

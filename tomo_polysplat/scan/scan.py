@@ -80,7 +80,7 @@ class Scan:
             self.truth = np.ascontiguousarray(require_array("truth", self.truth, 3), np.float32)
             require_shape("truth", self.truth, self.volume_shape, "(z, y, x)")
         if self.metal_mask is not None:
-            self.metal_mask = np.ascontiguousarray(self.metal_mask, bool)
+            self.metal_mask = np.ascontiguousarray(require_array("metal_mask", self.metal_mask, 3), bool)
             require_shape("metal_mask", self.metal_mask, self.volume_shape, "(z, y, x)")
 
     @property

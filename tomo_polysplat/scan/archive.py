@@ -1,0 +1,108 @@
+"""Reading NumPy archives that may be damaged, truncated or something else altogether."""
+
+from __future__ import annotations
+
+import math
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from tomo_polysplat.checks import fail, require_array
+from tomo_polysplat.files import existing_file, require_plausible_size
+
+__all__ = ["archived_number", "archived_text", "read_archive"]
+
+_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+# NumPy writes no others, and some of them may ask for gigabytes before they give the first byte.
+_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+# What zipfile and zlib raise for archives that are broken, encrypted or of a later version.
+_BROKEN = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, RuntimeError, UnicodeDecodeError)
+_LONGEST_TEXT = 1000
+
+
+def read_archive(path: str | Path, names: Iterable[str]) -> dict[str, np.ndarray]:
+    """Arrays called `names` of a NumPy archive, those that it has.
+
+    Nothing is unpickled, and each header is compared with what is stored before memory is taken.
+
+    Raises
+    ------
+    ValueError
+        If the file is not such an archive, is truncated, or a header does not fit its data.
+    MemoryError
+        If an array is too large for the free memory.
+    """
+    file = existing_file(path)
+    size = file.stat().st_size
+    try:
+        with zipfile.ZipFile(file) as archive:
+            members = {info.filename: info for info in archive.infolist()}
+            chosen = [name for name in names if f"{name}.npy" in members]
+            return {name: _read_member(archive, members[f"{name}.npy"], size) for name in chosen}
+    except _BROKEN as error:
+        raise fail(
+            "path", "a readable .npz archive", f"{file} ({error})", "copy or write the file again"
+        ) from error
+
+
+def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, file_size: int) -> np.ndarray:
+    if info.compress_type not in _COMPRESSIONS:
+        raise fail(info.filename, "a stored or deflated array", f"compression type {info.compress_type}")
+    with archive.open(info) as stream:
+        shape, dtype = _header(stream, info)
+    declared = math.prod(shape) * dtype.itemsize
+    if declared > info.file_size:
+        raise fail(
+            info.filename, f"{declared} bytes as its header declares", f"{info.file_size}", "damaged file"
+        )
+    require_plausible_size(info.filename, declared, min(info.compress_size, file_size))
+    with archive.open(info) as stream:
+        return np.lib.format.read_array(stream, allow_pickle=False)
+
+
+def _header(stream: IO[bytes], info: zipfile.ZipInfo) -> tuple[tuple[int, ...], np.dtype]:
+    """Shape and type that an array's header declares."""
+    try:
+        version = np.lib.format.read_magic(stream)
+        if version not in _HEADERS:
+            raise ValueError(f"format {version}")
+        shape, _, dtype = _HEADERS[version](stream)
+    except _BROKEN:
+        raise
+    except Exception as error:  # the text of a header goes through Python's parser, which may raise anything
+        raise fail(info.filename, "the header of a NumPy array", str(error)[:200], "damaged file") from error
+    if dtype.hasobject:
+        raise fail(info.filename, "an array of numbers", "pickled objects, which are never loaded")
+    if dtype.kind not in "fiubU" or min(shape, default=0) < 0 or (dtype.itemsize == 0 and shape):
+        raise fail(info.filename, "an array of numbers", f"{dtype} of shape {shape}"[:200])
+    return shape, dtype
+
+
+def archived_number(arrays: dict[str, np.ndarray], *names: str) -> float | None:
+    """The first of the named numbers that is there."""
+    for name in names:
+        if name in arrays:
+            array = require_array(name, arrays[name])
+            if array.size != 1 or not np.isfinite(array).all():
+                raise fail(name, "one finite number", f"shape {array.shape}")
+            return float(array.reshape(()))
+    return None
+
+
+def archived_text(arrays: dict[str, np.ndarray], name: str) -> str | None:
+    """A short text, where it is there."""
+    if name not in arrays:
+        return None
+    array = arrays[name]
+    if array.dtype.kind != "U" or array.size != 1 or array.dtype.itemsize > 4 * _LONGEST_TEXT:
+        raise fail(name, "a short text", f"{array.dtype} of shape {array.shape}")
+    try:
+        # Half of a surrogate pair could not be written to a report.
+        return str(array.reshape(-1)[0]).encode("utf-8", "replace").decode("utf-8")
+    except ValueError as error:
+        raise fail(name, "a text", "characters that do not exist") from error
