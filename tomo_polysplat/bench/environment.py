@@ -13,7 +13,7 @@ from tomo_polysplat.parallel import cpu_threads
 
 __all__ = ["environment"]
 
-_PACKAGES = ("tomo-polysplat", "numpy", "torch", "numba", "triton", "astra-toolbox")
+_PACKAGES = ("tomo-polysplat", "numpy", "torch", "numba", "triton", "astra-toolbox", "mbirtorch")
 
 
 def environment() -> dict[str, Any]:

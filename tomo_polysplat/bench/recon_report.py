@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["as_text", "error_figure", "machine", "write_figures"]
+__all__ = ["as_text", "colour", "dress", "error_figure", "machine", "write_figures"]
 
 _COLOURS = (
     "#9a9a9a",
@@ -85,10 +85,10 @@ def error_figure(record: Mapping[str, Any], scene: str, size: int) -> Figure:
             ]
             for curve in curves:
                 axis.plot(
-                    *zip(*[(p["seconds"], p[key]) for p in curve["history"]]), color=_colour(name, record)
+                    *zip(*[(p["seconds"], p[key]) for p in curve["history"]]), color=colour(name, record)
                 )
         axis.set(xscale="log", xlabel="seconds, from projections to volume", ylabel=f"PSNR {label} (dB)")
-        _dress(axis)
+        dress(axis)
     if axis.lines:
         axis.legend(frameon=False, fontsize=8)
     figure.suptitle(
@@ -114,7 +114,7 @@ def _size_figure(folder: Path, record: Mapping[str, Any], scene: str) -> Path:
     sizes = sorted({run["size"] for run in here})
     axis.set_xticks(sizes, [str(size) for size in sizes])
     axis.minorticks_off()
-    _dress(axis)
+    dress(axis)
     figure.legend(loc="outside right center", frameon=False, fontsize=8)
     figure.suptitle(f"{scene}; {machine(record)}", fontsize=10)
     return _save(figure, folder / f"recon-seconds-{scene}.png")
@@ -129,11 +129,12 @@ def _plot(
     line: str,
 ) -> None:
     axis.plot(
-        *zip(*points), marker=marker, linestyle=line, color=_colour(name, record), label=METHODS[name].label
+        *zip(*points), marker=marker, linestyle=line, color=colour(name, record), label=METHODS[name].label
     )
 
 
-def _colour(name: str, record: Mapping[str, Any]) -> str:
+def colour(name: str, record: Mapping[str, Any]) -> str:
+    """Of a method, the same in every figure of a record."""
     others = [method for method in record["bench"]["methods"] if method != OURS]
     return ACCENT if name == OURS else _COLOURS[others.index(name) % len(_COLOURS)]
 
@@ -146,7 +147,8 @@ def machine(record: Mapping[str, Any]) -> str:
     return f"{environment['cpu']}, {environment['threads']} threads"
 
 
-def _dress(axis: Axes) -> None:
+def dress(axis: Axes) -> None:
+    """Axes as all figures have them."""
     axis.spines[["top", "right"]].set_visible(False)
     axis.grid(color=QUIET, alpha=0.2, linewidth=0.6)
 

@@ -1,4 +1,4 @@
-"""``tomo-polysplat bench``: kernels, and whole reconstructions by several methods, timed with their errors."""
+"""``tomo-polysplat bench``: kernels, reconstructions, their accuracy, and what the solver's parts are worth."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 NAME = "bench"
 HELP = "time kernels, or whole reconstructions by several methods, together with their errors"
 
+_METHODS = ["fdk", "fdk-water", "sirt", "limar", "nmar", "voxel-poly", "mono", "polysplat"]
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Its own subcommands and their options."""
@@ -25,7 +27,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     kernels.add_argument("--repeats", type=int, default=5, help="the shortest of so many counts (default: 5)")
     recon = what.add_parser("recon", help="scenes x sizes x methods x time budgets")
     _add_recon_arguments(recon)
-    for child in (kernels, recon):
+    accuracy = what.add_parser(
+        "accuracy", help="errors of many kinds, over seeds, noise, views and tube voltages"
+    )
+    _add_accuracy_arguments(accuracy)
+    ablation = what.add_parser("ablation", help="seconds and errors with parts of the solver changed")
+    _add_ablation_arguments(ablation)
+    for child in (kernels, recon, accuracy, ablation):
         child.add_argument(
             "--record",
             metavar="FOLDER",
@@ -35,15 +43,61 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _add_recon_arguments(parser: argparse.ArgumentParser) -> None:
     add_solver_options(parser)
+    _add_comparison_arguments(parser)
+    parser.add_argument("--views", type=int, default=180, help="projection images (default: 180)")
+    parser.add_argument("--photons", type=float, default=1e5, help="counts of a free ray (default: 1e5)")
+    parser.add_argument("--kvp", type=float, default=90.0, help="tube voltage, behind 1 mm Al (default: 90)")
+
+
+def _add_accuracy_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--device", default="auto", help="auto (default), cpu, cuda or cuda:N")
+    _add_comparison_arguments(parser)
+    parser.add_argument("--seeds", type=int, default=1, help="repetitions with other noise (default: 1)")
+    for name, kind, standard, words in (
+        ("--views", int, 180, "projection images"),
+        ("--photons", float, 1e5, "counts of a free ray"),
+        ("--kvp", float, 90.0, "tube voltages, behind 1 mm Al"),
+    ):
+        parser.add_argument(
+            name, nargs="+", type=kind, default=[standard], help=f"{words} (default: {standard:g})"
+        )
+    _add_settings_argument(parser)
+
+
+def _add_ablation_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--device", default="auto", help="auto (default), cpu, cuda or cuda:N")
+    parser.add_argument("--scenes", nargs="+", default=["pins", "teeth"], help="default: pins teeth")
+    parser.add_argument("--size", type=int, default=64, help="voxels per edge (default: 64)")
+    parser.add_argument("--views", type=int, default=180, help="projection images (default: 180)")
+    parser.add_argument("--photons", type=float, default=1e5, help="counts of a free ray (default: 1e5)")
+    parser.add_argument("--kvp", type=float, default=90.0, help="tube voltage, behind 1 mm Al (default: 90)")
+    parser.add_argument("--seeds", type=int, default=1, help="repetitions with other noise (default: 1)")
+    parser.add_argument(
+        "--groups",
+        nargs="+",
+        metavar="GROUP",
+        help="among components nodes curve free weights relocation affine (default: all)",
+    )
+    parser.add_argument("--cache", metavar="FOLDER", help="simulated scans (default: among temporary files)")
+    _add_settings_argument(parser)
+
+
+def _add_settings_argument(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--passes", type=float, metavar="N", help="passes over the views, instead of the default"
+    )
+
+
+def _add_comparison_arguments(parser: argparse.ArgumentParser) -> None:
+    """What benchmarks that compare methods share."""
     parser.add_argument("--scenes", nargs="+", default=["pins", "teeth"], help="default: pins teeth")
     parser.add_argument("--sizes", nargs="+", type=int, default=[64], help="voxels per edge (default: 64)")
-    parser.add_argument("--views", type=int, default=180, help="projection images (default: 180)")
     parser.add_argument(
         "--methods",
         nargs="+",
         metavar="METHOD",
-        default=["fdk", "fdk-water", "sirt", "limar", "nmar", "voxel-poly", "mono", "polysplat"],
-        help="among fdk fdk-water sirt sirt-200 limar nmar voxel-poly mono polysplat (default: all but sirt-200)",
+        default=_METHODS,
+        help=f"among {' '.join(_METHODS)} (the default), sirt-200, and mbir mbir-mar mbir-metal (mbirtorch)",
     )
     parser.add_argument(
         "--budgets",
@@ -53,8 +107,6 @@ def _add_recon_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="SECONDS",
         help="for methods that improve with time (default: until they stop by themselves)",
     )
-    parser.add_argument("--photons", type=float, default=1e5, help="counts of a free ray (default: 1e5)")
-    parser.add_argument("--kvp", type=float, default=90.0, help="tube voltage, behind 1 mm Al (default: 90)")
     parser.add_argument(
         "--no-curves", action="store_true", help="leave out the runs that are watched as they go"
     )
@@ -66,7 +118,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.record:
         Path(arguments.record).mkdir(parents=True, exist_ok=True)
     arguments.device = _device(arguments.device)
-    return _kernels(arguments) if arguments.what == "kernels" else _recon(arguments)
+    return {"kernels": _kernels, "recon": _recon, "accuracy": _accuracy, "ablation": _ablation}[
+        arguments.what
+    ](arguments)
 
 
 def _device(name: str) -> str:
@@ -91,14 +145,10 @@ def _recon(arguments: argparse.Namespace) -> int:
     from tomo_polysplat.bench.recon import run_recon_bench
     from tomo_polysplat.bench.recon_report import as_text, write_figures
 
-    cache = None
-    if arguments.cache:
-        cache = Path(arguments.cache)
-        cache.mkdir(parents=True, exist_ok=True)
     record = run_recon_bench(
         _recon_bench(arguments),
-        cache=cache,
-        progress=lambda words: print(words, file=sys.stderr, flush=True),
+        cache=_cache(arguments),
+        progress=_say,
         update=lambda so_far: _write(arguments, "recon.json", so_far, quiet=True),
     )
     print(as_text(record))
@@ -106,7 +156,73 @@ def _recon(arguments: argparse.Namespace) -> int:
     if arguments.record:
         for path in write_figures(Path(arguments.record), record):
             print(f"wrote {path}")
-    return 0 if all(entry["seconds"] is not None for entry in record["runs"]) else 1
+    return _status(record)
+
+
+def _status(record: dict[str, Any]) -> int:
+    """0 unless a run failed; one that cannot take part here did not."""
+    return 0 if all(run["seconds"] is not None or "skipped" in run["about"] for run in record["runs"]) else 1
+
+
+def _say(words: str) -> None:
+    print(words, file=sys.stderr, flush=True)
+
+
+def _cache(arguments: argparse.Namespace) -> Path | None:
+    if not arguments.cache:
+        return None
+    cache = Path(arguments.cache)
+    cache.mkdir(parents=True, exist_ok=True)
+    return cache
+
+
+def _settings(arguments: argparse.Namespace) -> dict[str, Any]:
+    return {} if arguments.passes is None else {"passes": arguments.passes}
+
+
+def _accuracy(arguments: argparse.Namespace) -> int:
+    from tomo_polysplat.bench import accuracy_report as report
+    from tomo_polysplat.bench.accuracy import CONDITION, AccuracyBench, run_accuracy_bench
+
+    names = ("scenes", "sizes", "methods", "views", "kvp", "photons", "seeds", "budgets", "device")
+    chosen = {name: getattr(arguments, name) for name in names}
+    bench = AccuracyBench(**chosen, curves=not arguments.no_curves, settings=_settings(arguments))
+    pictures: dict[tuple[Any, ...], bytes] = {}
+
+    def update(record: dict[str, Any], where: dict[str, Any], scan: Any, volumes: Any) -> None:
+        if arguments.record is None:
+            return
+        if where["seed"] == 0:
+            key = tuple(where[name] for name in CONDITION)
+            pictures[key] = report.slices_png(scan, scan.truth_energy_kev, volumes)
+        _write(arguments, "accuracy.json", record, quiet=True)
+        report.write_page(Path(arguments.record) / "accuracy.html", record, pictures)
+
+    record = run_accuracy_bench(bench, cache=_cache(arguments), progress=_say, update=update)
+    print(report.as_text(record))
+    _write(arguments, "accuracy.json", record)
+    _write_text(arguments, "accuracy.md", report.as_markdown(record))
+    return _status(record)
+
+
+def _ablation(arguments: argparse.Namespace) -> int:
+    from tomo_polysplat.bench.ablation import AblationBench, as_markdown, as_text, run_ablation
+
+    names = ("scenes", "size", "views", "photons", "kvp", "seeds", "device")
+    chosen = {name: getattr(arguments, name) for name in names}
+    if arguments.groups:
+        chosen["groups"] = arguments.groups
+    bench = AblationBench(**chosen, settings=_settings(arguments))
+    record = run_ablation(
+        bench,
+        cache=_cache(arguments),
+        progress=_say,
+        update=lambda so_far: _write(arguments, "ablation.json", so_far, quiet=True),
+    )
+    print(as_text(record))
+    _write(arguments, "ablation.json", record)
+    _write_text(arguments, "ablation.md", as_markdown(record))
+    return _status(record)
 
 
 def _recon_bench(arguments: argparse.Namespace) -> ReconBench:
@@ -125,3 +241,14 @@ def _write(arguments: argparse.Namespace, name: str, content: dict[str, Any], *,
     write_json(path, {"command": command, **content}, overwrite=True)
     if not quiet:
         print(f"wrote {path}")
+
+
+def _write_text(arguments: argparse.Namespace, name: str, text: str) -> None:
+    from tomo_polysplat.files import replacing
+
+    if arguments.record is None:
+        return
+    path = Path(arguments.record) / name
+    with replacing(path, overwrite=True) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    print(f"wrote {path}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from tomo_polysplat.report.style import ACCENT, INK, OURS, QUIET
 if TYPE_CHECKING:
     from tomo_polysplat.result.result import Result
 
-__all__ = ["write_report"]
+__all__ = ["image", "page", "write_report"]
 
 PAGE = """<!DOCTYPE html>
 <html lang="en">
@@ -60,22 +60,31 @@ def write_report(
     true = None if truth is None else _spatial(result, truth)
     metal = None if metal_mask is None else _spatial(result, metal_mask).astype(bool)
     title = "tomo-polysplat reconstruction"
-    body = "\n".join(
-        [
-            f"<h1>{title}</h1>",
-            f'<p class="note">{html.escape(repr(result))}</p>',
-            *_slices(result, volume, true, metal),
-            *_errors(result, volume, true, metal),
-            "<h2>Speed against error</h2>",
-            _image(history_figure(result.history), "error of the projections against seconds"),
-            *_section("What was modelled and why", result.plan),
-            *_section("Left out or limited", result.counts),
-            *_section("Settings", result.settings),
-        ]
-    )
-    page = PAGE.format(title=title, body=body, ink=INK, accent=ACCENT, quiet=QUIET)
-    with replacing(path, overwrite=overwrite, needed_bytes=len(page)) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    body = [
+        f"<h1>{title}</h1>",
+        f'<p class="note">{html.escape(repr(result))}</p>',
+        *_slices(result, volume, true, metal),
+        *_errors(result, volume, true, metal),
+        "<h2>Speed against error</h2>",
+        image(png_bytes(history_figure(result.history)), "error of the projections against seconds"),
+        *_section("What was modelled and why", result.plan),
+        *_section("Left out or limited", result.counts),
+        *_section("Settings", result.settings),
+    ]
+    content = page(title, body)
+    with replacing(path, overwrite=overwrite, needed_bytes=len(content)) as temporary:
+        temporary.write_text(content, encoding="utf-8")
+
+
+def page(title: str, body: Sequence[str]) -> str:
+    """A whole page of these parts, which are HTML."""
+    return PAGE.format(title=html.escape(title), body="\n".join(body), ink=INK, accent=ACCENT, quiet=QUIET)
+
+
+def image(png: bytes, description: str) -> str:
+    """A picture inside the page."""
+    data = base64.b64encode(png).decode("ascii")
+    return f'<img alt="{html.escape(description)}" src="data:image/png;base64,{data}">'
 
 
 def _spatial(result: Result, volume: np.ndarray) -> np.ndarray:
@@ -93,7 +102,7 @@ def _slices(
     volumes = [("reconstruction", volume), *([] if truth is None else [("truth", truth)])]
     figure = slices_figure(volumes, result.unit, result.energy_kev, window, planes)
     note = f"All slices are shown from {window[0]:.3g} to {window[1]:.3g} 1/{result.unit}; brighter is white."
-    return ["<h2>Slices</h2>", f'<p class="note">{note}</p>', _image(figure, "orthogonal slices")]
+    return ["<h2>Slices</h2>", f'<p class="note">{note}</p>', image(png_bytes(figure), "orthogonal slices")]
 
 
 def _errors(
@@ -106,11 +115,6 @@ def _errors(
     entry = {"name": OURS, "seconds": result.seconds, **compare(volume, truth, metal)}
     rows = dict(zip(tables.headings(result.unit)[1:], tables.cells(entry)[1:]))
     return _section("Against the truth", rows)
-
-
-def _image(figure: Any, description: str) -> str:
-    data = base64.b64encode(png_bytes(figure)).decode("ascii")
-    return f'<img alt="{description}" src="data:image/png;base64,{data}">'
 
 
 def _section(heading: str, content: Mapping[str, Any]) -> list[str]:
