@@ -5,24 +5,28 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch
 
 from tomo_polysplat.checks import require_array
 from tomo_polysplat.parallel import cpu_threads, run_tasks, split_range
-from tomo_polysplat.physics.beer_lambert import projection
+from tomo_polysplat.physics.beer_lambert import projection, shares
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.physics.spectrum import Spectrum
 
 __all__ = ["transmitted_energy", "water_equivalent", "water_linearised"]
 
-_TABLE = 8192
+# Nodes of the inverse, and of the table that places them.
+_NODES, _STEPS = 16384, 2048
+# Values looked up at once: the intermediate results are several times as large.
+_CHUNK = 1 << 22
 
 
-def water_equivalent(projections: Any, spectrum: Spectrum) -> np.ndarray:
+def water_equivalent(projections: Any, spectrum: Spectrum) -> Any:
     """Areal density of water (g/cm2) that gives the measured projection values.
 
     Parameters
     ----------
-    projections : array_like
+    projections : array_like or tensor
         ``P = -log(I / I0)``, of any shape. Negative values (noise in air) continue the curve linearly with
         its slope at 0, so that noise stays unbiased; NaN and infinity are kept.
     spectrum : Spectrum
@@ -30,30 +34,60 @@ def water_equivalent(projections: Any, spectrum: Spectrum) -> np.ndarray:
 
     Returns
     -------
-    array of float64
-        In the shape of ``projections``; within 1e-6 relative of the exact inverse above P = 0.01.
+    array of float64, or float32 tensor on the device of ``projections``
+        In their shape; before it is rounded, within 1e-6 relative of the exact inverse from a thousandth of
+        the largest value on.
     """
+    if isinstance(projections, torch.Tensor):
+        values = projections.reshape(-1)
+        return _inverted(values, spectrum, torch.empty_like(values)).reshape(projections.shape)
     values = require_array("projections", projections).astype(np.float64)
+    flat = torch.from_numpy(values.reshape(-1))
+    return _inverted(flat, spectrum, torch.empty_like(flat)).numpy().reshape(values.shape)
+
+
+def _inverted(values: torch.Tensor, spectrum: Spectrum, water: torch.Tensor) -> torch.Tensor:
+    """``water`` filled with the inverse of the curve at ``values``, (n,) both."""
+    largest = max((float(values[a:b].nan_to_num(0, 0, 0).max()) for a, b in _chunks(values)), default=0.0)
+    nodes, slope = _inverse(spectrum, max(largest, 1.0))
+    table = torch.from_numpy(nodes).to(values.device)
+    scale = (_NODES - 1) / max(largest, 1.0) ** (1 / 3)
+
+    def look_up(first: int, last: int) -> None:
+        part = values[first:last].double()
+        place = part.clamp(min=0).pow_(1 / 3).mul_(scale)
+        index = place.nan_to_num(0).clamp_(max=_NODES - 2).long()
+        left = table[index]
+        found = torch.addcmul(left, table[index + 1] - left, place - index)
+        water[first:last] = torch.where(part < 0, part / slope, found)
+
+    if values.is_cuda:
+        for a, b in _chunks(values):
+            look_up(a, b)
+    else:
+        run_tasks(look_up, split_range(values.numel(), 4 * cpu_threads()))
+    return water
+
+
+def _chunks(values: torch.Tensor) -> list[tuple[int, int]]:
+    return split_range(values.numel(), -(-values.numel() // _CHUNK)) if values.numel() else []
+
+
+def _inverse(spectrum: Spectrum, largest: float) -> tuple[np.ndarray, float]:
+    """Areal densities of water at evenly spaced cube roots of P up to ``largest``, and dP/dwater at 0."""
     lit = spectrum.weights > 0
     log_weights = np.log(spectrum.weights[lit])
     curve = mass_attenuation("water", spectrum.energies[lit])[None]
-    finite = values[np.isfinite(values)]
-    largest = max(finite.max(initial=0.0), 1.0)
     # P rises at least as fast as at its hardest energy, so this path reaches the largest value. Cubic spacing
     # follows the curve, which bends most at 0 where the soft photons still count.
-    paths = largest / curve.min() * np.linspace(0.0, 1.0, _TABLE) ** 3
-    table = projection(paths[None], log_weights, curve)
-    table[0] = 0.0
-    water = np.empty_like(values)
-    flat, out = values.reshape(-1), water.reshape(-1)
-
-    def look_up(first: int, last: int) -> None:
-        out[first:last] = np.interp(flat[first:last], table, paths)
-
-    run_tasks(look_up, split_range(flat.size, 4 * cpu_threads()))
-    slope = float(curve[0] @ np.exp(log_weights))
-    water = np.where(values < 0, values / slope, water)
-    return np.where(values == np.inf, np.inf, water)
+    paths = largest / curve.min() * np.linspace(0.0, 1.0, _STEPS) ** 3
+    wanted = largest * np.linspace(0.0, 1.0, _NODES) ** 3
+    nodes = np.interp(wanted, projection(paths[None], log_weights, curve), paths)
+    # A Newton's step squares an error that is small already.
+    value, share = shares(nodes[None], log_weights, curve)
+    nodes -= (value - wanted) / (curve[0] @ share)
+    nodes[0] = 0.0
+    return nodes, float(curve[0] @ np.exp(log_weights))
 
 
 def water_linearised(projections: Any, spectrum: Spectrum) -> np.ndarray:
@@ -71,11 +105,12 @@ def transmitted_energy(projections: Any, spectrum: Spectrum) -> float:
 
     Typical is the median of the values above a tenth of the largest.
     """
-    values = require_array("projections", projections)
-    values = values[np.isfinite(values)]
-    inside = values[values > 0.1 * values.max(initial=0.0)]
-    if not len(inside):
+    if not isinstance(projections, torch.Tensor):
+        projections = torch.from_numpy(np.ascontiguousarray(require_array("projections", projections)))
+    values = projections[torch.isfinite(projections)]
+    inside = values[values > 0.1 * values.max().clamp(min=0)] if values.numel() else values
+    if not inside.numel():
         return spectrum.effective_energy
-    path = water_equivalent(np.median(inside), spectrum)
+    path = water_equivalent(float(inside.median()), spectrum)
     through = spectrum.weights * np.exp(-path * mass_attenuation("water", spectrum.energies))
     return float(through @ spectrum.energies / through.sum())
