@@ -75,7 +75,9 @@ class FusedStep:
         self._views, self._table = rays.views.select(np.arange(batch)), rays.views.host_table()
         self._sums = torch.zeros(3, dtype=torch.float64, device=device)
         self._skipped = torch.zeros((), dtype=torch.int64, device=device)
-        self._grad_shared = torch.zeros_like(gaussians.shared_material)
+        # The largest values so far of an image and of a box, for sums that do not depend on their order.
+        self._largest = torch.zeros((2, 1), dtype=torch.float32, device=device)
+        self._grad_shared = torch.zeros(len(gaussians.shared_material), dtype=torch.int64, device=device)
         self._control = torch.zeros(_HEAD + batch * (_VIEW + 2) + _BOX, dtype=torch.float64, device=device)
         self._curves = None
         if scene.reference_curve is not None and scene.output_curve is not None:
@@ -85,6 +87,16 @@ class FusedStep:
         self._no_box = tuple(
             torch.zeros(shape, device=device) for shape in ((len(gaussians), 3),) * 2 + ((len(gaussians), 4),)
         ) + (torch.zeros((1, len(gaussians)), device=device),)
+
+    @property
+    def largest(self) -> list[float]:
+        """Largest value so far of an image and of a box; see `Step`."""
+        return self._largest[:, 0].tolist()
+
+    @largest.setter
+    def largest(self, values: list[float]) -> None:
+        if values:
+            self._largest.copy_(torch.tensor(values)[:, None])
 
     def _measure(self) -> Measurement:
         rays, scene, settings = self.rays, self.scene, self.settings
@@ -163,9 +175,10 @@ class FusedStep:
         views, cutoff, channels = self._views, self.scene.cutoff, len(weight)
         drawn = (position, scale, rotation, weight)
         record = footprints(*drawn, views, table, cutoff, self._skipped)
-        image = rays_forward.splat(record, channels, views, cutoff)
-        beyond = rays_backward.beyond(views)
-        pixels = misfit_gradient(image, table, chosen, views, self._measurement, self._sums, beyond)
+        largest, beyond = self._largest[0], rays_backward.beyond(views)
+        image = rays_forward.splat(record, channels, views, cutoff, largest)
+        measured, sums = self._measurement, self._sums
+        pixels = misfit_gradient(image, table, chosen, views, measured, sums, largest, beyond)
         moments = rays_backward.sum_moments(record, pixels, channels, views, cutoff)
         return rays_pull_back(*drawn, table, views, record, moments)
 
@@ -176,7 +189,7 @@ class FusedStep:
         """Gradients of the total variation in the box, likewise."""
         drawn, box = (position, scale, rotation, output), VoxelBox(np.zeros(3), np.ones(3), self._box)
         record = ellipsoids(*drawn, table, VOXEL_CUTOFF)
-        volume = box_forward.splat(record, 1, box, VOXEL_CUTOFF)
-        slope = variation_gradient(volume, self.settings.tv_clip, self.settings.tv_weight)
+        volume = box_forward.splat(record, 1, box, VOXEL_CUTOFF, self._largest[1])
+        slope = variation_gradient(volume, self.settings.tv_clip, self.settings.tv_weight, self._largest[1])
         moments = box_backward.sum_moments(record, slope, box, VOXEL_CUTOFF)
         return box_backward.pull_back(*drawn, table, moments)

@@ -19,6 +19,8 @@ __all__ = [
     "HALF_LOG2E",
     "cross",
     "dot",
+    "grain",
+    "grained",
     "on_device",
     "require_scene",
     "rotation_matrix",
@@ -44,6 +46,26 @@ def require_scene(position, scale, rotation, weight) -> None:
             raise fail(name, "a float32 tensor for the triton kernel", str(tensor.dtype))
     if not 1 <= len(weight) <= 4:
         raise fail("weight", "1 to 4 channels for the triton kernel", str(len(weight)))
+
+
+@triton.jit
+def grain(largest, GRAINED: tl.constexpr):
+    """What `grained` takes, from where the largest sum so far is kept; see there."""
+    if GRAINED:
+        bits = tl.load(largest).to(tl.int32, bitcast=True)
+        return 6.0 * (bits & 0x7F800000).to(tl.float32, bitcast=True)
+    return 0.0
+
+
+@triton.jit
+def grained(value, shift):
+    """``value`` rounded so that float32 sums of such values are exact, whatever their order.
+
+    ``shift`` is 6 times the power of two at or below the largest sum that is expected. Added to it, a smaller
+    value keeps 23 bits behind that of 4 times the power, so that sums up to 8 times the power need no more than
+    the 24 bits there are. Beyond that they are rounded as any others.
+    """
+    return (value + shift) - shift
 
 
 @triton.jit

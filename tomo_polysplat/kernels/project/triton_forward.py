@@ -2,7 +2,8 @@
 
 A warp holds the outlines of GROUP neighbours, one to a lane. For every tile of their common window it finds
 those that reach the tile, sums them in registers, and adds the sum to the image atomically: one addition for
-many Gaussians. Additions meet in any order, so the image repeats to rounding (about 1e-7), not to the bit.
+many Gaussians. Additions meet in any order, so the image repeats to rounding (about 1e-7), and to the bit only
+where they are made exact.
 The windows are small when Gaussians near in the list are near in space.
 """
 
@@ -15,7 +16,7 @@ import triton.language as tl  # noqa: TID253
 from tomo_polysplat.kernels.project.triton_image import spread
 from tomo_polysplat.kernels.project.triton_setup import RECORD
 from tomo_polysplat.kernels.triton_lanes import add_four, adds_four, lane_set, load_four, lowest_lane
-from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, on_device
+from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, grain, grained, on_device
 from tomo_polysplat.kernels.views import DetectorViews
 
 __all__ = ["TILE", "splat"]
@@ -96,10 +97,11 @@ def _sum_tile(
 
 @triton.jit
 def _splat_kernel(
-    record, image, count, rows, columns, cut,
+    record, image, largest, count, rows, columns, cut,
     CHANNELS: tl.constexpr, CONE: tl.constexpr, TILE_H: tl.constexpr, TILE_W: tl.constexpr,
-    PARTS: tl.constexpr, GROUP: tl.constexpr, AT_ONCE: tl.constexpr,
+    PARTS: tl.constexpr, GROUP: tl.constexpr, AT_ONCE: tl.constexpr, GRAINED: tl.constexpr,
 ):  # fmt: skip
+    shift = grain(largest, GRAINED)
     group, part = tl.program_id(0) // PARTS, tl.program_id(0) % PARTS
     view = tl.program_id(1).to(tl.int64)
     record += view * count * RECORD
@@ -128,6 +130,9 @@ def _splat_kernel(
                 sum0, sum1, sum2, sum3 = _sum_tile(
                     record, found, left, top, cut, CHANNELS, CONE, TILE_H, TILE_W
                 )
+                if GRAINED:
+                    sum0, sum1 = grained(sum0, shift), grained(sum1, shift)
+                    sum2, sum3 = grained(sum2, shift), grained(sum3, shift)
                 j, i = left + tl.arange(0, TILE_W)[:, None], top + tl.arange(0, TILE_H)[None, :]
                 pixel = (view * rows + i) * columns + j
                 inside = (i < rows) & (j < columns)
@@ -138,8 +143,14 @@ def _splat_kernel(
                     add_four(image + 4 * pixel, sum0, sum1, sum2, sum3, inside, AT_ONCE)
 
 
-def splat(record, channels: int, views: DetectorViews, cutoff: float) -> torch.Tensor:
-    """Image of the footprints in the layout of triton_image, without the factor of the pixel."""
+def splat(
+    record, channels: int, views: DetectorViews, cutoff: float, largest: torch.Tensor | None = None
+) -> torch.Tensor:
+    """Image of the footprints in the layout of triton_image, without the factor of the pixel.
+
+    With ``largest``, a float32 tensor of the largest value that such an image has had, it has the same bits every
+    time: what is added is rounded to some 2e-7 of that (`grained`).
+    """
     many, count = record.shape[:2]
     image = record.new_zeros((many, views.rows, views.columns, spread(channels)))
     if not (count and image.numel()):
@@ -149,8 +160,9 @@ def splat(record, channels: int, views: DetectorViews, cutoff: float) -> torch.T
     tile = _PLANAR_TILE if views.rows == 1 else TILE
     with on_device(record):
         _splat_kernel[(groups * parts, many)](
-            record, image, count, views.rows, views.columns, cutoff * cutoff * HALF_LOG2E,
+            record, image, record if largest is None else largest, count, views.rows, views.columns,
+            cutoff * cutoff * HALF_LOG2E,
             CHANNELS=channels, CONE=views.cone, TILE_H=tile[0], TILE_W=tile[1], PARTS=parts, GROUP=GROUP,
-            AT_ONCE=adds_four(record.device), num_warps=1, num_stages=1,
+            AT_ONCE=adds_four(record.device), GRAINED=largest is not None, num_warps=1, num_stages=1,
         )  # fmt: skip
     return image

@@ -90,7 +90,7 @@ def _is_held_out(view, pixel, held_out):
 
 @triton.jit
 def _misfit_kernel(
-    raw, pixels, table, chosen, projections, totals, log_weights, attenuation, sums,
+    raw, pixels, table, chosen, projections, totals, log_weights, attenuation, sums, largest,
     area, columns, beyond, nodes, noise, held_out, corner, areal_scale,
     CHANNELS: tl.constexpr, CONE: tl.constexpr, HUBER: tl.constexpr, MANY: tl.constexpr,
     BLOCK: tl.constexpr,
@@ -108,12 +108,16 @@ def _misfit_kernel(
         tl.zeros([BLOCK], tl.float32),
     )
     if CHANNELS == 1:
-        predicted = tl.load(raw + at) * factor
+        a0 = tl.load(raw + at)
+        most = a0
+        predicted = a0 * factor
     else:
         a0, a1, a2, _ = load_four(raw + 4 * at)
+        most = tl.maximum(a0, tl.maximum(a1, a2))
         predicted, d0, d1, d2 = _beer_lambert(
             a0 * factor, a1 * factor, a2 * factor, log_weights, attenuation, nodes
         )
+    tl.atomic_max(largest, tl.max(most, 0), sem="relaxed")
     value = tl.load(projections + slot * area + pixel, mask=inside, other=float("nan"))
     usable = tl.abs(value) < float("inf")
     value = tl.where(usable, value, 0.0)
@@ -152,6 +156,7 @@ def misfit_gradient(
     views: DetectorViews,
     measurement: Measurement,
     sums: torch.Tensor,
+    largest: torch.Tensor,
     beyond: int,
 ) -> torch.Tensor:
     """The gradient of the misfit, laid out for the projection's adjoint, with ``beyond`` zero pixels after it.
@@ -169,6 +174,8 @@ def misfit_gradient(
     sums : (3,) float64 tensor
         To which the mean misfit of the fitted rays, the sum of that of the held-out rays, and their weight are
         added.
+    largest : float32 tensor of one number
+        Raised to the largest value of ``raw``.
     """
     many, area = len(views), views.rows * views.columns
     channels = 1 if measurement.nodes is None else 3
@@ -177,7 +184,7 @@ def misfit_gradient(
     with on_device(raw):
         _misfit_kernel[(triton.cdiv(area + beyond, _BLOCK), many)](
             raw, pixels, table, chosen, measurement.projections, measurement.totals, log_weights, attenuation,
-            sums, area, views.columns, beyond, 0 if measurement.nodes is None else len(log_weights),
+            sums, largest, area, views.columns, beyond, 0 if measurement.nodes is None else len(log_weights),
             measurement.noise, measurement.held_out, measurement.corner, measurement.areal_scale,
             CHANNELS=channels, CONE=views.cone, HUBER=measurement.corner > 0, MANY=many, BLOCK=_BLOCK,
             num_warps=4,

@@ -20,6 +20,7 @@ __all__ = ["FIRST_DECAY", "SECOND_DECAY", "Bounds", "update"]
 
 FIRST_DECAY, SECOND_DECAY = 0.9, 0.999
 _KEEP_FIRST, _KEEP_SECOND = tl.constexpr(FIRST_DECAY), tl.constexpr(SECOND_DECAY)
+_WHOLE = tl.constexpr(2.0**50)
 _BLOCK = 128
 
 
@@ -71,11 +72,15 @@ def _material_gradients(grad_weight, grad_output, own, shared, group, curves, he
 
 @triton.jit
 def _add_to_groups(grad_shared, member, value):
-    """Sums of ``value`` by group; neighbours mostly share one, which is then added at once."""
+    """Sums of ``value`` by group; neighbours mostly share one, which is then added at once.
+
+    In whole numbers of 2^-50, whose sums do not depend on their order: gradients are of a mean over the rays.
+    """
+    value = (value.to(tl.float64) * _WHOLE).to(tl.int64)
     largest = tl.max(member, 0)
     if largest > 0:
         together = member == largest
-        tl.atomic_add(grad_shared + largest, tl.sum(tl.where(together, value, 0.0), 0), sem="relaxed")
+        tl.atomic_add(grad_shared + largest, tl.sum(tl.where(together, value, 0), 0), sem="relaxed")
         tl.atomic_add(grad_shared + member, value, mask=(member > 0) & ~together, sem="relaxed")
 
 
@@ -138,14 +143,14 @@ def _shared_kernel(
 ):  # fmt: skip
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = n < count
-    gradient = tl.load(grad_shared + n, mask=live, other=0.0)
+    gradient = (tl.load(grad_shared + n, mask=live, other=0).to(tl.float64) / _WHOLE).to(tl.float32)
     # The soft matter's number is held, and the metals' until the control lets them go.
     gradient = tl.where(n > 0, gradient * tl.load(control + 2).to(tl.float32), 0.0)
     rate = tl.load(rates + 5) * tl.load(control).to(tl.float32)
     root = tl.load(control + 1).to(tl.float32)
     u = _adam(shared, shared_1, shared_2, n, live, gradient, rate, root, epsilon)
     tl.store(shared + n, _kept(u, least_u, most_u), mask=live)
-    tl.store(grad_shared + n, 0.0, mask=live)
+    tl.store(grad_shared + n, tl.zeros([BLOCK], tl.int64), mask=live)
 
 
 def update(
@@ -172,7 +177,7 @@ def update(
         Gradients of position, deviation, rotation and weights, as the projection's and the voxeliser's
         adjoints give them.
     state : tuple of tensors
-        Gradient of the shared numbers (groups,), zero, and left so; pull (n,), to which the lengths of the
+        Gradient of the shared numbers (groups,) int64, zero, and left so; pull (n,), to which the lengths of the
         gradients by position are added; rates (6,) in the order of the parameters; control (3,) float64: the
         share of the rates over Adam's first bias correction, the root of its second one, and whether the
         metals' shared numbers may move.

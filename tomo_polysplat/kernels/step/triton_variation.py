@@ -29,7 +29,7 @@ def _along(volume, at, value, index, length, stride, live, ceiling):
 
 
 @triton.jit
-def _variation_kernel(volume, grad, nz, ny, nx, ceiling, factor, BLOCK: tl.constexpr):
+def _variation_kernel(volume, grad, largest, nz, ny, nx, ceiling, factor, BLOCK: tl.constexpr):
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     size = nz * ny * nx
     live = at < size
@@ -37,6 +37,7 @@ def _variation_kernel(volume, grad, nz, ny, nx, ceiling, factor, BLOCK: tl.const
     x, y, z = at - line * nx, line % ny, line // ny
     raw = tl.load(volume + at, mask=live, other=0.0)
     value = tl.minimum(raw, ceiling)
+    tl.atomic_max(largest, tl.max(raw, 0), sem="relaxed")
     # The mean over an axis has a term less a line than the volume has voxels.
     slope = _along(volume, at, value, x, nx, 1, live, ceiling) / tl.maximum(size - ny * nz, 1)
     slope += _along(volume, at, value, y, ny, nx, live, ceiling) / tl.maximum(size - nx * nz, 1)
@@ -44,11 +45,16 @@ def _variation_kernel(volume, grad, nz, ny, nx, ceiling, factor, BLOCK: tl.const
     tl.store(grad + at, tl.where(raw <= ceiling, slope * factor, 0.0), mask=live)
 
 
-def variation_gradient(volume: torch.Tensor, ceiling: float, factor: float) -> torch.Tensor:
-    """``factor`` times the gradient of ``fit.loss.total_variation`` of a volume (1, nz, ny, nx), so shaped."""
+def variation_gradient(
+    volume: torch.Tensor, ceiling: float, factor: float, largest: torch.Tensor
+) -> torch.Tensor:
+    """``factor`` times the gradient of ``fit.loss.total_variation`` of a volume (1, nz, ny, nx), so shaped.
+
+    ``largest``, a float32 tensor of one number, is raised to the largest value of the volume.
+    """
     grad = torch.empty_like(volume)
     with on_device(volume):
         _variation_kernel[(triton.cdiv(volume.numel(), _BLOCK),)](
-            volume, grad, *volume.shape[1:], ceiling, factor, BLOCK=_BLOCK, num_warps=4
+            volume, grad, largest, *volume.shape[1:], ceiling, factor, BLOCK=_BLOCK, num_warps=4
         )
     return grad

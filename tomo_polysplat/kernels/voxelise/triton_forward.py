@@ -11,7 +11,7 @@ import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.kernels.triton_lanes import lane_set, load_four, lowest_lane
-from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, dot, on_device
+from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, dot, grain, grained, on_device
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.kernels.voxelise.triton_setup import RECORD
 
@@ -75,10 +75,11 @@ def _sum_brick(record, found, x, y, z, cut, CHANNELS: tl.constexpr):
 
 @triton.jit
 def _splat_kernel(
-    record, volume, count, nz, ny, nx, stride, cut,
+    record, volume, largest, count, nz, ny, nx, stride, cut,
     CHANNELS: tl.constexpr, D: tl.constexpr, H: tl.constexpr, W: tl.constexpr,
-    PARTS: tl.constexpr, GROUP: tl.constexpr,
+    PARTS: tl.constexpr, GROUP: tl.constexpr, GRAINED: tl.constexpr,
 ):  # fmt: skip
+    shift = grain(largest, GRAINED)
     group, part, lane = tl.program_id(0) // PARTS, tl.program_id(0) % PARTS, tl.arange(0, GROUP)
     n = group * GROUP + lane
     at = record + tl.minimum(n, count - 1).to(tl.int64) * RECORD
@@ -104,6 +105,9 @@ def _splat_kernel(
                 sum0, sum1, sum2, sum3 = _sum_brick(
                     record, found, ix.to(tl.float32), iy.to(tl.float32), iz.to(tl.float32), cut, CHANNELS
                 )
+                if GRAINED:
+                    sum0, sum1 = grained(sum0, shift), grained(sum1, shift)
+                    sum2, sum3 = grained(sum2, shift), grained(sum3, shift)
                 inside = (ix < nx) & (iy < ny) & (iz < nz)
                 voxel = volume + ((iz.to(tl.int64) * ny + iy) * nx + ix)
                 tl.atomic_add(voxel, sum0, mask=inside & (sum0 != 0), sem="relaxed")
@@ -118,8 +122,10 @@ def _splat_kernel(
                     tl.atomic_add(voxel, sum3, mask=inside & (sum3 != 0), sem="relaxed")
 
 
-def splat(record, channels: int, box: VoxelBox, cutoff: float) -> torch.Tensor:
-    """Volume (channels, nz, ny, nx) of the ellipsoids."""
+def splat(
+    record, channels: int, box: VoxelBox, cutoff: float, largest: torch.Tensor | None = None
+) -> torch.Tensor:
+    """Volume (channels, nz, ny, nx) of the ellipsoids; with ``largest`` as in the projection's, to the bit."""
     count = len(record)
     volume = record.new_zeros((channels, *box.shape))
     if not (count and volume.numel()):
@@ -128,8 +134,8 @@ def splat(record, channels: int, box: VoxelBox, cutoff: float) -> torch.Tensor:
     parts = triton.next_power_of_2(max(1, min(_MOST_PARTS, _PROGRAMS // groups)))
     with on_device(record):
         _splat_kernel[(groups * parts,)](
-            record, volume, count, *box.shape, volume.stride(0), cutoff * cutoff * HALF_LOG2E,
-            CHANNELS=channels, D=BRICK[0], H=BRICK[1], W=BRICK[2], PARTS=parts, GROUP=GROUP, num_warps=1,
-            num_stages=1,
+            record, volume, record if largest is None else largest, count, *box.shape, volume.stride(0),
+            cutoff * cutoff * HALF_LOG2E, CHANNELS=channels, D=BRICK[0], H=BRICK[1], W=BRICK[2], PARTS=parts,
+            GROUP=GROUP, GRAINED=largest is not None, num_warps=1, num_stages=1,
         )  # fmt: skip
     return volume
