@@ -83,6 +83,7 @@ class _Fitter:
         """Where the fit stands between two passes; ``numbers`` of the run are kept with it."""
         own = {
             "steps_made": self.step.done,
+            "largest": self.step.largest,
             "relocated": self.relocated,
             "relocation_due": self.relocation_due,
             "random": self.rng.bit_generator.state,
@@ -99,6 +100,7 @@ class _Fitter:
         self.step.pull.copy_(kept.pull)
         self.order = kept.order
         self.step.done = int(kept.numbers["steps_made"])
+        self.step.largest = kept.numbers["largest"]
         self.relocated = int(kept.numbers["relocated"])
         self.relocation_due = bool(kept.numbers["relocation_due"])
         self.rng.bit_generator.state = kept.numbers["random"]

@@ -50,11 +50,14 @@ class Step(Protocol):
         Adam's memory, to be changed in place only.
     done : int
         Steps made; Adam's bias correction counts with it.
+    largest : list of float
+        Largest sums so far, to which a GPU's roundings are made; goes with the moments when a run goes on.
     """
 
     pull: torch.Tensor
     moments: Moments
     done: int
+    largest: list[float]
 
     def __call__(self, views: np.ndarray, box: VoxelBox, share: float) -> None:
         """Step towards the rays of these views and a smooth box; ``share`` of the run is done, 0 to 1."""
@@ -83,7 +86,8 @@ def log_scale_bounds(
 ) -> tuple[float, float]:
     """Smallest and largest logarithm of a Gaussian's deviation."""
     voxel = float(scene.box.spacing[: 2 if planar else 3].min())
-    return math.log(settings.smallest_scale * voxel), math.log(settings.largest_scale * spacing)
+    # Seeds closer than the voxels are there to show what is inside these.
+    return math.log(settings.smallest_scale * min(voxel, spacing)), math.log(settings.largest_scale * spacing)
 
 
 def new_moments(parameters: dict[str, torch.Tensor]) -> Moments:
@@ -114,6 +118,7 @@ class EagerStep:
             first, second = self.moments[name]
             count = torch.zeros((), dtype=torch.float32, device=tensor.device)
             self.optimiser.state[tensor] = {"step": count, "exp_avg": first, "exp_avg_sq": second}
+        self.largest: list[float] = []
         self._sums: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor, int | torch.Tensor]] = []
         self._done = 0
 
