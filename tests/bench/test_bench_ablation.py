@@ -102,7 +102,7 @@ def test_unknown_groups_are_refused():
 
 
 def test_command_line(tmp_path, capsys):
-    options = ["--scenes", "pins", "--size", "15", "--views", "44", "--groups", "relocation", "affine"]
+    options = ["--scenes", "pins", "--size", "15", "--views", "20", "--groups", "relocation", "affine"]
     options += ["--device", "cpu", "--passes", "1", "--seeds", "2", "--cache", str(tmp_path)]
     assert main(["bench", "ablation", *options, "--record", str(tmp_path)]) == 0
     assert "no relocation" in capsys.readouterr().out
