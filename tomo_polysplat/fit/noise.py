@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+import torch
 
 __all__ = ["photons_per_ray"]
 
@@ -10,7 +13,7 @@ _VIEWS = 24
 _BINS = 16
 
 
-def photons_per_ray(projections: np.ndarray) -> float:
+def photons_per_ray(projections: np.ndarray | torch.Tensor) -> float:
     """Photons of an unattenuated ray, from the scatter of neighbouring pixels.
 
     Counts that are Poisson distributed give ``-log(I/I0)`` a variance ``exp(P) / I0``. The variance is taken
@@ -20,7 +23,7 @@ def photons_per_ray(projections: np.ndarray) -> float:
 
     Parameters
     ----------
-    projections : (views, rows, columns) array
+    projections : (views, rows, columns) array or tensor
         -log(I/I0); NaN where a ray is unusable.
 
     Returns
@@ -31,18 +34,22 @@ def photons_per_ray(projections: np.ndarray) -> float:
     if projections.shape[2] < 5:
         return float("inf")
     step = max(1, len(projections) // _VIEWS)
-    some = np.asarray(projections[::step], np.float64)
-    difference = np.abs(some[..., 3:-1] - 2 * some[..., 2:-2] + some[..., 1:-3])
+    some = torch.as_tensor(projections[::step]).double()
+    difference = (some[..., 3:-1] - 2 * some[..., 2:-2] + some[..., 1:-3]).abs()
     # The pixels beside the three: binned by its own value, a pixel's noise would be sorted away.
     middle = 0.5 * (some[..., 4:] + some[..., :-4])
-    good = np.isfinite(difference) & np.isfinite(middle)
+    good = torch.isfinite(difference) & torch.isfinite(middle)
     difference, middle = difference[good], middle[good]
     if len(middle) < 4 * _BINS:
         return float("inf")
-    order = np.argsort(middle)
+    middle, order = middle.sort()
     rates = []
-    for part in np.array_split(order, _BINS):
-        deviation = 1.4826 * np.median(difference[part]) / np.sqrt(6)
-        rates.append(deviation**2 / np.exp(np.median(middle[part])))
-    variance = float(np.sort(rates)[_BINS // 8])
+    for values, differences in zip(middle.tensor_split(_BINS), difference[order].tensor_split(_BINS)):
+        deviation = 1.4826 * _median(differences.sort().values) / math.sqrt(6)
+        rates.append(deviation**2 / math.exp(_median(values)))
+    variance = sorted(rates)[_BINS // 8]
     return max(1.0, 1 / variance) if variance > 0 else float("inf")
+
+
+def _median(ordered: torch.Tensor) -> float:
+    return float(0.5 * (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]))

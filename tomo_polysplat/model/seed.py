@@ -23,7 +23,7 @@ _LEAST = 0.02
 
 
 def seed_gaussians(
-    start: np.ndarray,
+    start: torch.Tensor | np.ndarray,
     grid: VolumeGrid,
     spacing: float,
     settings: Settings,
@@ -35,7 +35,7 @@ def seed_gaussians(
 
     Parameters
     ----------
-    start : (nz, ny, nx) array
+    start : (nz, ny, nx) array or tensor
         First reconstruction in soft references.
     grid : VolumeGrid
         In the solver's coordinates.
@@ -45,7 +45,7 @@ def seed_gaussians(
         Endless along z, for a scan of one plane.
     """
     dims = 2 if planar else 3
-    start = _sharpened(start, settings.metal_level)
+    start = _sharpened(torch.as_tensor(start, device=device), settings.metal_level)
     points, size, cell, value = _lattices(start, grid, spacing, dims, settings)
     reach = settings.free_radius * float(grid.voxel_size[:dims].min())
     own, shared, group = _materials(start, points, value, grid, reach, settings, polychromatic)
@@ -53,142 +53,164 @@ def seed_gaussians(
     # height a lattice of them averages to the wanted value: the cell's integral over the Gaussian's.
     width = settings.seed_width * size
     attenuation = value * cell / (math.sqrt(2 * math.pi) * width) ** dims
-
-    def tensor(array: np.ndarray) -> torch.Tensor:
-        return torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32, device=device)
-
-    rotation = np.zeros((len(points), 4))
+    rotation = points.new_zeros((len(points), 4))
     rotation[:, 0] = 1.0
-    gaussians = Gaussians(
-        tensor(points),
-        tensor(np.repeat(np.log(width)[:, None], dims, axis=1)),
-        tensor(rotation),
-        tensor(attenuation),
-        tensor(own),
-        tensor(shared),
-        torch.as_tensor(group, device=device),
-    )
+    parts = (points, width.log()[:, None].repeat(1, dims), rotation, attenuation, own, shared)
+    blur = rotation.new_tensor([settings.blur])
+    gaussians = Gaussians(*(part.float() for part in parts), group, blur.float())
     # Neighbours in space beside each other in memory, which the kernels use.
     order = spatial_order(gaussians.position)
     return gaussians.select(order)
 
 
-def _sharpened(start: np.ndarray, level: float) -> np.ndarray:
+def _pieces(mask: torch.Tensor) -> tuple[tuple[slice, ...], np.ndarray, int]:
+    """The box round all that is true, its connected pieces numbered from 1 in an array, and their number."""
+    from scipy import ndimage
+
+    box = []
+    for others in ((1, 2), (0, 2), (0, 1)):
+        some = mask.any(dim=others[1]).any(dim=others[0]).nonzero()[:, 0]
+        box.append(slice(int(some[0]), int(some[-1]) + 1) if len(some) else slice(0, 1))
+    pieces, number = ndimage.label(mask[tuple(box)].cpu().numpy())
+    return tuple(box), pieces, number
+
+
+def _sharpened(start: torch.Tensor, level: float) -> torch.Tensor:
     """The start with every piece of metal cut at half its height, its mass kept and its rim made soft matter.
 
     Filtered backprojection blurs; the blurred rim of metal is many times as bright as what really lies there.
     """
     from scipy import ndimage
 
-    pieces, _ = ndimage.label(start > level)
-    sharp = start.copy()
-    for label, box in enumerate(ndimage.find_objects(pieces), 1):
-        piece, old, new = pieces[box] == label, start[box], sharp[box]
+    box, pieces, _ = _pieces(start > level)
+    old_part = start[box].cpu().numpy()
+    new_part = old_part.copy()
+    for label, where in enumerate(ndimage.find_objects(pieces), 1):
+        piece, old, new = pieces[where] == label, old_part[where], new_part[where]
         values = old[piece]
         core = piece & (old > 0.5 * np.quantile(values, 0.9))
         new[piece] = np.minimum(values, 1.0)
         new[core] = old[core] * (values.sum() / old[core].sum())
+    sharp = start.clone()
+    sharp[box] = torch.from_numpy(new_part).to(start.device)
     return sharp
 
 
 def _lattices(
-    start: np.ndarray, grid: VolumeGrid, spacing: float, dims: int, settings: Settings
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    start: torch.Tensor, grid: VolumeGrid, spacing: float, dims: int, settings: Settings
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """Points (n, 3) on the support; spacing, volume of the cell and the start's mean over it, (n,) each."""
-    coarse, step = _lattice(grid, spacing, dims)
+    coarse, step = _lattice(grid, spacing, dims, start.device)
     metal = _reaches(start, coarse, grid, settings.metal_level, spacing)
     parts = []
     for points, share in ((coarse[~metal], 1.0), (_split(coarse[metal], step), 0.5)):
         value, nearby = _sample(start, points, grid, share * step)
         keep = nearby > settings.support_level
-        every = np.ones(int(keep.sum()))
+        points, value = points[keep], value[keep].clamp(min=_LEAST)
         cell = float(np.prod(share * step))
-        parts.append((points[keep], share * spacing * every, cell * every, np.maximum(value[keep], _LEAST)))
-    points, sizes, cells, values = (np.concatenate(arrays) for arrays in zip(*parts))
+        parts.append((points, torch.full_like(value, share * spacing), torch.full_like(value, cell), value))
+    points, sizes, cells, values = (torch.cat(tensors) for tensors in zip(*parts))
     return points, sizes, cells, values
 
 
-def _lattice(grid: VolumeGrid, spacing: float, dims: int) -> tuple[np.ndarray, np.ndarray]:
+def _lattice(
+    grid: VolumeGrid, spacing: float, dims: int, device: torch.device
+) -> tuple[torch.Tensor, np.ndarray]:
     """Points (n, 3) of a lattice that fills the grid's window, and its steps (dims,); planar, in one layer."""
     counts = np.maximum(np.round(grid.extent / spacing).astype(int), 1)
     counts[dims:] = 1
     steps = grid.extent / counts
-    x, y, z = np.meshgrid(
-        *(low + (np.arange(n) + 0.5) * d for low, n, d in zip(grid.lower, counts, steps)), indexing="ij"
-    )
-    return np.stack([x, y, z], -1).reshape(-1, 3), steps[:dims]
+    axes = [low + (np.arange(n) + 0.5) * d for low, n, d in zip(grid.lower, counts, steps)]
+    x, y, z = torch.meshgrid(*(torch.as_tensor(axis, device=device) for axis in axes), indexing="ij")
+    return torch.stack([x, y, z], -1).reshape(-1, 3), steps[:dims]
 
 
 def _sample(
-    start: np.ndarray, points: np.ndarray, grid: VolumeGrid, cell: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+    start: torch.Tensor, points: torch.Tensor, grid: VolumeGrid, cell: np.ndarray
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Mean of the start over the cell of each seed, and the largest such mean among it and its neighbours."""
-    from scipy import ndimage
-
     cells = np.ones(3, int)
     cells[3 - len(cell) :] = np.maximum(np.round(cell / grid.voxel_size[: len(cell)]).astype(int), 1)[::-1]
-    mean = ndimage.uniform_filter(start, cells, mode="nearest") if cells.max() > 1 else start
-    index = _voxel_of(points, grid)
+    mean, index = _box_mean(start, cells), _voxel_of(points, grid)
     around = mean[index]
     for offset in itertools.product((-1, 0, 1), repeat=3):
-        beside = tuple(np.clip(i + d, 0, n - 1) for i, d, n in zip(index, offset, mean.shape))
-        around = np.maximum(around, mean[beside])
-    return mean[index].astype(np.float64), around
+        beside = tuple((i + d).clamp_(0, n - 1) for i, d, n in zip(index, offset, mean.shape))
+        around = torch.maximum(around, mean[beside])
+    return mean[index].double(), around
 
 
-def _split(points: np.ndarray, step: np.ndarray) -> np.ndarray:
+def _box_mean(volume: torch.Tensor, cells: np.ndarray) -> torch.Tensor:
+    """Mean over (z, y, x) voxels about each one; the volume's faces go on beyond it."""
+    if cells.max() == 1:
+        return volume
+    margins = [side for n in cells[::-1].tolist() for side in (n // 2, n - 1 - n // 2)]
+    padded = torch.nn.functional.pad(volume[None, None], margins, mode="replicate")
+    return torch.nn.functional.avg_pool3d(padded, cells.tolist(), stride=1)[0, 0]
+
+
+def _split(points: torch.Tensor, step: np.ndarray) -> torch.Tensor:
     """Every lattice point replaced by the 2^dims points of a lattice of half the steps in its cell."""
     dims = len(step)
     corners = np.stack(np.meshgrid(*[[-0.25, 0.25]] * dims, indexing="ij"), -1).reshape(-1, dims)
     offsets = np.zeros((len(corners), 3))
     offsets[:, :dims] = corners * step
-    return (points[:, None] + offsets).reshape(-1, 3)
+    return (points[:, None] + torch.from_numpy(offsets).to(points.device)).reshape(-1, 3)
 
 
 def _reaches(
-    start: np.ndarray, points: np.ndarray, grid: VolumeGrid, level: float, reach: float
-) -> np.ndarray:
+    start: torch.Tensor, points: torch.Tensor, grid: VolumeGrid, level: float, reach: float
+) -> torch.Tensor:
     """Points within a distance, along every axis, of a voxel above a level."""
-    from scipy import ndimage
-
-    near = (start > level).astype(np.uint8)
-    if not near.any():
-        return np.zeros(len(points), bool)
+    near = start > level
+    if not bool(near.any()):
+        return torch.zeros(len(points), dtype=torch.bool, device=points.device)
     for axis, size in enumerate(grid.voxel_size[::-1]):
         # A whole number of voxels must not lose one to rounding.
-        voxels = int(reach / size + 1e-6)
-        near = ndimage.maximum_filter1d(near, 2 * voxels + 1, axis=axis, mode="nearest")
-    return near[_voxel_of(points, grid)] > 0
+        near = _grown(near, axis, int(reach / size + 1e-6))
+    return near[_voxel_of(points, grid)]
+
+
+def _grown(mask: torch.Tensor, axis: int, voxels: int) -> torch.Tensor:
+    """What is true, and as many voxels before and behind it; every step nearly trebles the width."""
+    length, half = mask.shape[axis], 0
+    while half < min(voxels, length - 1):
+        step = min(2 * half + 1, voxels - half, length - 1)
+        wider = mask.clone()
+        wider.narrow(axis, step, length - step).logical_or_(mask.narrow(axis, 0, length - step))
+        wider.narrow(axis, 0, length - step).logical_or_(mask.narrow(axis, step, length - step))
+        mask, half = wider, half + step
+    return mask
 
 
 def _materials(
-    start: np.ndarray,
-    points: np.ndarray,
-    value: np.ndarray,
+    start: torch.Tensor,
+    points: torch.Tensor,
+    value: torch.Tensor,
     grid: VolumeGrid,
     reach: float,
     settings: Settings,
     polychromatic: bool,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Material numbers of their own, of the groups, and the group of every seed.
 
     Group 0 is the soft matter away from anything dense; then comes one for every separate piece of metal. In
     between, where the start cannot be trusted to tell what is what, every Gaussian has its own.
     """
-    from scipy import ndimage
-
-    group = np.zeros(len(points), np.int64)
-    own = np.full(len(points), settings.soft_u)
+    group = torch.zeros(len(points), dtype=torch.int64, device=points.device)
+    own = torch.full_like(value, settings.soft_u)
     if not polychromatic:
-        return own, np.array([settings.soft_u]), group
+        return own, value.new_tensor([settings.soft_u]), group
     group[_reaches(start, points, grid, settings.bone_level, reach)] = -1
     own[value > settings.bone_level] = settings.bone_u
-    pieces, number = ndimage.label(start > settings.metal_level)
-    piece = pieces[_voxel_of(points, grid)]
-    group[piece > 0] = piece[piece > 0]
-    return own, np.r_[settings.soft_u, np.full(number, settings.metal_u)], group
+    box, pieces, number = _pieces(start > settings.metal_level)
+    labels = torch.zeros(start.shape, dtype=torch.int64, device=start.device)
+    labels[box] = torch.from_numpy(pieces.astype(np.int64)).to(start.device)
+    piece = labels[_voxel_of(points, grid)]
+    group = torch.where(piece > 0, piece, group)
+    return own, value.new_tensor([settings.soft_u, *[settings.metal_u] * number]), group
 
 
-def _voxel_of(points: np.ndarray, grid: VolumeGrid) -> tuple[np.ndarray, ...]:
-    index = ((points - grid.lower) / grid.voxel_size).astype(int)[:, ::-1]
-    return tuple(np.clip(index[:, k], 0, grid.shape[k] - 1) for k in range(3))
+def _voxel_of(points: torch.Tensor, grid: VolumeGrid) -> tuple[torch.Tensor, ...]:
+    lower, size = (torch.from_numpy(np.array(v)).to(points.device) for v in (grid.lower, grid.voxel_size))
+    index = ((points - lower) / size).long()
+    return tuple(index[:, 2 - k].clamp(0, grid.shape[k] - 1) for k in range(3))
