@@ -11,6 +11,7 @@ from tomo_polysplat.checks import require_array, require_shape
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.fdk import fdk, fits_fdk
 from tomo_polysplat.start.sirt import sirt
+from tomo_polysplat.start.source_planes import beyond_sources
 
 __all__ = ["fill_invalid", "initial_volume"]
 
@@ -22,6 +23,8 @@ FEW_VIEWS = 40
 _VIEWS_PER_SUBSET = 6
 # Passes of SIRT times views: over ordered subsets the noise grows with the number of updates.
 _PASSES_TIMES_VIEWS, _PASSES = 400, (3, 10)
+# Voxels, or pixels at the object, that a seed with its three deviations takes up to either side.
+_SOURCE_MARGIN = 2.0
 # Steps along rays in one pass of SIRT beyond which a coarser volume and detector do for a start: a few
 # seconds for all passes on two CPU cores.
 _MOST_STEPS = 4e7
@@ -54,7 +57,7 @@ def initial_volume(
         Attenuation per unit of length.
     info : dict
         ``method`` ("fdk" or "sirt"), ``reason`` and ``invalid_pixels`` (not used, and for FDK interpolated
-        from their row).
+        from their row). The reason also says how many voxels were left empty because a source plane is near.
     """
     projections = require_array("projections", projections, ndim=3)
     require_shape("projections", projections, geometry.shape, "(views, rows, columns)")
@@ -75,7 +78,24 @@ def initial_volume(
         volume = fdk(filled, geometry, grid, filter_name="hann", device=device)
     else:
         volume = _sirt_start(np.where(usable, projections, np.nan), geometry, grid)
-    return volume, {"method": method, "reason": reason, "invalid_pixels": invalid}
+    volume, near = _without_sources(volume, geometry, grid)
+    return volume, {"method": method, "reason": reason + near, "invalid_pixels": invalid}
+
+
+def _without_sources(volume: np.ndarray, geometry: Geometry, grid: VolumeGrid) -> tuple[np.ndarray, str]:
+    """The volume without what lies beyond the sources, and words that say so."""
+    width, height = geometry.pixel_size_at(grid.centre)
+    planar = geometry.planar and grid.planar
+    finest = max(
+        float(grid.voxel_size[: 2 if planar else 3].min()), width if planar else np.sqrt(width * height)
+    )
+    beyond = beyond_sources(geometry, grid, _SOURCE_MARGIN * finest)
+    if beyond is None:
+        return volume, ""
+    _log.warning("%d voxels lie beyond a source or too near to one, and are left empty.", int(beyond.sum()))
+    return np.where(
+        beyond, np.float32(0), volume
+    ), f"; {int(beyond.sum())} voxels beyond the sources left empty"
 
 
 def _sirt_start(projections: np.ndarray, geometry: Geometry, grid: VolumeGrid) -> np.ndarray:
