@@ -51,6 +51,7 @@ def cloud(dims=3, count=40, seed=0, widest=0.12, narrowest=0.06):
         torch.zeros(count),
         torch.zeros(1),
         torch.zeros(count, dtype=torch.int64),
+        torch.zeros(1),
     )
 
 
@@ -116,6 +117,20 @@ def test_means_over_voxels_are_means_of_finer_voxels():
     assert float((means - expected).norm() / expected.norm()) < 0.04
     centres = voxelise_gaussians(gaussians, weights, voxel_box(cube(16)), KERNEL)[0]
     assert float((centres - expected).norm() / expected.norm()) > 0.1, "else there was nothing to do"
+
+
+@pytest.mark.parametrize("shape", [(2, 16, 16), (16, 1, 16), (1, 1, 1)])
+def test_means_over_oblong_and_over_huge_voxels(shape):
+    """A voxel many deviations long is sampled as finely as its Gaussians are thin."""
+    gaussians = cloud(widest=0.09, narrowest=0.06)
+    weights = gaussians.weights(None)
+    grid = VolumeGrid(shape, [-1.0, -1.0, -1.0], [1.0, 1.0, 1.0])
+    means = voxelise_means(gaussians, weights, voxel_box(grid), KERNEL)[0]
+    fine = voxelise_gaussians(gaussians, weights, voxel_box(cube(80)), KERNEL)[0]
+    blocks = [n for pair in ((n, 80 // n) for n in shape) for n in pair]
+    expected = fine.reshape(blocks).mean(dim=(1, 3, 5))
+    # Of which 0.9 % are the three samples along the short edges.
+    assert float((means - expected).norm() / expected.norm()) < 0.02
 
 
 def test_where_voxels_are_fine_their_centres_do():
