@@ -148,3 +148,12 @@ def test_an_empty_start_can_be_planned():
         of = problem(polychromatic=polychromatic)
         chosen = plan(of, np.zeros(of.grid.shape, np.float32))
         assert chosen.reference == 1.0 and chosen.spacing > 0
+
+
+@pytest.mark.parametrize("planar", [True, False])
+def test_few_voxels_get_more_seeds_than_voxels(planar):
+    for pixel, spacing in ((0.1, 6 / 12), (0.5, 0.65), (1.0, 1.3)):
+        of = problem(6, planar=planar, pixel=pixel)
+        chosen = plan(of, ball(of, 1))
+        assert chosen.spacing == pytest.approx(spacing)
+        assert ("few voxels" in chosen.reasons["seed_spacing_voxels"]) == (pixel < 1)

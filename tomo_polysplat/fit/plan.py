@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from tomo_polysplat.settings import Settings
 
@@ -23,6 +24,9 @@ __all__ = ["Plan", "make_plan", "mass_level"]
 
 logger = logging.getLogger(__name__)
 
+# Seeds along the longest edge: a ray through few large voxels tells what is inside them, and an object's outline
+# in a handful of Gaussians would leave its mass wrong.
+_FEWEST_SEEDS = 12
 # Gaussians that a laptop and a GPU fit in a time people wait for.
 _MOST_GAUSSIANS = {"cpu": 60_000, "cuda": 300_000}
 
@@ -48,12 +52,12 @@ class Plan:
     reasons: dict[str, Any] = field(default_factory=dict)
 
 
-def make_plan(start: np.ndarray, problem: Problem, settings: Settings, device: str) -> Plan:
+def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Settings, device: str) -> Plan:
     """Decide from the start volume and the geometry.
 
     Parameters
     ----------
-    start : (nz, ny, nx) array
+    start : (nz, ny, nx) array or tensor
         First reconstruction in the solver's units (``Problem.start_volume``).
     problem : Problem
     settings : Settings
@@ -74,7 +78,7 @@ def make_plan(start: np.ndarray, problem: Problem, settings: Settings, device: s
         if problem.planar
         else "3D Gaussians: several rows or slices, or rays that leave the plane",
         "soft_reference": f"{reference:.4g} {unit}: {why}",
-        "support": f"{support} of {start.size} voxels hold more than {settings.support_level:g} soft references",
+        "support": f"{support} of {math.prod(start.shape)} voxels hold more than {settings.support_level:g} soft references",
         "seed_spacing_voxels": f"{spacing:.2f}: {because}",
         "views_per_step": f"{views} of {problem.geometry.views}: "
         + (
@@ -84,14 +88,14 @@ def make_plan(start: np.ndarray, problem: Problem, settings: Settings, device: s
     return plan
 
 
-def mass_level(volume: np.ndarray) -> float:
+def mass_level(volume: np.ndarray | torch.Tensor) -> float:
     """The value below which half the mass of a volume lies: its main matter, whatever noise and metal do."""
-    values = volume[volume > 0].astype(np.float64)
+    values = torch.as_tensor(volume)
+    values = values[values > 0].double().sort().values
     if not len(values):
         return 0.0
-    values.sort()
-    mass = np.cumsum(values)
-    return float(values[np.searchsorted(mass, 0.5 * mass[-1])])
+    mass = values.cumsum(0)
+    return float(values[torch.searchsorted(mass, 0.5 * mass[-1])])
 
 
 def _reference(level: float, polychromatic: bool) -> tuple[float, str]:
@@ -127,11 +131,15 @@ def _seed_spacing(support: int, problem: Problem, settings: Settings, device: st
 
 
 def _finest_spacing(problem: Problem) -> tuple[float, str]:
-    """Seeds no closer than the detector can tell apart, and than the voxels can show."""
+    """Seeds no closer than the detector can tell apart, and than the voxels can show, unless these are few."""
     width, height = problem.geometry.pixel_size_at(problem.grid.centre)
-    pixel = width if problem.planar else math.sqrt(width * height)
-    if pixel > problem.voxel:
-        return 1.3 * pixel / problem.voxel, "1.3 detector pixels at the object"
+    pixel = (width if problem.planar else math.sqrt(width * height)) / problem.voxel
+    edge = float((problem.grid.extent / problem.voxel)[: 2 if problem.planar else 3].max())
+    if pixel > 1.0:
+        return 1.3 * pixel, "1.3 detector pixels at the object"
+    few = max(1.3 * pixel, edge / _FEWEST_SEEDS)
+    if few < 1.3 - 1e-6:
+        return few, f"a volume of few voxels: {_FEWEST_SEEDS} seeds along it, or 1.3 detector pixels"
     return 1.3, "1.3 voxels"
 
 
