@@ -18,8 +18,14 @@ def fail(
     argument: str, expected: str, got: Any, remedy: str = "", error: type[Exception] = ValueError
 ) -> Exception:
     """The exception to raise: ``raise fail("angles", "radians", "degrees", "use numpy.deg2rad")``."""
-    message = f"{argument}: expected {expected}, got {got}"
+    message = f"{_short(argument, 200)}: expected {expected}, got {_short(got, 400)}"
     return error(f"{message}; {remedy}" if remedy else message)
+
+
+def _short(text: Any, longest: int) -> str:
+    """What a caller passed may be a whole file."""
+    whole = str(text)
+    return whole if len(whole) <= longest else f"{whole[:longest]} ..."
 
 
 def require_number(
@@ -34,7 +40,7 @@ def require_number(
     """A finite number within bounds, as a float."""
     try:
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise fail(argument, "a number", f"{value!r}", remedy, TypeError) from None
     if not (math.isfinite(number) and number > above and at_least <= number <= at_most):
         bounds = [
@@ -50,14 +56,18 @@ def require_number(
 def require_choice(argument: str, value: Any, choices: Iterable[str], remedy: str = "") -> str:
     """One of a few names."""
     known = list(choices)
-    if value not in known:
+    # An array is no name, and comparing it with one gives an array.
+    if not isinstance(value, str) or value not in known:
         raise fail(argument, f"one of {', '.join(known)}", repr(value), remedy)
     return value
 
 
 def require_array(argument: str, value: Any, ndim: int | None = None, remedy: str = "") -> np.ndarray:
     """A numeric array of real numbers (never an object array), of ``ndim`` axes when given."""
-    array = np.asarray(value)
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise fail(argument, "an array of real numbers", str(error), remedy) from None
     if array.dtype.kind not in "fiub":
         raise fail(argument, "an array of real numbers", f"dtype {array.dtype}", remedy, TypeError)
     if ndim is not None and array.ndim != ndim:

@@ -93,6 +93,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         require_choice("settings['loss']", self.loss, ("huber", "weighted-l1", "l1"))
+        require_choice("settings['kernel']", self.kernel, ("auto", "triton", "numba", "reference"))
         for field in fields(self):
             name, value = f"settings[{field.name!r}]", getattr(self, field.name)
             if isinstance(field.default, str):
@@ -102,7 +103,8 @@ class Settings:
             if isinstance(field.default, int):
                 if number != int(number):
                     raise fail(name, "a whole number", repr(value))
-                object.__setattr__(self, field.name, int(number))
+                number = int(number)
+            object.__setattr__(self, field.name, number)
         require_number("settings['held_out']", self.held_out, at_most=0.5)
 
     def to_dict(self) -> dict[str, Any]:
@@ -122,6 +124,8 @@ def make_settings(quality: str = "balanced", changes: Mapping[str, Any] | Settin
     if isinstance(changes, Settings):
         return changes
     require_choice("quality", quality, PRESETS)
+    if changes is not None and not isinstance(changes, Mapping):
+        raise fail("settings", "Settings or a dict of their names", repr(changes), error=TypeError)
     known = {field.name for field in fields(Settings)}
     for name in changes or {}:
         if name not in known:

@@ -55,6 +55,8 @@ def mass_attenuation(material: MaterialLike, energies_kev: Any) -> np.ndarray:
 
 def density(material: str) -> float:
     """Nominal density in g/cm3 of an element or a named material; other formulas have none."""
+    if not isinstance(material, str):
+        raise fail("material", "a name or a formula", repr(material), error=TypeError)
     name = _canonical(material)
     if name in NAMED:
         return NAMED[name][0]

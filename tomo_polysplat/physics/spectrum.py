@@ -93,14 +93,18 @@ class Spectrum:
         ValueError
             For a voltage or anode outside the tables, or an unknown filter material.
         """
-        spectrum = cls(*tube_counts(kvp, anode), label=f"{kvp:g} kVp {anode} tube").filtered(filters or {})
-        return spectrum.detected(detector or Detector.photon_counting())
+        kvp = require_number("kvp", kvp)
+        tube = cls(*tube_counts(kvp, anode), label=f"{kvp:g} kVp {anode} tube")
+        spectrum = tube.filtered({} if filters is None else filters)
+        return spectrum.detected(Detector.photon_counting() if detector is None else detector)
 
     def filtered(self, filters: Filters) -> Spectrum:
         """This spectrum behind more filters, ``{material: cm}`` or ``{material: (cm, g/cm3)}``."""
+        if not isinstance(filters, Mapping):
+            raise fail("filters", "a dict of material and cm", repr(filters), error=TypeError)
         exponent = np.zeros_like(self._energies)
         for material, amount in filters.items():
-            thickness, grams = amount if isinstance(amount, tuple) else (amount, None)
+            thickness, grams = amount if isinstance(amount, tuple) and len(amount) == 2 else (amount, None)
             thickness = require_number(
                 f"filters[{material!r}]", thickness, at_least=0.0, remedy="a thickness in cm"
             )
@@ -117,6 +121,8 @@ class Spectrum:
 
     def detected(self, detector: Detector) -> Spectrum:
         """This spectrum of photons as seen by a detector."""
+        if not isinstance(detector, Detector):
+            raise fail("detector", "a Detector", repr(detector), error=TypeError)
         weights = self._weights * detector.response(self._energies)
         if not weights.any():
             raise fail(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from tomo_polysplat.checks import fail, require_array, require_number, require_shape
-from tomo_polysplat.physics.materials import Materials
+from tomo_polysplat.physics.materials import Materials, require_energies
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.units import cm_per
@@ -74,13 +74,15 @@ class Result:
         require_shape("basis", self.basis, (channels, *self.grid.shape), "(channels, z, y, x)")
         if self.materials is not None and self.energy_kev is None:
             raise fail("energy_kev", "an energy in keV", "None", "a polychromatic result has one")
+        if self.materials is not None:
+            require_energies("energy_kev", self.energy_kev)
         if self.flipped_2d and self.grid.shape[0] != 1:
             raise fail("flipped_2d", "False for more than one slice", f"{self.grid.shape[0]} slices")
         if self.gaussians:
             self._check_gaussians()
 
     def _check_gaussians(self) -> None:
-        number = len(self.gaussians["density"])
+        number = len(require_array("gaussians['density']", self.gaussians["density"], ndim=1))
         for name, tail in GAUSSIAN_PARTS.items():
             require_shape(
                 f"gaussians[{name!r}]", np.asarray(self.gaussians[name]), (number, *tail), "(n, ...)"

@@ -38,7 +38,7 @@ _VECTOR_LENGTH = {
 
 def is_planar_geometry(geometry: Mapping[str, Any]) -> bool:
     """True if an ASTRA projection or volume geometry is a 2D one."""
-    if "GridRowCount" in geometry:
+    if isinstance(geometry, Mapping) and "GridRowCount" in geometry:
         return "GridSliceCount" not in geometry
     return _type_of(geometry) in _PLANAR_TYPES
 
@@ -68,6 +68,8 @@ def from_astra(proj_geom: Mapping[str, Any], vol_geom: Mapping[str, Any]) -> tup
     from astra import geom_2vec
 
     kind = _type_of(proj_geom)
+    if not isinstance(vol_geom, Mapping) or "GridRowCount" not in vol_geom:
+        raise fail("vol_geom", "a dict from astra.create_vol_geom", repr(vol_geom), "", TypeError)
     if is_planar_geometry(proj_geom) != is_planar_geometry(vol_geom):
         kinds = [f"a {'2D' if is_planar_geometry(g) else '3D'} one" for g in (proj_geom, vol_geom)]
         remedy = "give create_vol_geom (rows, columns) in 2D or (rows, columns, slices) in 3D"
@@ -161,7 +163,7 @@ def _type_of(proj_geom: Mapping[str, Any]) -> str:
         )
     kind = proj_geom["type"]
     matrix = "a matrix has no rays; give the geometry that it was made from"
-    remedy = matrix if kind == "sparse_matrix" else ""
+    remedy = matrix if isinstance(kind, str) and kind == "sparse_matrix" else ""
     return require_choice("proj_geom type", kind, _PLANAR_TYPES + _SPATIAL_TYPES, remedy)
 
 
@@ -232,11 +234,14 @@ def _look_like_degrees(angles: np.ndarray) -> bool:
 
 
 def _check_distances(proj_geom: Mapping[str, Any]) -> None:
-    for key in ("DetectorWidth", "DetectorSpacingX", "DetectorSpacingY"):
-        if key in proj_geom:
-            require_number(key, proj_geom[key], above=0.0)
-    if "DistanceOriginSource" in proj_geom:
-        require_number("DistanceOriginSource", proj_geom["DistanceOriginSource"], above=0.0)
+    kind = _type_of(proj_geom)
+    planar = kind in _PLANAR_TYPES
+    for key in ("DetectorWidth",) if planar else ("DetectorSpacingX", "DetectorSpacingY"):
+        require_number(key, _entry(proj_geom, key), above=0.0)
+    for key in ("DetectorCount",) if planar else ("DetectorRowCount", "DetectorColCount"):
+        require_count(key, _entry(proj_geom, key))
+    if kind in ("cone", "fanflat"):
+        require_number("DistanceOriginSource", _entry(proj_geom, "DistanceOriginSource"), above=0.0)
         require_number("DistanceOriginDetector", _entry(proj_geom, "DistanceOriginDetector"), at_least=0.0)
 
 
