@@ -144,7 +144,7 @@ def _errors(scan: Scan) -> Callable[[np.ndarray, Scan], dict[str, Any]]:
 
 
 def _label(named: Record) -> str:
-    return named["method"] + ("" if named["budget"] is None else f", {named['budget']:g} s")
+    return METHODS[named["method"]].label + ("" if named["budget"] is None else f", {named['budget']:g} s")
 
 
 def _watch(record: Record, where: Record, task: Task, bench: AccuracyBench, progress: Progress) -> None:

@@ -174,12 +174,12 @@ def _truth_figure(part: Record) -> Figure:
     figure = Figure(figsize=(6.4, 3.6), layout="constrained")
     axis = figure.subplots()
     for curve in part["curves"]:
-        points = [(p["held_out"], p["rmse"]) for p in curve["history"] if p["held_out"]]
+        points = [(p["held_out"], p["psnr"]) for p in curve["history"] if p["held_out"] is not None]
         if points:
             name = curve["method"]
             axis.plot(*zip(*points), ".-", color=colour(name, part), label=METHODS[name].label)
             axis.plot(*points[-1], "o", color=colour(name, part))
-    axis.set(xscale="log", yscale="log", xlabel="error of the rays held out", ylabel="true rms error (1/cm)")
+    axis.set(xlabel="error of the rays held out", ylabel="PSNR without metal (dB)")
     dress(axis)
     if axis.lines:
         axis.legend(frameon=False, fontsize=8, title="passes; the dot is the last")
