@@ -29,6 +29,7 @@ def fit_problem(kind, polychromatic, device, kernel, count=29, **changes):
     values = 1.5 * torch.rand((5, views.rows, views.columns), generator=generator) - 0.1
     values[1, 0, 3:6] = float("nan")
     values[:, -1, 7] = 400.0
+    blurring = changes.pop("blurring", True)
     settings = Settings(**({"held_out": 0.2, "tv_weight": 0.3, "material_from": 0.5} | changes))
     rays = Rays(values.to(device), views, 1e3, settings.model_error, settings.held_out)
     quadrature, curves = None, (None, None)
@@ -40,7 +41,7 @@ def fit_problem(kind, polychromatic, device, kernel, count=29, **changes):
         curves = CURVES.to(device)
     shape = (1, 9, 11) if planar else (6, 7, 9)
     box = VoxelBox(np.array([-0.6, -0.5, 0.0 if planar else -0.4]), np.array([0.13, 0.15, 0.17]), shape)
-    scene = FitScene(box, quadrature, 0.7, *curves, kernel, 3.0, 0.0)
+    scene = FitScene(box, quadrature, 0.7, *curves, kernel, 3.0, 0.0, blurring)
     return _gaussians(count, planar, device), 0.2, rays, scene, settings, box
 
 
@@ -54,6 +55,7 @@ def _gaussians(count, planar, device):
         0.5 * weight[1],
         torch.tensor([0.0, 0.6, 0.7]),
         torch.arange(count) % 4 - 1,
+        torch.tensor([0.2]),
     ]
     return Gaussians(*(t.contiguous().to(device) for t in parts))
 

@@ -20,6 +20,7 @@ from tomo_polysplat.kernels.project import triton_forward as rays_forward
 from tomo_polysplat.kernels.project.triton_pull_back import pull_back as rays_pull_back
 from tomo_polysplat.kernels.project.triton_setup import footprints
 from tomo_polysplat.kernels.step.triton_activate import activate
+from tomo_polysplat.kernels.step.triton_blur import blurred_misfit_gradient
 from tomo_polysplat.kernels.step.triton_misfit import Measurement, misfit_gradient
 from tomo_polysplat.kernels.step.triton_update import FIRST_DECAY, SECOND_DECAY, Bounds, update
 from tomo_polysplat.kernels.step.triton_variation import variation_gradient
@@ -28,6 +29,7 @@ from tomo_polysplat.kernels.voxelise import triton_forward as box_forward
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.kernels.voxelise.triton_setup import ellipsoids
 from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.physics.detector_blur import LARGEST_BLUR
 from tomo_polysplat.physics.transmission import nodes_on
 from tomo_polysplat.render.renderer import VOXEL_CUTOFF
 from tomo_polysplat.settings import Settings
@@ -71,13 +73,14 @@ class FusedStep:
         rates = step_rates(settings, spacing)
         self._rates = torch.tensor([rates[k] for k in parameters], dtype=torch.float32, device=device)
         bounds = log_scale_bounds(scene, spacing, gaussians.planar, settings)
-        self._bounds = Bounds(bounds, (LEAST_U, 1.0), EPSILON)
+        self._bounds = Bounds(bounds, (LEAST_U, 1.0), LARGEST_BLUR, EPSILON)
         self._views, self._table = rays.views.select(np.arange(batch)), rays.views.host_table()
         self._sums = torch.zeros(3, dtype=torch.float64, device=device)
         self._skipped = torch.zeros((), dtype=torch.int64, device=device)
         # The largest values so far of an image and of a box, for sums that do not depend on their order.
         self._largest = torch.zeros((2, 1), dtype=torch.float32, device=device)
         self._grad_shared = torch.zeros(len(gaussians.shared_material), dtype=torch.int64, device=device)
+        self._grad_blur = torch.zeros(1, dtype=torch.int64, device=device)
         self._control = torch.zeros(_HEAD + batch * (_VIEW + 2) + _BOX, dtype=torch.float64, device=device)
         self._curves = None
         if scene.reference_curve is not None and scene.output_curve is not None:
@@ -166,8 +169,9 @@ class FusedStep:
             (scale, self._curves),
             of_rays,
             of_box,
-            (self._grad_shared, self.pull, self._rates, head),
+            (self._grad_shared, self._grad_blur, self.pull, self._rates, head),
             self._bounds,
+            self.scene.blurring,
         )
 
     def _ray_gradients(self, position, scale, rotation, weight, table, chosen) -> tuple[torch.Tensor, ...]:
@@ -178,7 +182,11 @@ class FusedStep:
         largest, beyond = self._largest[0], rays_backward.beyond(views)
         image = rays_forward.splat(record, channels, views, cutoff, largest)
         measured, sums = self._measurement, self._sums
-        pixels = misfit_gradient(image, table, chosen, views, measured, sums, largest, beyond)
+        seen = (image, table, chosen, views, measured, sums, largest, beyond)
+        if self.scene.blurring:
+            pixels = blurred_misfit_gradient(*seen, self.gaussians.blur, self._grad_blur)
+        else:
+            pixels = misfit_gradient(*seen)
         moments = rays_backward.sum_moments(record, pixels, channels, views, cutoff)
         return rays_pull_back(*drawn, table, views, record, moments)
 

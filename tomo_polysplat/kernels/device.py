@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import numpy as np
 import torch
 
 from tomo_polysplat.checks import fail
 
-__all__ = ["one_torch_thread", "pick_device"]
+__all__ = ["one_torch_thread", "pick_device", "usual_modes"]
 
 
 def pick_device(name: str | torch.device) -> torch.device:
@@ -40,10 +42,34 @@ class _Borrowed:
     """torch's number of threads while someone has lowered it; one for the process, as that number is."""
 
     def __init__(self) -> None:
-        self.lock, self.users, self.before = threading.Lock(), 0, 1
+        self.users, self.before = 0, 1
+        self.renew_lock()
+
+    def renew_lock(self) -> None:
+        """A lock that nobody holds: after a fork the thread that held the old one is gone."""
+        self.lock = threading.Lock()
 
 
 _borrowed = _Borrowed()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_borrowed.renew_lock)
+
+
+@contextmanager
+def usual_modes() -> Iterator[None]:
+    """torch and NumPy as they come, whatever modes the caller has chosen for work of its own.
+
+    A call from within ``torch.no_grad()``, ``inference_mode()`` or ``autocast()``, or where NumPy raises at an
+    underflow, gives the same result as any other.
+    """
+    with (
+        torch.inference_mode(False),
+        torch.enable_grad(),
+        torch.autocast("cpu", enabled=False),
+        torch.autocast("cuda", enabled=False),
+        np.errstate(divide="warn", over="warn", under="ignore", invalid="warn"),
+    ):
+        yield
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from tomo_polysplat.kernels.triton_lanes import load_four, store_four
 from tomo_polysplat.kernels.triton_maths import on_device
 from tomo_polysplat.kernels.views import DetectorViews
 
-__all__ = ["Measurement", "misfit_gradient"]
+__all__ = ["Measurement", "misfit_gradient", "ray_misfit", "sharp_projection", "store_gradients"]
 
 _BLOCK = 256
 
@@ -89,35 +89,27 @@ def _is_held_out(view, pixel, held_out):
 
 
 @triton.jit
-def _misfit_kernel(
-    raw, pixels, table, chosen, projections, totals, log_weights, attenuation, sums, largest,
-    area, columns, beyond, nodes, noise, held_out, corner, areal_scale,
-    CHANNELS: tl.constexpr, CONE: tl.constexpr, HUBER: tl.constexpr, MANY: tl.constexpr,
-    BLOCK: tl.constexpr,
-):  # fmt: skip
-    k = tl.program_id(1).to(tl.int64)
-    pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    inside = pixel < area
-    live = pixel < tl.where(k == MANY - 1, area + beyond, area)
-    view, slot = tl.load(chosen + k).to(tl.int64), tl.load(chosen + MANY + k).to(tl.int64)
-    factor = pixel_factor(table, k, pixel, columns, CONE) * areal_scale
-    at = k * area + tl.minimum(pixel, area - 1)
-    d0, d1, d2 = (
-        tl.full([BLOCK], 1.0, tl.float32),
-        tl.zeros([BLOCK], tl.float32),
-        tl.zeros([BLOCK], tl.float32),
-    )
+def sharp_projection(raw, at, factor, log_weights, attenuation, nodes, CHANNELS: tl.constexpr):
+    """Largest number of the splat's image, P of the rays through pixels' centres, and its derivatives."""
     if CHANNELS == 1:
         a0 = tl.load(raw + at)
-        most = a0
-        predicted = a0 * factor
-    else:
-        a0, a1, a2, _ = load_four(raw + 4 * at)
-        most = tl.maximum(a0, tl.maximum(a1, a2))
-        predicted, d0, d1, d2 = _beer_lambert(
-            a0 * factor, a1 * factor, a2 * factor, log_weights, attenuation, nodes
-        )
-    tl.atomic_max(largest, tl.max(most, 0), sem="relaxed")
+        one = tl.full(a0.shape, 1.0, tl.float32)
+        return a0, a0 * factor, one, one, one
+    a0, a1, a2, _ = load_four(raw + 4 * at)
+    most = tl.maximum(a0, tl.maximum(a1, a2))
+    predicted, d0, d1, d2 = _beer_lambert(
+        a0 * factor, a1 * factor, a2 * factor, log_weights, attenuation, nodes
+    )
+    return most, predicted, d0, d1, d2
+
+
+@triton.jit
+def ray_misfit(
+    predicted, projections, totals, chosen, sums, k, pixel, inside, area, noise, held_out, corner,
+    HUBER: tl.constexpr, MANY: tl.constexpr,
+):  # fmt: skip
+    """Gradient of the misfit by the projection; what there is to read of it is added to ``sums``."""
+    view, slot = tl.load(chosen + k).to(tl.int64), tl.load(chosen + MANY + k).to(tl.int64)
     value = tl.load(projections + slot * area + pixel, mask=inside, other=float("nan"))
     usable = tl.abs(value) < float("inf")
     value = tl.where(usable, value, 0.0)
@@ -141,12 +133,38 @@ def _misfit_kernel(
     tl.atomic_add(sums + 1, tl.sum(tl.where(aside, loss, 0.0), 0).to(tl.float64), sem="relaxed")
     tl.atomic_add(sums + 2, tl.sum(tl.where(aside, weight, 0.0), 0).to(tl.float64), sem="relaxed")
     slope = tl.where(residual > 0, slope, tl.where(residual < 0, -slope, 0.0))
-    slope = tl.where(aside | (weight == 0), 0.0, slope * by_total * factor)
-    to = k * area + pixel
+    return tl.where(aside | (weight == 0), 0.0, slope * by_total)
+
+
+@triton.jit
+def store_gradients(pixels, to, slope, d0, d1, d2, live, CHANNELS: tl.constexpr):
+    """Gradients by the line integrals of the channels, in the layout of triton_image."""
     if CHANNELS == 1:
         tl.store(pixels + to, slope, mask=live)
     else:
         store_four(pixels + 4 * to, slope * d0, slope * d1, slope * d2, tl.zeros_like(slope), live)
+
+
+@triton.jit
+def _misfit_kernel(
+    raw, pixels, table, chosen, projections, totals, log_weights, attenuation, sums, largest,
+    area, columns, beyond, nodes, noise, held_out, corner, areal_scale,
+    CHANNELS: tl.constexpr, CONE: tl.constexpr, HUBER: tl.constexpr, MANY: tl.constexpr,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    k = tl.program_id(1).to(tl.int64)
+    pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = pixel < area
+    live = pixel < tl.where(k == MANY - 1, area + beyond, area)
+    factor = pixel_factor(table, k, pixel, columns, CONE) * areal_scale
+    at = k * area + tl.minimum(pixel, area - 1)
+    most, predicted, d0, d1, d2 = sharp_projection(raw, at, factor, log_weights, attenuation, nodes, CHANNELS)
+    tl.atomic_max(largest, tl.max(most, 0), sem="relaxed")
+    slope = ray_misfit(
+        predicted, projections, totals, chosen, sums, k, pixel, inside, area, noise, held_out, corner,
+        HUBER, MANY,
+    )  # fmt: skip
+    store_gradients(pixels, k * area + pixel, slope * factor, d0, d1, d2, live, CHANNELS)
 
 
 def misfit_gradient(

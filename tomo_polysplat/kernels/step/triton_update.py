@@ -1,8 +1,8 @@
-"""Adam's update of all parameters of Gaussians, from the gradients of what was drawn, in two CUDA kernels.
+"""Adam's update of all parameters of Gaussians, from the gradients of what was drawn, in a few CUDA kernels.
 
 The adjoint of triton_activate.py and the optimiser (Kingma and Ba 2015, arXiv:1412.6980) in one: a lane reads
 all of a Gaussian and writes it once. The material numbers of the groups, which many Gaussians share, are added
-up atomically and follow in a second kernel.
+up atomically and the blur too, follow in kernels of their own.
 """
 
 from __future__ import annotations
@@ -16,20 +16,22 @@ import triton.language as tl  # noqa: TID253
 from tomo_polysplat.kernels.step.triton_activate import material, mixture
 from tomo_polysplat.kernels.triton_maths import dot, on_device
 
-__all__ = ["FIRST_DECAY", "SECOND_DECAY", "Bounds", "update"]
+__all__ = ["FIRST_DECAY", "SECOND_DECAY", "WHOLE", "Bounds", "update"]
 
 FIRST_DECAY, SECOND_DECAY = 0.9, 0.999
 _KEEP_FIRST, _KEEP_SECOND = tl.constexpr(FIRST_DECAY), tl.constexpr(SECOND_DECAY)
-_WHOLE = tl.constexpr(2.0**50)
+# Gradients of what many share are added up in whole numbers of 1 / WHOLE, in any order to the same bits.
+WHOLE = tl.constexpr(2.0**50)
 _BLOCK = 128
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """What the update keeps to: smallest and largest log scale and material number, and Adam's epsilon."""
+    """What the update keeps to: the ends of log scale and material number, the widest blur, Adam's epsilon."""
 
     log_scale: tuple[float, float]
     material: tuple[float, float]
+    blur: float
     epsilon: float
 
 
@@ -72,11 +74,8 @@ def _material_gradients(grad_weight, grad_output, own, shared, group, curves, he
 
 @triton.jit
 def _add_to_groups(grad_shared, member, value):
-    """Sums of ``value`` by group; neighbours mostly share one, which is then added at once.
-
-    In whole numbers of 2^-50, whose sums do not depend on their order: gradients are of a mean over the rays.
-    """
-    value = (value.to(tl.float64) * _WHOLE).to(tl.int64)
+    """Sums of ``value`` by group; neighbours mostly share one, which is then added at once."""
+    value = (value.to(tl.float64) * WHOLE).to(tl.int64)
     largest = tl.max(member, 0)
     if largest > 0:
         together = member == largest
@@ -137,20 +136,20 @@ def _update_kernel(
 
 
 @triton.jit
-def _shared_kernel(
-    shared, shared_1, shared_2, grad_shared, rates, control, count, least_u, most_u, epsilon,
-    BLOCK: tl.constexpr,
+def _common_kernel(
+    parameter, first, second, gradient, rate, control, count, held, low, high, epsilon,
+    FREED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = n < count
-    gradient = (tl.load(grad_shared + n, mask=live, other=0).to(tl.float64) / _WHOLE).to(tl.float32)
-    # The soft matter's number is held, and the metals' until the control lets them go.
-    gradient = tl.where(n > 0, gradient * tl.load(control + 2).to(tl.float32), 0.0)
-    rate = tl.load(rates + 5) * tl.load(control).to(tl.float32)
-    root = tl.load(control + 1).to(tl.float32)
-    u = _adam(shared, shared_1, shared_2, n, live, gradient, rate, root, epsilon)
-    tl.store(shared + n, _kept(u, least_u, most_u), mask=live)
-    tl.store(grad_shared + n, tl.zeros([BLOCK], tl.int64), mask=live)
+    whole = tl.load(gradient + n, mask=live, other=0)
+    slope = tl.where(n < held, 0.0, (whole.to(tl.float64) / WHOLE).to(tl.float32))
+    if FREED:
+        slope *= tl.load(control + 2).to(tl.float32)
+    share, root = tl.load(control).to(tl.float32), tl.load(control + 1).to(tl.float32)
+    p = _adam(parameter, first, second, n, live, slope, tl.load(rate) * share, root, epsilon)
+    tl.store(parameter + n, _kept(p, low, high), mask=live)
+    tl.store(gradient + n, tl.zeros([BLOCK], tl.int64), mask=live)
 
 
 def update(
@@ -162,6 +161,7 @@ def update(
     of_box: tuple[torch.Tensor, ...],
     state: tuple[torch.Tensor, ...],
     bounds: Bounds,
+    blurring: bool,
 ) -> None:
     """Change parameters and moments in place.
 
@@ -177,14 +177,16 @@ def update(
         Gradients of position, deviation, rotation and weights, as the projection's and the voxeliser's
         adjoints give them.
     state : tuple of tensors
-        Gradient of the shared numbers (groups,) int64, zero, and left so; pull (n,), to which the lengths of the
-        gradients by position are added; rates (6,) in the order of the parameters; control (3,) float64: the
-        share of the rates over Adam's first bias correction, the root of its second one, and whether the
-        metals' shared numbers may move.
+        Gradients of the shared numbers (groups,) and of the blur (1,), int64 and left at zero; pull (n,), to
+        which the lengths of the gradients by position are added; rates (7,) in the order of the parameters;
+        control (3,) float64: the share of the rates over Adam's first bias correction, the root of its second
+        one, and whether the metals' shared numbers may move.
     bounds : Bounds
+    blurring : bool
+        Whether the blur is fitted.
     """
     names = ("position", "log_scale", "rotation", "attenuation", "own_material")
-    grad_shared, pull, rates, control = state
+    grad_shared, grad_blur, pull, rates, control = state
     (scale, curves), (low, high), (least, most) = drawn, bounds.log_scale, bounds.material
     count = len(group)
     with on_device(group):
@@ -196,9 +198,12 @@ def update(
             DIMS=parameters["log_scale"].shape[1], CHANNELS=1 if curves is None else 3, BLOCK=_BLOCK,
             num_warps=4,
         )  # fmt: skip
-        if curves is not None:
-            shared = parameters["shared_material"]
-            _shared_kernel[(triton.cdiv(len(shared), _BLOCK),)](
-                shared, *moments["shared_material"], grad_shared, rates, control, len(shared),
-                least, most, bounds.epsilon, BLOCK=_BLOCK, num_warps=4,
+        # The soft matter's number is held, and the metals' until the control lets them go.
+        common = [("shared_material", grad_shared, 5, 1, least, most)] if curves is not None else []
+        common += [("blur", grad_blur, 6, 0, 0.0, bounds.blur)] if blurring else []
+        for name, gradient, k, held, low, high in common:
+            parameter = parameters[name]
+            _common_kernel[(triton.cdiv(len(parameter), _BLOCK),)](
+                parameter, *moments[name], gradient, rates[k:], control, len(parameter), held, low, high,
+                bounds.epsilon, FREED=name == "shared_material", BLOCK=_BLOCK, num_warps=4,
             )  # fmt: skip
