@@ -10,7 +10,10 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
-__all__ = ["cpu_threads", "split_range", "run_tasks"]
+import numpy as np
+from numpy.typing import DTypeLike
+
+__all__ = ["contiguous", "cpu_threads", "split_range", "run_tasks"]
 
 
 def cpu_threads() -> int:
@@ -38,3 +41,18 @@ def run_tasks(function: Callable[..., object], tasks: Sequence[tuple]) -> list:
         return [function(*task) for task in tasks]
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(lambda task: function(*task), tasks))
+
+
+def contiguous(array: np.ndarray, dtype: DTypeLike) -> np.ndarray:
+    """``np.ascontiguousarray(array, dtype)``, copied by all threads where it must be copied."""
+    if array.flags.c_contiguous and array.dtype == dtype:
+        return array
+    copy = np.empty(array.shape, dtype)
+
+    def fill(first: int, last: int) -> None:
+        # What the type cannot hold becomes infinite.
+        with np.errstate(over="ignore"):
+            copy[first:last] = array[first:last]
+
+    run_tasks(fill, split_range(len(array), 4 * cpu_threads()) if len(array) else [])
+    return copy

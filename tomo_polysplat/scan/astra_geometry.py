@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from tomo_polysplat.checks import fail, require_array, require_choice, require_number
+from tomo_polysplat.parallel import contiguous
 from tomo_polysplat.scan.curved_detector import flat_geometry, flatten_projections
 from tomo_polysplat.scan.view_geometry import Geometry
 from tomo_polysplat.scan.volume_grid import VolumeGrid, require_count
@@ -134,7 +135,7 @@ def projections_from_astra(projections: Any, proj_geom: Mapping[str, Any]) -> np
     rows = require_count("DetectorRowCount", _entry(proj_geom, "DetectorRowCount"))
     columns = require_count("DetectorColCount", _entry(proj_geom, "DetectorColCount"))
     _require_order(array, {"rows": rows, "views": views, "columns": columns})
-    ordered = np.ascontiguousarray(array.swapaxes(0, 1), dtype=np.float32)
+    ordered = contiguous(array.swapaxes(0, 1), np.float32)
     if _type_of(proj_geom) != "cyl_cone_vec":
         return ordered
     return flatten_projections(ordered, _checked_vectors(proj_geom, "cyl_cone_vec"))
