@@ -54,6 +54,10 @@ class Settings:
     learning_rate_material: float = 1e-2
     learning_rate_shared: float = 5e-3
     """Of each piece of metal's one number."""
+    blur: float = 0.1
+    """Variance of the detector's blur along rows and along columns, in squared pixels, that the fit starts from."""
+    learning_rate_blur: float = 1e-2
+    """0 holds the blur; with ``blur`` 0, rays are infinitely thin."""
     material_from: float = 0.4
     """Share of the run after which the metals' numbers are fitted: before, they would explain blur."""
     final_rate: float = 0.1

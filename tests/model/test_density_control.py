@@ -23,6 +23,7 @@ def cloud(attenuation):
         own_material=torch.linspace(0, 0.5, count),
         shared_material=torch.zeros(1),
         group=torch.full((count,), -1),
+        blur=torch.zeros(1),
     )
 
 

@@ -20,6 +20,7 @@ def gaussians(own, shared=(0.0,), group=None, dims=3):
         torch.tensor(own),
         torch.tensor(shared),
         torch.full((n,), -1) if group is None else torch.tensor(group),
+        torch.zeros(1),
     )
 
 
@@ -85,5 +86,5 @@ def test_a_copy_is_independent():
 def test_everything_but_the_groups_is_fitted():
     cloud = gaussians([0.1])
     assert set(cloud.parameters()) == {
-        *("position", "log_scale", "rotation", "attenuation", "own_material", "shared_material")
+        *("position", "log_scale", "rotation", "attenuation", "own_material", "shared_material", "blur")
     }

@@ -25,7 +25,7 @@ from tomo_polysplat.checks import fail
 from tomo_polysplat.files import replacing, require_replaceable, require_writable
 from tomo_polysplat.fit.plan import Plan
 from tomo_polysplat.fit.problem import Problem
-from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.model.gaussians import OF_ALL, Gaussians
 from tomo_polysplat.scan.archive import read_archive
 
 __all__ = ["Checkpoint", "Snapshot"]
@@ -252,13 +252,17 @@ def _cloud(arrays: dict[str, np.ndarray], kind: str, count: tuple[int, ...]) -> 
     """Gaussians of the file, ``count`` (n,) of them."""
     dims, groups = arrays[f"{kind}/log_scale"].shape[-1], arrays[f"{kind}/shared_material"].shape[-1]
     tails: dict[str, tuple[int, ...]] = {"position": (3,), "log_scale": (dims,), "rotation": (4,)}
-    parts = {name: _tensor(arrays[f"{kind}/{name}"], (*count, *tails.get(name, ()))) for name in _FITTED[:-1]}
-    shared = _tensor(arrays[f"{kind}/shared_material"], (groups,))
+    parts = {
+        name: _tensor(arrays[f"{kind}/{name}"], (*count, *tails.get(name, ())))
+        for name in _FITTED
+        if name not in OF_ALL
+    }
+    whole = {n: _tensor(arrays[f"{kind}/{n}"], s) for n, s in zip(OF_ALL, ((groups,), (1,)))}
     group = arrays[f"{kind}/group"]
-    whole = group.dtype == np.int64 and group.shape == count
-    if len(count) != 1 or dims not in (2, 3) or not whole or (group < -1).any() or (group >= groups).any():
+    indices = group.dtype == np.int64 and group.shape == count
+    if len(count) != 1 or dims not in (2, 3) or not indices or (group < -1).any() or (group >= groups).any():
         raise TypeError(f"{kind} of shape {count}")
-    return Gaussians(**parts, shared_material=shared, group=torch.from_numpy(group))
+    return Gaussians(**parts, **whole, group=torch.from_numpy(group))
 
 
 def _tensor(array: np.ndarray, shape: tuple[int, ...]) -> torch.Tensor:

@@ -19,7 +19,7 @@ from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.stopping import Clock, FitState, Watch
 from tomo_polysplat.model.density_control import relocate
-from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.model.gaussians import OF_ALL, Gaussians
 from tomo_polysplat.settings import Settings
 
 __all__ = ["FitOutcome", "FitState", "fit"]
@@ -113,7 +113,7 @@ class _Fitter:
         if len(changed):
             self.relocated += len(changed) // 2
             for name, moments in self.step.moments.items():
-                if name != "shared_material":
+                if name not in OF_ALL:
                     for moment in moments:
                         moment[changed] = 0.0
 

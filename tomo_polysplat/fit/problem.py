@@ -6,8 +6,9 @@ the first reconstruction on happens in them, so that no choice, and not even rou
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -23,12 +24,13 @@ from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.model.seed import seed_gaussians
 from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.quadrature import Quadrature, fit_quadrature
+from tomo_polysplat.physics.scatter import add_scatter, without_scatter
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.water import transmitted_energy, water_equivalent
 from tomo_polysplat.render.renderer import detector_views, voxel_box
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.settings import Settings
-from tomo_polysplat.start.initial import initial_volume
+from tomo_polysplat.start.initial import initial_volume_on
 from tomo_polysplat.units import LENGTH_UNITS, cm_per
 
 __all__ = ["Problem"]
@@ -58,6 +60,8 @@ class Problem:
         Two-dimensional: one row and one slice in one plane.
     spectrum, materials : Spectrum, Materials, or None
         None for a monochromatic model.
+    scatter : float
+        Constant scattered signal, as a fraction of the open beam.
     """
 
     projections: np.ndarray
@@ -69,6 +73,8 @@ class Problem:
     planar: bool
     spectrum: Spectrum | None = None
     materials: Materials | None = None
+    scatter: float = 0.0
+    _copies: dict[torch.device, torch.Tensor] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def of(
@@ -111,13 +117,19 @@ class Problem:
         per_gram = self.materials.mass_attenuation([self.spectrum.effective_energy])[0, 0]
         return float(per_gram) * self.depth / self.length
 
-    def start_volume(self, device: torch.device) -> tuple[np.ndarray, str]:
+    def start_volume(self, device: torch.device) -> tuple[torch.Tensor, str]:
         """First reconstruction, ``depth`` times g/cm3 of water or times an attenuation, and how it was made."""
-        values = self.projections
+        values = self._primary(device)
         if self.spectrum is not None:
-            values = water_equivalent(values, self.spectrum).astype(np.float32)
-        volume, done = initial_volume(values, self.geometry, self.grid, device=device.type)
+            values = water_equivalent(values, self.spectrum)
+        volume, done = initial_volume_on(values, self.geometry, self.grid)
         return volume, f"{done['method'].upper()}: {done['reason']}"
+
+    def measured(self, device: torch.device) -> torch.Tensor:
+        """The projections on a device, copied there once."""
+        if device not in self._copies:
+            self._copies[device] = torch.from_numpy(self.projections).to(device)
+        return self._copies[device]
 
     def scene(self, plan: Plan, settings: Settings, device: torch.device) -> FitScene:
         """The forward model."""
@@ -133,7 +145,15 @@ class Problem:
             kernel,
             settings.cutoff,
             settings.metal_tail,
+            settings.blur > 0 or settings.learning_rate_blur > 0,
         )
+
+    def _primary(self, device: torch.device) -> torch.Tensor:
+        """The projections as they would be without scatter, on a device."""
+        if not self.scatter:
+            return self.measured(device)
+        primary = without_scatter(self.projections, self.scatter, _LARGEST_PROJECTION)
+        return torch.from_numpy(primary).to(device, torch.float32)
 
     def _physics(
         self, plan: Plan, settings: Settings, device: torch.device
@@ -142,16 +162,21 @@ class Problem:
         spectrum, materials = self.spectrum, self.materials
         if spectrum is None or materials is None:
             return None, None, None
-        largest = float(np.clip(np.nanmax(self.projections), 1.0, _LARGEST_PROJECTION))
+        primary = self._primary(device)
+        most = float(primary.nan_to_num(nan=-math.inf).max())
+        largest = min(max(most, 1.0), _LARGEST_PROJECTION)
         nodes = settings.spectral_nodes or None
         quadrature = fit_quadrature(spectrum, materials, max_path=largest, nodes=nodes)
-        energy = transmitted_energy(self.projections, spectrum)
+        quadrature = add_scatter(quadrature, self.scatter)
+        energy = transmitted_energy(primary, spectrum)
         plan.reasons["spectrum"] = quadrature.describe()
         plan.reasons["reference_energy"] = f"{energy:.1f} keV: the mean of what a typical ray transmits"
         output = _relative(materials, spectrum.effective_energy, device)
         return quadrature, _relative(materials, energy, device), output
 
-    def seeds(self, start: np.ndarray, plan: Plan, settings: Settings, device: torch.device) -> Gaussians:
+    def seeds(
+        self, start: np.ndarray | torch.Tensor, plan: Plan, settings: Settings, device: torch.device
+    ) -> Gaussians:
         """Gaussians to start from."""
         relative = start / (self.depth * plan.reference)
         spacing = plan.spacing * self.voxel
@@ -164,11 +189,10 @@ class Problem:
 
     def rays(self, plan: Plan, settings: Settings, device: torch.device) -> Rays:
         """The measured rays on the device."""
-        photons = float("inf") if settings.loss == "l1" else photons_per_ray(self.projections)
+        photons = float("inf") if settings.loss == "l1" else photons_per_ray(self.measured(device))
         plan.reasons["photons_per_ray"] = f"{photons:.3g}, from the scatter of neighbouring pixels"
-        values = torch.from_numpy(self.projections).to(device)
         views = detector_views(self.geometry, self.planar)
-        return Rays(values, views, photons, settings.model_error, settings.held_out)
+        return Rays(self.measured(device), views, photons, settings.model_error, settings.held_out)
 
 
 def _snapped_grid(grid: VolumeGrid) -> VolumeGrid:

@@ -9,6 +9,7 @@ import torch
 from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.physics.detector_blur import blurred
 from tomo_polysplat.physics.quadrature import Quadrature
 from tomo_polysplat.physics.transmission import polychromatic_projection
 from tomo_polysplat.render.metal_edges import without_tails
@@ -37,6 +38,8 @@ class FitScene:
     cutoff : float
     metal_tail : float
         Share of a neighbour's metal below which a voxel's metal is a tail; see ``render.metal_edges``.
+    blurring : bool
+        Whether rays are seen through the detector's blur; see ``physics.detector_blur``.
     """
 
     box: VoxelBox
@@ -47,6 +50,7 @@ class FitScene:
     kernel: str
     cutoff: float
     metal_tail: float
+    blurring: bool
 
     @property
     def polychromatic(self) -> bool:
@@ -58,9 +62,8 @@ class FitScene:
         weights = gaussians.weights(self.reference_curve)
         areal, skipped = project_gaussians(gaussians, weights, views, self.kernel, self.cutoff)
         areal = areal * self.areal_scale
-        if self.quadrature is None:
-            return areal[0], skipped
-        return polychromatic_projection(areal, self.quadrature), skipped
+        sharp = areal[0] if self.quadrature is None else polychromatic_projection(areal, self.quadrature)
+        return (blurred(sharp, gaussians.blur) if self.blurring else sharp), skipped
 
     def attenuation(self, gaussians: Gaussians, box: VoxelBox) -> torch.Tensor:
         """(nz, ny, nx) attenuation at the effective energy in soft references, at voxel centres."""

@@ -14,6 +14,7 @@ from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.similarity import dissimilarity
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.physics.detector_blur import LARGEST_BLUR
 from tomo_polysplat.settings import Settings
 
 __all__ = [
@@ -78,6 +79,7 @@ def step_rates(settings: Settings, spacing: float) -> dict[str, float]:
         "attenuation": settings.learning_rate_attenuation,
         "own_material": settings.learning_rate_material,
         "shared_material": settings.learning_rate_shared,
+        "blur": settings.learning_rate_blur,
     }
 
 
@@ -161,6 +163,7 @@ class EagerStep:
         self.gaussians.attenuation.clamp_(min=0.0)
         self.gaussians.own_material.clamp_(LEAST_U, 1.0)
         self.gaussians.shared_material.clamp_(LEAST_U, 1.0)
+        self.gaussians.blur.clamp_(0.0, LARGEST_BLUR)
         self.gaussians.log_scale.clamp_(*self.bounds)
 
     def read(self) -> tuple[float, float, int]:

@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.model.gaussians import OF_ALL, Gaussians
 
 __all__ = ["relocate"]
 
@@ -47,7 +47,7 @@ def relocate(gaussians: Gaussians, pull: torch.Tensor, share: float) -> torch.Te
     gaussians.log_scale[source, axis] += math.log(0.7)
     gaussians.attenuation[source] *= 0.5 / 0.7
     for name, tensor in gaussians.parameters().items():
-        if name != "shared_material":
+        if name not in OF_ALL:
             tensor[target] = tensor[source]
     gaussians.group[target] = gaussians.group[source]
     gaussians.position[source] -= half

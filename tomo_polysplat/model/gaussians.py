@@ -12,7 +12,10 @@ from dataclasses import dataclass, fields
 
 import torch
 
-__all__ = ["Gaussians"]
+__all__ = ["OF_ALL", "Gaussians"]
+
+# Parameters that belong to no single Gaussian.
+OF_ALL = ("shared_material", "blur")
 
 
 @dataclass
@@ -35,6 +38,8 @@ class Gaussians:
     group : (n,) int64 tensor
         The group whose material number a Gaussian shares, or -1 for its own. What the rays cannot tell apart
         Gaussian by Gaussian, such as the plastic around a pin, they tell very well for all of it together.
+    blur : (1,) tensor
+        Variance of the detector's blur in squared pixels, through which their projections are seen.
     """
 
     position: torch.Tensor
@@ -44,6 +49,7 @@ class Gaussians:
     own_material: torch.Tensor
     shared_material: torch.Tensor
     group: torch.Tensor
+    blur: torch.Tensor
 
     def __len__(self) -> int:
         return len(self.position)
@@ -63,7 +69,7 @@ class Gaussians:
 
     def select(self, chosen: torch.Tensor) -> Gaussians:
         """The Gaussians of these (m,) int64 indices, still attached to the graph."""
-        whole = {"shared_material": self.shared_material}
+        whole = {name: getattr(self, name) for name in OF_ALL}
         names = [field.name for field in fields(self) if field.name not in whole]
         own = {name: getattr(self, name).index_select(0, chosen) for name in names}
         return Gaussians(**own, **whole)
