@@ -19,7 +19,7 @@ from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.interrupts import postponed_interrupts
-from tomo_polysplat.kernels.device import one_torch_thread, pick_device
+from tomo_polysplat.kernels.device import one_torch_thread, pick_device, usual_modes
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.spectrum import Spectrum
@@ -42,6 +42,7 @@ logger = logging.getLogger(__name__)
 _LARGEST_LOGARITHM = 745.0
 
 
+@usual_modes()
 def reconstruct(
     projections: Any,
     proj_geom: Mapping[str, Any],

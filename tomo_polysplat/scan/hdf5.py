@@ -30,6 +30,7 @@ __all__ = [
 
 _MOST_LINKS = 16
 _LARGEST_ATTRIBUTE = 2**16
+_ADDRESS_BYTES = 8
 # What h5py raises for files that HDF5 cannot make sense of.
 _BROKEN = (OSError, RuntimeError, KeyError, UnicodeDecodeError)
 _OUTSIDE = "copy the data into one file: h5repack does, and so does h5py"
@@ -118,7 +119,16 @@ def find_array(group: h5py.Group, name: str) -> h5py.Dataset | None:
     _require_stored(where, dataset, math.prod(dataset.shape) * dtype.itemsize)
     if dataset.chunks:
         _require_stored(where, dataset, math.prod(dataset.chunks) * dtype.itemsize)
+        _require_chunks(where, dataset)
     return dataset
+
+
+def _require_chunks(where: str, dataset: h5py.Dataset) -> None:
+    """Refuse more chunks than the file can have addresses of: each would be looked for."""
+    chunks = math.prod(-(-length // size) for length, size in zip(dataset.shape, dataset.chunks))
+    most = Path(dataset.file.filename).stat().st_size // _ADDRESS_BYTES
+    if chunks > max(most, 1):
+        raise fail(where, f"at most {most} chunks in a file of this size", f"{chunks}", "damaged file")
 
 
 def _type_of(dataset: Any) -> np.dtype | None:

@@ -1,0 +1,185 @@
+"""Solves in threads and processes side by side, and what a solve leaves behind: nothing."""
+
+import hashlib
+import logging
+import multiprocessing
+import os
+import random
+import signal
+import threading
+import warnings
+from contextlib import nullcontext
+
+import numba
+import numpy as np
+import pytest
+import torch
+from small_scans import fan, reconstruct
+
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.kernels import device
+
+# A child that hangs is a failure, not a night's wait.
+SECONDS = 120
+
+
+def digest(seed=0):
+    """The volume of a solve, to the last bit."""
+    return hashlib.sha256(reconstruct(fan(), seed=seed).volume.tobytes()).hexdigest()
+
+
+def in_processes(method, seeds):
+    """Digests of solves in as many processes at once."""
+    with multiprocessing.get_context(method).Pool(len(seeds)) as pool:
+        return pool.map_async(digest, seeds, chunksize=1).get(SECONDS)
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="this system cannot fork")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_forked_processes_side_by_side_give_what_one_gives_alone():
+    alone = [digest(seed) for seed in (0, 1)]
+    # Threads of torch and of the kernels have run in this process: a child has none of them.
+    torch.set_num_threads(max(2, torch.get_num_threads()))
+    torch.ones(600, 600) @ torch.ones(600, 600)
+    assert in_processes("fork", [0, 1]) == alone and alone[0] != alone[1]
+
+
+def test_a_spawned_process_gives_the_same():
+    assert in_processes("spawn", [0]) == [digest()]
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_fork_within_a_solve_can_solve_itself():
+    """As a callback may do; the parent's solve goes on."""
+    alone, answers = digest(), []
+
+    def fork(state):
+        if not answers:
+            answers.extend(in_processes("fork", [0]))
+
+    result = reconstruct(fan(), callbacks=[fork])
+    assert answers == [alone]
+    assert hashlib.sha256(result.volume.tobytes()).hexdigest() == alone
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_lock_held_while_forking_does_not_hang_the_child():
+    alone = digest()
+    with device._borrowed.lock:
+        assert in_processes("fork", [0]) == [alone]
+
+
+def surroundings():
+    """Everything outside the package that a solve could leave changed."""
+    return {
+        "torch threads": torch.get_num_threads(),
+        "numba threads": numba.get_num_threads(),
+        "environment": dict(os.environ),
+        "folder": os.getcwd(),
+        "numpy random": str(np.random.get_state()),  # noqa: NPY002  # the global state is what is looked at
+        "torch random": torch.random.get_rng_state().tolist(),
+        "random": random.getstate(),
+        "numpy errors": np.geterr(),
+        "numpy print": str(np.get_printoptions()),
+        "torch type": torch.get_default_dtype(),
+        "torch gradients": torch.is_grad_enabled(),
+        "torch determinism": torch.are_deterministic_algorithms_enabled(),
+        "tf32": torch.get_float32_matmul_precision(),
+        "signals": [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGFPE)],
+        "log": (list(logging.root.handlers), logging.root.level),
+        "warnings": list(warnings.filters),
+        "threads": threading.active_count(),
+    }
+
+
+class Broken(Exception):
+    """Raised in the middle of a stage."""
+
+
+def broken(*_, **__):
+    raise Broken
+
+
+STAGES = {
+    "none": None,
+    "start volume": "tomo_polysplat.fit.problem.Problem.start_volume",
+    "seeds": "tomo_polysplat.fit.problem.Problem.seeds",
+    "fit": "tomo_polysplat.fit.scene.FitScene.projections",
+    "loss": "tomo_polysplat.fit.step.misfit",
+    "volume": "tomo_polysplat.fit.scene.FitScene.basis",
+}
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_solve_leaves_nothing_behind(stage, monkeypatch):
+    reconstruct(fan())  # what is imported and compiled once
+    before = surroundings()
+    with monkeypatch.context() as patched, nullcontext() if stage == "none" else pytest.raises(Broken):
+        if stage != "none":
+            patched.setattr(STAGES[stage], broken)
+        reconstruct(fan())
+    after = surroundings()
+    assert {name for name in before if before[name] != after[name]} == set()
+
+
+def test_a_solve_does_not_know_what_was_solved_before():
+    first = digest()
+    reconstruct(fan(False), seed=9)
+    with pytest.raises(ValueError, match="settings"):
+        reconstruct(fan(), settings={"nothing": 1})
+    assert digest() == first
+
+
+@pytest.mark.parametrize(
+    "mode",
+    [
+        torch.no_grad,
+        torch.inference_mode,
+        lambda: torch.autocast("cpu", dtype=torch.bfloat16),
+        lambda: np.errstate(all="raise"),
+    ],
+    ids=["no gradients", "inference", "autocast", "NumPy raises"],
+)
+def test_modes_of_the_caller_do_not_matter(mode):
+    alone = digest()
+    with mode():
+        assert digest() == alone
+
+
+def test_a_default_type_of_the_caller_does_not_matter():
+    alone = digest()
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert digest() == alone
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+def test_the_caller_may_use_torch_in_a_thread_meanwhile():
+    """A callback's thread keeps its own modes, and the solve its result."""
+    alone, seen = digest(), []
+
+    def other():
+        with torch.no_grad():
+            seen.append(torch.is_grad_enabled())
+            seen.append(float((torch.ones(50, 50) @ torch.ones(50, 50)).sum()))
+
+    def beside(state):
+        thread = threading.Thread(target=other)
+        thread.start()
+        thread.join()
+
+    result = reconstruct(fan(), callbacks=[beside])
+    assert seen[:2] == [False, 125_000.0]
+    assert hashlib.sha256(result.volume.tobytes()).hexdigest() == alone
+
+
+def test_torch_has_one_thread_for_the_volume_as_well(monkeypatch):
+    seen, before, basis = [], torch.get_num_threads(), FitScene.basis
+    monkeypatch.setattr(FitScene, "basis", lambda *a: (seen.append(torch.get_num_threads()), basis(*a))[1])
+    torch.set_num_threads(2)
+    try:
+        reconstruct(fan())
+        assert seen == [1] and torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
