@@ -8,7 +8,7 @@ from tomo_polysplat.physics.materials import Materials, mass_attenuation
 from tomo_polysplat.physics.quadrature import fit_quadrature
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.transmission import polychromatic_projection, polychromatic_projection_numpy
-from tomo_polysplat.physics.water import water_equivalent, water_linearised
+from tomo_polysplat.physics.water import transmitted_energy, water_equivalent, water_linearised
 
 SPECTRUM = Spectrum.from_tube(90, filters={"Al": 0.1})
 QUADRATURE = fit_quadrature(SPECTRUM, Materials(), 10.0)
@@ -119,3 +119,12 @@ def test_water_equivalent_of_noise_and_of_bad_pixels():
     assert np.isnan(kept[0]) and kept[1] == np.inf and np.isfinite(kept[2])
     assert water_equivalent(np.float32(0.0), SPECTRUM) == 0.0
     assert water_equivalent(np.zeros((0, 4)), SPECTRUM).shape == (0, 4)
+
+
+def test_water_of_a_tensor_is_that_of_an_array():
+    values = np.array([[0.3, -0.2, np.nan], [np.inf, 0.0, 7.5]], np.float32)
+    water = water_equivalent(torch.from_numpy(values), SPECTRUM)
+    assert water.dtype == torch.float32
+    np.testing.assert_allclose(water.numpy(), water_equivalent(values, SPECTRUM), rtol=1e-6)
+    energies = transmitted_energy(values, SPECTRUM), transmitted_energy(torch.from_numpy(values), SPECTRUM)
+    assert energies[0] == pytest.approx(energies[1], rel=1e-6)

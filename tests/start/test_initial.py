@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+import torch
 from start_phantoms import DISCS, SPHERES, chords, distance, relative_error, truth
 
 from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.start import initial
-from tomo_polysplat.start.initial import fill_invalid, initial_volume
+from tomo_polysplat.start.initial import fill_invalid, initial_volume, initial_volume_on
+from tomo_polysplat.start.on_gpu import fill_rows
 
 astra = pytest.importorskip("astra")
 
@@ -101,3 +103,29 @@ def test_nothing_to_start_from_is_said():
         initial_volume(np.full(geometry.shape, np.nan, np.float32), geometry, grid)
     with pytest.raises(ValueError, match="valid: expected shape"):
         initial_volume(np.ones(geometry.shape, np.float32), geometry, grid, valid=np.ones((2, 2), bool))
+
+
+def test_rows_are_filled_alike_in_torch():
+    """Gaps inside a row, at its ends, of a whole row and of a whole view, against numpy's interpolation."""
+    rng = np.random.default_rng(5)
+    projections = rng.random((5, 7, 23)).astype(np.float32)
+    projections[rng.random(projections.shape) < 0.4] = np.nan
+    projections[1, 2], projections[3] = np.nan, np.inf
+    projections[0, 0, :4], projections[2, 1, -3:] = np.nan, -np.inf
+    projections[4] = 0.5
+    before = projections.copy()
+    filled = fill_rows(torch.from_numpy(projections)).numpy()
+    np.testing.assert_allclose(filled, fill_invalid(projections, np.isfinite(projections)), rtol=1e-6)
+    assert np.array_equal(projections, before, equal_nan=True)
+
+
+@pytest.mark.gpu
+def test_a_start_on_the_gpu_is_that_of_the_cpu():
+    geometry, grid = scan(90)
+    projections = chords(geometry, SPHERES)
+    projections[::7, 3, 5:9] = np.nan
+    expected, _ = initial_volume(projections, geometry, grid)
+    volume, info = initial_volume_on(torch.from_numpy(projections).cuda(), geometry, grid)
+    assert volume.is_cuda and info["method"] == "fdk" and info["invalid_pixels"] == 13 * 4
+    # Two implementations of filtered backprojection.
+    assert float((volume.cpu() - torch.from_numpy(expected)).norm()) < 0.1 * np.linalg.norm(expected)

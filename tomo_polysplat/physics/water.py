@@ -39,8 +39,8 @@ def water_equivalent(projections: Any, spectrum: Spectrum) -> Any:
         the largest value on.
     """
     if isinstance(projections, torch.Tensor):
-        values = projections.reshape(-1)
-        return _inverted(values, spectrum, torch.empty_like(values)).reshape(projections.shape)
+        line = projections.reshape(-1)
+        return _inverted(line, spectrum, torch.empty_like(line)).reshape(projections.shape)
     values = require_array("projections", projections).astype(np.float64)
     flat = torch.from_numpy(values.reshape(-1))
     return _inverted(flat, spectrum, torch.empty_like(flat)).numpy().reshape(values.shape)

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, to_astra
 from tomo_polysplat.start.orbit import Orbit
 
-__all__ = ["fdk_cuda", "suits_fdk_cuda"]
+if TYPE_CHECKING:
+    import torch
+
+__all__ = ["fdk_cuda", "fdk_cuda_tensor", "suits_fdk_cuda"]
 
 
 def suits_fdk_cuda(geometry: Geometry, grid: VolumeGrid, orbit: Orbit) -> tuple[bool, str]:
@@ -51,9 +56,17 @@ def fdk_cuda(
     filter_name: str = "ram-lak",
     device: str = "cuda",
 ) -> np.ndarray:
-    """ASTRA's FDK_CUDA on linked torch tensors, for a scan that `suits_fdk_cuda`.
+    """ASTRA's FDK_CUDA for a scan that `suits_fdk_cuda`; parameters and result are those of `fdk`."""
+    import torch
 
-    Parameters and result are those of `fdk`.
+    values = torch.from_numpy(np.ascontiguousarray(projections, dtype=np.float32)).to(device)
+    return fdk_cuda_tensor(values, geometry, grid, orbit, filter_name).cpu().numpy()
+
+
+def fdk_cuda_tensor(
+    projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid, orbit: Orbit, filter_name: str
+) -> torch.Tensor:
+    """The same of projections on a CUDA device, where the volume stays.
 
     Raises
     ------
@@ -63,13 +76,13 @@ def fdk_cuda(
     import astra
     import torch
 
-    target = torch.device(device)
-    index = torch.cuda.current_device() if target.index is None else target.index
+    index = projections.device.index
     # ASTRA takes the origin for the centre of the orbit.
     shift = -np.array([*orbit.axis, geometry.origin[:, 2].mean()])
     proj_geom, vol_geom = to_astra(geometry.shifted(shift), grid.shifted(shift))
-    ordered = np.ascontiguousarray(projections.swapaxes(0, 1), dtype=np.float32)
-    sinogram = torch.from_numpy(ordered).to(f"cuda:{index}")
+    # ASTRA filters its input in place.
+    sinogram = torch.empty_like(projections.transpose(0, 1), memory_format=torch.contiguous_format)
+    sinogram.copy_(projections.transpose(0, 1))
     volume = torch.full(grid.shape, torch.nan, dtype=torch.float32, device=sinogram.device)
     # ASTRA works on streams of its own and asks for none of torch's.
     torch.cuda.synchronize(index)
@@ -90,4 +103,4 @@ def fdk_cuda(
     torch.cuda.synchronize(index)
     if not bool(torch.isfinite(volume).all()):
         raise RuntimeError("ASTRA's FDK_CUDA left voxels unwritten; is its GPU out of memory?")
-    return volume.cpu().numpy()
+    return volume

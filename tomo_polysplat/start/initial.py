@@ -6,14 +6,16 @@ import logging
 from typing import Any
 
 import numpy as np
+import torch
 
 from tomo_polysplat.checks import require_array, require_shape
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.fdk import fdk, fits_fdk
+from tomo_polysplat.start.on_gpu import fdk_on_gpu
 from tomo_polysplat.start.sirt import sirt
 from tomo_polysplat.start.source_planes import beyond_sources
 
-__all__ = ["fill_invalid", "initial_volume"]
+__all__ = ["fill_invalid", "initial_volume", "initial_volume_on"]
 
 _log = logging.getLogger(__name__)
 
@@ -28,6 +30,33 @@ _SOURCE_MARGIN = 2.0
 # Steps along rays in one pass of SIRT beyond which a coarser volume and detector do for a start: a few
 # seconds for all passes on two CPU cores.
 _MOST_STEPS = 4e7
+
+
+def initial_volume_on(
+    projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid
+) -> tuple[torch.Tensor, dict[str, Any]]:
+    """As `initial_volume` for projections on a device, where the volume is, too."""
+    volume = None
+    if projections.is_cuda and _method(geometry, grid)[0]:
+        volume = fdk_on_gpu(projections, geometry, grid)
+    if volume is None:
+        device = projections.device
+        found, done = initial_volume(projections.cpu().numpy(), geometry, grid, device=device.type)
+        return torch.from_numpy(np.ascontiguousarray(found)).to(device), done
+    reason, invalid = _method(geometry, grid)[1], int((~torch.isfinite(projections)).sum())
+    _log.info("Start from FDK: %s; %d invalid pixels.", reason, invalid)
+    beyond, near = _beyond_sources(geometry, grid)
+    if beyond is not None:
+        volume[torch.from_numpy(beyond.copy()).to(volume.device)] = 0.0
+    return volume, {"method": "fdk", "reason": reason + near, "invalid_pixels": invalid}
+
+
+def _method(geometry: Geometry, grid: VolumeGrid) -> tuple[bool, str]:
+    """Whether filtered backprojection is the better start, and why (not)."""
+    fits, reason = fits_fdk(geometry, grid)
+    if fits and geometry.views < FEW_VIEWS:
+        return False, f"only {geometry.views} views"
+    return fits, reason
 
 
 def initial_volume(
@@ -67,9 +96,7 @@ def initial_volume(
         usable &= valid
     if not usable.any():
         raise ValueError("projections: expected some valid pixels, got none")
-    fits, reason = fits_fdk(geometry, grid)
-    if fits and geometry.views < FEW_VIEWS:
-        fits, reason = False, f"only {geometry.views} views"
+    fits, reason = _method(geometry, grid)
     method, invalid = ("fdk" if fits else "sirt"), int((~usable).sum())
     _log.info("Start from %s: %s; %d invalid pixels.", method.upper(), reason, invalid)
     if fits:
@@ -78,12 +105,14 @@ def initial_volume(
         volume = fdk(filled, geometry, grid, filter_name="hann", device=device)
     else:
         volume = _sirt_start(np.where(usable, projections, np.nan), geometry, grid)
-    volume, near = _without_sources(volume, geometry, grid)
+    beyond, near = _beyond_sources(geometry, grid)
+    if beyond is not None:
+        volume = np.where(beyond, np.float32(0), volume)
     return volume, {"method": method, "reason": reason + near, "invalid_pixels": invalid}
 
 
-def _without_sources(volume: np.ndarray, geometry: Geometry, grid: VolumeGrid) -> tuple[np.ndarray, str]:
-    """The volume without what lies beyond the sources, and words that say so."""
+def _beyond_sources(geometry: Geometry, grid: VolumeGrid) -> tuple[np.ndarray | None, str]:
+    """Voxels that lie beyond the sources, if any, and words that say so."""
     width, height = geometry.pixel_size_at(grid.centre)
     planar = geometry.planar and grid.planar
     finest = max(
@@ -91,11 +120,9 @@ def _without_sources(volume: np.ndarray, geometry: Geometry, grid: VolumeGrid) -
     )
     beyond = beyond_sources(geometry, grid, _SOURCE_MARGIN * finest)
     if beyond is None:
-        return volume, ""
+        return None, ""
     _log.warning("%d voxels lie beyond a source or too near to one, and are left empty.", int(beyond.sum()))
-    return np.where(
-        beyond, np.float32(0), volume
-    ), f"; {int(beyond.sum())} voxels beyond the sources left empty"
+    return beyond, f"; {int(beyond.sum())} voxels beyond the sources left empty"
 
 
 def _sirt_start(projections: np.ndarray, geometry: Geometry, grid: VolumeGrid) -> np.ndarray:

@@ -1,0 +1,58 @@
+"""Filtered backprojection of projections that are on a GPU, where they stay."""
+
+from __future__ import annotations
+
+import torch
+
+from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.start.orbit import find_orbit
+
+__all__ = ["fdk_on_gpu", "fill_rows"]
+
+# Views filled at once: the intermediate results are several times as large.
+_CHUNK = 32
+
+
+def fdk_on_gpu(projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid) -> torch.Tensor | None:
+    """Smooth filtered backprojection (nz, ny, nx), or None where ASTRA cannot do this scan on a GPU.
+
+    Parameters
+    ----------
+    projections : (views, rows, columns) float32 CUDA tensor
+        -log(I/I0) of a scan that `fits_fdk`; pixels that are not finite are interpolated from their row.
+    """
+    from tomo_polysplat.start.astra_fdk import fdk_cuda_tensor, suits_fdk_cuda
+
+    orbit, _ = find_orbit(geometry)
+    if orbit is None or not suits_fdk_cuda(geometry, grid, orbit)[0]:
+        return None
+    # Smooth: the noise of a sharp filter would be seeded as if it were matter.
+    return fdk_cuda_tensor(fill_rows(projections), geometry, grid, orbit, "hann")
+
+
+def fill_rows(projections: torch.Tensor) -> torch.Tensor:
+    """Pixels that are not finite interpolated linearly along their row, as by `initial.fill_invalid`.
+
+    Beyond the last good pixel the row goes on as it ends; a row without any becomes 0.
+    """
+    spoiled = (~torch.isfinite(projections)).any(dim=2).any(dim=1).nonzero()[:, 0]
+    if not len(spoiled):
+        return projections
+    filled = projections.clone()
+    for views in spoiled.split(_CHUNK):
+        filled[views] = _filled(projections[views])
+    return filled
+
+
+def _filled(values: torch.Tensor) -> torch.Tensor:
+    good, count = torch.isfinite(values), values.shape[2]
+    column = torch.arange(count, device=values.device).expand_as(values)
+    before = torch.where(good, column, -1).cummax(dim=2).values
+    after = torch.where(good, column, count).flip(2).cummin(dim=2).values.flip(2)
+    some = good.any(dim=2, keepdim=True)
+    left = torch.where(before < 0, after, before).clamp(max=count - 1)
+    right = torch.where(after == count, before, after).clamp(min=0)
+    usable = torch.where(good, values, 0.0)
+    low, high = usable.gather(2, left), usable.gather(2, right)
+    share = (column - left) / (right - left).clamp(min=1)
+    return torch.where(good, values, torch.where(some, low + share * (high - low), 0.0))
