@@ -105,5 +105,9 @@ GROUPS: dict[str, tuple[Variant, ...]] = {
         Variant("plain L1", {"loss": "l1"}),
         Variant("the paper's: plain L1 + 0.25 (1 - SSIM)", {"loss": "l1", "ssim_weight": 0.25}),
     ),
+    "blur": (
+        Variant("rays infinitely thin", {"blur": 0.0, "learning_rate_blur": 0.0}),
+        Variant("blur held at its start", {"learning_rate_blur": 0.0}),
+    ),
     "relocation": (Variant("no relocation", {"relocated": 0.0}),),
 }
