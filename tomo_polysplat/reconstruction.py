@@ -6,12 +6,14 @@ import logging
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import torch
 
-from tomo_polysplat.checks import fail, require_array, require_number, require_shape
+from tomo_polysplat.checks import fail, require_number
+from tomo_polysplat.fit.calibration import Calibration, calibrated, with_fitted
 from tomo_polysplat.fit.checkpoint import Checkpoint
 from tomo_polysplat.fit.optimise import FitOutcome, FitState, fit
 from tomo_polysplat.fit.plan import Plan, make_plan
@@ -23,23 +25,20 @@ from tomo_polysplat.kernels.device import one_torch_thread, pick_device, usual_m
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.spectrum import Spectrum
-from tomo_polysplat.physics.water_correction import describe_polynomial, undo_water_correction
+from tomo_polysplat.physics.water_correction import describe_polynomial
 from tomo_polysplat.progress import progress_reports
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import (
     VolumeGrid,
     from_astra,
     is_planar_geometry,
-    projections_from_astra,
 )
+from tomo_polysplat.scan.usable import uncorrected, usable_rays
 from tomo_polysplat.settings import Settings, make_settings
 
 __all__ = ["reconstruct"]
 
 logger = logging.getLogger(__name__)
-
-# No number above 0 has a logarithm beyond this in float64.
-_LARGEST_LOGARITHM = 745.0
 
 
 @usual_modes()
@@ -57,6 +56,8 @@ def reconstruct(
     device: str = "auto",
     valid: Any = None,
     water_correction: Sequence[float] | None = None,
+    calibrate: bool | str | Sequence[str] = False,
+    soft_density: float | None = None,
     callbacks: Sequence[Callable[[FitState], Any]] = (),
     progress: bool | Callable[[float, str], Any] | None = None,
     settings: Settings | Mapping[str, Any] | None = None,
@@ -91,6 +92,12 @@ def reconstruct(
         Coefficients c_0 = 0, c_1, ... of the polynomial ``sum_k c_k P^k`` that the scanner has put its
         -log(I/I0) through; it is undone first, so that every ray keeps the noise of its counts. With a
         spectrum only.
+    calibrate : bool or names among "scatter", "kvp", "filter"
+        Fit these by a few short fits first, and use what fits the held-out rays better: a constant scattered
+        signal, and the tube's voltage or its filters, which need ``soft_density``. True calibrates scatter, and
+        the voltage where the density is given. ``result.plan["calibration"]`` tells what came of it.
+    soft_density : float, optional
+        Known density in g/cm3 of what most of the object is made of, the first of ``materials``.
     callbacks : sequence of callables
         Each gets a :class:`~tomo_polysplat.fit.optimise.FitState` once a pass over the views; returning True
         ends the fit.
@@ -127,16 +134,20 @@ def reconstruct(
         time_budget = require_number("time_budget", time_budget, above=0)
     rng, target, callbacks = _generator(seed), pick_device(device), _functions(callbacks)
     geometry, grid = from_astra(proj_geom, vol_geom)
-    values, counts = _usable(projections, proj_geom, valid)
-    values = _uncorrected(values, water_correction, spectrum)
+    values, counts = usable_rays(projections, proj_geom, valid)
+    values = uncorrected(values, water_correction, spectrum)
     problem = Problem.of(values, geometry, grid, unit, spectrum, materials)
+    wanted = Calibration.of(calibrate, soft_density, problem.spectrum)
     flipped = is_planar_geometry(proj_geom)
     options = chosen.to_dict() | {"seed": int(seed), "time_budget": time_budget}
+    options |= {"calibration": None if wanted is None else asdict(wanted)}
     saved = _checkpoint(checkpoint, resume, problem, options)
     started -= 0.0 if saved is None else saved.seconds
     with one_torch_thread(target), progress_reports(progress) as report:
         report(0.0, "start volume")
+        problem, calibration = _calibration(problem, wanted, chosen, target, saved, options)
         plan, gaussians, scene, rays = _begin(problem, chosen, target, saved)
+        plan.reasons |= calibration
         if water_correction is not None:
             plan.reasons["water_correction"] = f"undone: {describe_polynomial(water_correction)}"
         outcome = fit(
@@ -157,7 +168,7 @@ def reconstruct(
             report(1.0, "volume")
             about = {
                 "unit": unit,
-                "spectrum": spectrum,
+                "spectrum": problem.spectrum or spectrum,
                 "flipped_2d": flipped,
                 "counts": counts | _counts(outcome),
             }
@@ -177,6 +188,24 @@ def _checkpoint(
             raise fail("resume", "a checkpoint to go on from", "none", "pass checkpoint= as well")
         return None
     return Checkpoint(path, problem, options, resume=resume)
+
+
+def _calibration(
+    problem: Problem,
+    wanted: Calibration | None,
+    settings: Settings,
+    device: torch.device,
+    saved: Checkpoint | None,
+    options: Mapping[str, Any],
+) -> tuple[Problem, dict[str, Any]]:
+    """The problem under the physics that short fits, or those before a checkpoint, have found, and its record."""
+    if wanted is None:
+        return problem, {}
+    if saved is not None and saved.plan is not None:
+        found = saved.plan.reasons["calibration"]
+    else:
+        found = calibrated(problem, wanted, settings, device, options["seed"], options["time_budget"])
+    return with_fitted(problem, found["fitted"]), {"calibration": found}
 
 
 def _begin(
@@ -218,44 +247,6 @@ def _functions(callbacks: Any) -> list[Callable[[FitState], Any]]:
         if not callable(function):
             raise fail("callbacks", "functions of a FitState", repr(function), error=TypeError)
     return functions
-
-
-def _usable(projections: Any, proj_geom: Mapping[str, Any], valid: Any) -> tuple[np.ndarray, dict[str, int]]:
-    """Projections (views, rows, columns) with NaN for every ray that is not to be used, and their counts."""
-    if isinstance(projections, np.ma.MaskedArray):
-        valid = ~np.ma.getmaskarray(projections) & (
-            True if valid is None else require_array("valid", valid) > 0
-        )
-    # What float32 cannot hold becomes infinite, and is counted as such.
-    with np.errstate(over="ignore"):
-        values = np.array(projections_from_astra(projections, proj_geom), np.float32)
-    counts = {"rays": values.size, "rays_not_finite": int(np.count_nonzero(~np.isfinite(values)))}
-    values[~np.isfinite(values)] = np.nan
-    if valid is not None:
-        mask = require_array("valid", valid)
-        require_shape("valid", mask, np.shape(projections), "of the projections")
-        mask = projections_from_astra(mask.astype(np.float32), proj_geom) > 0.5
-        counts["rays_marked_invalid"] = int(np.count_nonzero(~mask))
-        values[~mask] = np.nan
-    impossible = np.abs(values) > _LARGEST_LOGARITHM
-    counts["rays_out_of_range"] = int(np.count_nonzero(impossible))
-    values[impossible] = np.nan
-    if np.isnan(values).all():
-        remedy = "give -log(I/I0), not intensities, and check the flat fields and the mask"
-        raise fail("projections", "at least one usable ray", "none", remedy)
-    return values, counts
-
-
-def _uncorrected(
-    values: np.ndarray, water_correction: Sequence[float] | None, spectrum: Spectrum | None
-) -> np.ndarray:
-    """The projections before the scanner's water correction."""
-    if water_correction is None:
-        return values
-    if spectrum is None:
-        remedy = "a monochromatic model wants the values as they are: leave water_correction out"
-        raise fail("water_correction", "a spectrum beside it", "none", remedy)
-    return undo_water_correction(values, water_correction).astype(np.float32)
 
 
 def _volume_of(

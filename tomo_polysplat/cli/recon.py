@@ -63,6 +63,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="base materials (default: water aluminium iron)",
     )
     group.add_argument(
+        "--calibrate",
+        nargs="*",
+        metavar="WHAT",
+        help="fit scatter, kvp or filter first; alone: scatter, and kvp with --soft-density",
+    )
+    group.add_argument(
+        "--soft-density", type=float, metavar="G/CM3", help="known density of what most of the object is"
+    )
+    group.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="change one setting; may be repeated"
     )
     add_solver_options(group)
@@ -98,6 +107,8 @@ def run(arguments: argparse.Namespace) -> int:
             seed=arguments.seed,
             device=arguments.device,
             valid=scan.valid,
+            calibrate=arguments.calibrate or arguments.calibrate is not None,
+            soft_density=arguments.soft_density,
             water_correction=None if spectrum is None else scan.water_correction,
             progress=progress,
             settings=dict(_setting(text) for text in arguments.set) or None,

@@ -1,0 +1,142 @@
+"""A fit of a few passes over the views, to see what becomes of a scan under some physics."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from tomo_polysplat.fit.optimise import fit
+from tomo_polysplat.fit.plan import make_plan, mass_level
+from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.render.renderer import project_gaussians
+from tomo_polysplat.settings import Settings
+
+__all__ = ["ShortFit", "main_density", "short_fit"]
+
+_PASSES = 2.0
+# A scan of few views is not seen in fewer steps.
+_FEWEST_STEPS = 120
+_RAYS = 60_000
+_VIEWS = 24
+# The main matter's voxels: this share of those near its level, the ones closest to each other.
+_CROWD = 0.3
+
+
+@dataclass
+class ShortFit:
+    """What a short fit tells.
+
+    Attributes
+    ----------
+    fitted : dict
+        The physics that was assumed; see ``fit.calibration.with_fitted``.
+    held_out : float
+        Misfit of the held-out rays, or of the fitted ones where there are too few.
+    soft_density : float
+        Density in g/cm3 of what most of the object is made of, were it the first material.
+    areal : (3, rays) array
+        Areal densities in g/cm2 of some of the rays.
+    measured, weight : (rays,) arrays
+        Their P, and the inverse of its deviation, 1 for a ray without noise.
+    """
+
+    fitted: dict[str, float]
+    held_out: float
+    soft_density: float
+    areal: np.ndarray
+    measured: np.ndarray
+    weight: np.ndarray
+
+    def record(self) -> dict[str, float]:
+        """Its numbers, for the plan."""
+        return {**self.fitted, "held_out": self.held_out, "soft_density": self.soft_density}
+
+
+def short_fit(
+    problem: Problem,
+    fitted: dict[str, float],
+    settings: Settings,
+    device: torch.device,
+    seed: int,
+    budget: float | None,
+) -> ShortFit:
+    """Two passes over the views, or more where they are few.
+
+    Parameters
+    ----------
+    problem : Problem
+        Under the physics that ``fitted`` states.
+    settings : Settings
+        Of the fit to come.
+    seed : int
+    budget : float or None
+        Seconds it may take.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        After Ctrl-C: what a calibration has so far is no result.
+    """
+    start, _ = problem.start_volume(device)
+    plan = make_plan(start, problem, settings, device.type)
+    passes = max(_PASSES, _FEWEST_STEPS * plan.views_per_step / problem.geometry.views)
+    short = replace(settings, passes=min(passes, settings.passes))
+    scene, rays = problem.scene(plan, short, device), problem.rays(plan, short, device)
+    started = time.perf_counter()
+    outcome = fit(
+        problem.seeds(start, plan, short, device),
+        plan.spacing * problem.voxel,
+        rays,
+        scene,
+        short,
+        views_per_step=plan.views_per_step,
+        rng=np.random.default_rng(seed),
+        started=started,
+        deadline=None if budget is None else started + budget,
+        volume=lambda gaussians: scene.volume(gaussians).cpu().numpy(),
+    )
+    if outcome.reason == "interrupted":
+        raise KeyboardInterrupt("interrupted during the calibration: there is no result yet")
+    with torch.no_grad():
+        density = scene.volume(outcome.gaussians).cpu().numpy() * plan.reference
+        sample = _sample(outcome.gaussians, scene, rays, seed)
+    errors = [entry["held_out"] or entry["loss"] for entry in outcome.history] or [np.inf]
+    return ShortFit(fitted, float(min(errors)), main_density(density), *sample)
+
+
+def main_density(density: np.ndarray) -> float:
+    """Density of the matter that most of an object is made of: where its voxels crowd."""
+    level = mass_level(density)
+    near = np.sort(density[(density > 0.6 * level) & (density < 1.6 * level)].astype(np.float64))
+    if not len(near):
+        return level
+    width = max(1, int(_CROWD * len(near)))
+    first = int(np.argmin(near[width - 1 :] - near[: len(near) - width + 1]))
+    return float(near[first : first + width].mean())
+
+
+def _sample(
+    gaussians: Gaussians, scene: FitScene, rays: Rays, seed: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Areal densities, measured values and weights of some of the rays."""
+    count = len(rays.views)
+    parts: list[list[np.ndarray]] = []
+    weights = gaussians.weights(scene.reference_curve)
+    for view in np.unique(np.linspace(0, count - 1, min(_VIEWS, count)).astype(int)):
+        views, measured, weight, aside = rays.batch(np.array([view]))
+        areal, _ = project_gaussians(gaussians, weights, views, scene.kernel, scene.cutoff)
+        tensors = (
+            areal.reshape(3, -1) * scene.areal_scale,
+            measured.reshape(-1),
+            (weight + aside).reshape(-1),
+        )
+        parts.append([tensor.double().cpu().numpy() for tensor in tensors])
+    amounts, values, weighed = (np.concatenate(part, axis=-1) for part in zip(*parts))
+    chosen = np.random.default_rng(seed).permutation(np.flatnonzero(weighed > 0))[:_RAYS]
+    return amounts[:, chosen], values[chosen], weighed[chosen]

@@ -1,0 +1,76 @@
+"""Which of the rays that a caller hands over are measurements, and what they were before a water correction."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from tomo_polysplat.checks import fail, require_array, require_shape
+from tomo_polysplat.parallel import run_tasks, split_range
+from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.physics.water_correction import undo_water_correction
+from tomo_polysplat.scan.geometry import projections_from_astra
+
+__all__ = ["uncorrected", "usable_rays"]
+
+# No number above 0 has a logarithm beyond this in float64.
+_LARGEST_LOGARITHM = 745.0
+
+
+def usable_rays(
+    projections: Any, proj_geom: Mapping[str, Any], valid: Any
+) -> tuple[np.ndarray, dict[str, int]]:
+    """Projections (views, rows, columns) with NaN for every ray that is not to be used, and their counts.
+
+    Parameters and errors are those of :func:`tomo_polysplat.reconstruct`.
+    """
+    if isinstance(projections, np.ma.MaskedArray):
+        valid = ~np.ma.getmaskarray(projections) & (
+            True if valid is None else require_array("valid", valid) > 0
+        )
+    # What float32 cannot hold becomes infinite, and is counted as such.
+    with np.errstate(over="ignore"):
+        values = projections_from_astra(projections, proj_geom)
+    if np.may_share_memory(values, np.asarray(projections)):
+        values = values.copy()
+    marked = None
+    if valid is not None:
+        mask = require_array("valid", valid)
+        require_shape("valid", mask, np.shape(projections), "of the projections")
+        marked = ~(projections_from_astra(mask.astype(np.float32), proj_geom) > 0.5)
+    parts = [(values[a:b], None if marked is None else marked[a:b]) for a, b in split_range(len(values), 64)]
+    found = run_tasks(_take_out, parts)
+    counts = {"rays": values.size} | {name: sum(part[name] for part in found) for name in found[0]}
+    if counts.pop("used") == 0:
+        remedy = "give -log(I/I0), not intensities, and check the flat fields and the mask"
+        raise fail("projections", "at least one usable ray", "none", remedy)
+    return values, counts
+
+
+def _take_out(values: np.ndarray, marked: np.ndarray | None) -> dict[str, int]:
+    """Make every ray that is not to be used NaN; how many there were of each kind, and how many are used."""
+    bad = ~np.isfinite(values)
+    counts = {"rays_not_finite": int(np.count_nonzero(bad))}
+    if marked is not None:
+        counts["rays_marked_invalid"] = int(np.count_nonzero(marked))
+        bad |= marked
+    values[bad] = np.nan
+    impossible = np.abs(values) > _LARGEST_LOGARITHM
+    counts["rays_out_of_range"] = int(np.count_nonzero(impossible))
+    values[impossible] = np.nan
+    bad |= impossible
+    return counts | {"used": bad.size - int(np.count_nonzero(bad))}
+
+
+def uncorrected(
+    values: np.ndarray, water_correction: Sequence[float] | None, spectrum: Spectrum | None
+) -> np.ndarray:
+    """The projections before the scanner's water correction; see :func:`tomo_polysplat.reconstruct`."""
+    if water_correction is None:
+        return values
+    if spectrum is None:
+        remedy = "a monochromatic model wants the values as they are: leave water_correction out"
+        raise fail("water_correction", "a spectrum beside it", "none", remedy)
+    return undo_water_correction(values, water_correction).astype(np.float32)
