@@ -1,4 +1,4 @@
-"""``tomo-polysplat bench``: kernels, reconstructions, their accuracy, and what the solver's parts are worth."""
+"""``tomo-polysplat bench``: kernels, reconstructions, their accuracy, the solver's parts, and hard cases."""
 
 from __future__ import annotations
 
@@ -33,7 +33,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _add_accuracy_arguments(accuracy)
     ablation = what.add_parser("ablation", help="seconds and errors with parts of the solver changed")
     _add_ablation_arguments(ablation)
-    for child in (kernels, recon, accuracy, ablation):
+    hard = what.add_parser("hard", help="cases at the limits, each with what must come of it")
+    hard.add_argument("--device", default="auto", help="auto (default), cpu, cuda or cuda:N")
+    hard.add_argument("--only", nargs="+", default=[], metavar="NAME", help="these cases (default: all)")
+    for child in (kernels, recon, accuracy, ablation, hard):
         child.add_argument(
             "--record",
             metavar="FOLDER",
@@ -76,7 +79,7 @@ def _add_ablation_arguments(parser: argparse.ArgumentParser) -> None:
         "--groups",
         nargs="+",
         metavar="GROUP",
-        help="among components nodes curve free weights relocation affine (default: all)",
+        help="among components nodes curve free weights blur relocation affine (default: all)",
     )
     parser.add_argument("--cache", metavar="FOLDER", help="simulated scans (default: among temporary files)")
     _add_settings_argument(parser)
@@ -118,9 +121,14 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.record:
         Path(arguments.record).mkdir(parents=True, exist_ok=True)
     arguments.device = _device(arguments.device)
-    return {"kernels": _kernels, "recon": _recon, "accuracy": _accuracy, "ablation": _ablation}[
-        arguments.what
-    ](arguments)
+    commands = {
+        "kernels": _kernels,
+        "recon": _recon,
+        "accuracy": _accuracy,
+        "ablation": _ablation,
+        "hard": _hard,
+    }
+    return commands[arguments.what](arguments)
 
 
 def _device(name: str) -> str:
@@ -223,6 +231,22 @@ def _ablation(arguments: argparse.Namespace) -> int:
     _write(arguments, "ablation.json", record)
     _write_text(arguments, "ablation.md", as_markdown(record))
     return _status(record)
+
+
+def _hard(arguments: argparse.Namespace) -> int:
+    from tomo_polysplat.bench.hard import chosen_cases, run_hard_bench
+    from tomo_polysplat.bench.hard_report import as_markdown, as_text
+
+    record = run_hard_bench(
+        arguments.device,
+        chosen_cases(arguments.only),
+        progress=_say,
+        update=lambda so_far: _write(arguments, "hard.json", so_far, quiet=True),
+    )
+    print(as_text(record))
+    _write(arguments, "hard.json", record)
+    _write_text(arguments, "hard.md", as_markdown(record))
+    return 0 if all(case["passed"] for case in record["cases"]) else 1
 
 
 def _recon_bench(arguments: argparse.Namespace) -> ReconBench:
