@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.checks import require_choice
+from tomo_polysplat.fit.memory import projections_stay, require_room
 from tomo_polysplat.fit.noise import photons_per_ray
 from tomo_polysplat.fit.plan import Plan
 from tomo_polysplat.fit.rays import Rays
@@ -126,9 +127,10 @@ class Problem:
         return volume, f"{done['method'].upper()}: {done['reason']}"
 
     def measured(self, device: torch.device) -> torch.Tensor:
-        """The projections on a device, copied there once."""
+        """The projections on a device, copied there once; on the host where they do not fit there."""
         if device not in self._copies:
-            self._copies[device] = torch.from_numpy(self.projections).to(device)
+            stay = projections_stay(self.projections.nbytes, device)
+            self._copies[device] = torch.from_numpy(self.projections).to(device if stay else "cpu")
         return self._copies[device]
 
     def scene(self, plan: Plan, settings: Settings, device: torch.device) -> FitScene:
@@ -153,7 +155,7 @@ class Problem:
         if not self.scatter:
             return self.measured(device)
         primary = without_scatter(self.projections, self.scatter, _LARGEST_PROJECTION)
-        return torch.from_numpy(primary).to(device, torch.float32)
+        return torch.from_numpy(primary).to(self.measured(device).device, torch.float32)
 
     def _physics(
         self, plan: Plan, settings: Settings, device: torch.device
@@ -185,6 +187,15 @@ class Problem:
         )
         free = int((gaussians.group < 0).sum())
         plan.reasons["gaussians"] = f"{len(gaussians)}, the material number free for {free}"
+        values = self.measured(device)
+        plan.reasons["memory"] = require_room(
+            device,
+            gaussians=len(gaussians),
+            views=plan.views_per_step,
+            pixels=self.geometry.rows * self.geometry.columns,
+            voxels=math.prod(self.grid.shape),
+            projections=values.nbytes if values.device.type == device.type else 0,
+        )
         return gaussians
 
     def rays(self, plan: Plan, settings: Settings, device: torch.device) -> Rays:
@@ -192,7 +203,9 @@ class Problem:
         photons = float("inf") if settings.loss == "l1" else photons_per_ray(self.measured(device))
         plan.reasons["photons_per_ray"] = f"{photons:.3g}, from the scatter of neighbouring pixels"
         views = detector_views(self.geometry, self.planar)
-        return Rays(self.measured(device), views, photons, settings.model_error, settings.held_out)
+        values = self.measured(device)
+        target = None if values.device.type == device.type else device
+        return Rays(values, views, photons, settings.model_error, settings.held_out, target)
 
 
 def _snapped_grid(grid: VolumeGrid) -> VolumeGrid:

@@ -57,7 +57,7 @@ def seed_gaussians(
     rotation[:, 0] = 1.0
     parts = (points, width.log()[:, None].repeat(1, dims), rotation, attenuation, own, shared)
     blur = rotation.new_tensor([settings.blur])
-    gaussians = Gaussians(*(part.float() for part in parts), group, blur.float())
+    gaussians = Gaussians(*(part.float() for part in parts), group=group, blur=blur.float())
     # Neighbours in space beside each other in memory, which the kernels use.
     order = spatial_order(gaussians.position)
     return gaussians.select(order)

@@ -132,12 +132,40 @@ def _row_gradient(q0, q1, q2, r11, r12, r13, r22, r23, r33, xx, xy, xz, yy, yz, 
 
 
 @triton.jit
+def _store_zeros(to, n, live, NUMBERS: tl.constexpr):
+    for k in tl.static_range(NUMBERS):
+        tl.store(to + n * NUMBERS + k, tl.zeros(n.shape, tl.float32), mask=live)
+
+
+@triton.jit
 def _pull_back_kernel(
     scale, rotation, table, moments, grad_position, grad_scale, grad_rotation, grad_weight, count,
     CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = n < count
+    most = tl.zeros([BLOCK], tl.float32)
+    for k in tl.static_range(SUMS):
+        most = tl.maximum(most, tl.abs(tl.load(moments + n * SUMS + k, mask=live, other=0.0)))
+    # Of a whole volume's Gaussians, most are far from a small box.
+    if tl.max(most, 0) > 0:
+        _pull_back_block(
+            scale, rotation, table, moments, grad_position, grad_scale, grad_rotation, grad_weight, n, live,
+            count, CHANNELS,
+        )  # fmt: skip
+    else:
+        _store_zeros(grad_position, n, live, 3)
+        _store_zeros(grad_scale, n, live, 3)
+        _store_zeros(grad_rotation, n, live, 4)
+        for k in tl.static_range(CHANNELS):
+            tl.store(grad_weight + k * count + n, tl.zeros([BLOCK], tl.float32), mask=live)
+
+
+@triton.jit
+def _pull_back_block(
+    scale, rotation, table, moments, grad_position, grad_scale, grad_rotation, grad_weight, n, live, count,
+    CHANNELS: tl.constexpr,
+):  # fmt: skip
     (
         t00, t01, t02, t10, t11, t12, t20, t21, t22,
         a00, a01, a02, a10, a11, a12, a20, a21, a22, s0, s1, s2,

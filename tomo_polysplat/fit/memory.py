@@ -1,0 +1,80 @@
+"""How much of a GPU's memory a fit takes, estimated before it starts, and what to do where there is too little."""
+
+from __future__ import annotations
+
+import logging
+
+import torch
+
+from tomo_polysplat.checks import fail
+
+__all__ = ["free_bytes", "projections_stay", "require_room"]
+
+logger = logging.getLogger(__name__)
+
+# Bytes a Gaussian takes: parameters, both moments, the best copy and gradients; and its footprint and sums in
+# each view of a step.
+_GAUSSIAN, _FOOTPRINT = 640, 144
+# Bytes a pixel of a step takes: image and gradient of four channels, projections and their slopes.
+_PIXEL = 48
+# Bytes a voxel takes, the most at once: while seeds are chosen and when the volumes are made; and the samples
+# of thin Gaussians (render.renderer).
+_VOXEL, _SAMPLES = 110, 12 << 25
+# Copies of the projections that the first reconstruction makes: water equivalents, the filtered ones, ASTRA's.
+_COPIES = 4
+# Of what is free: the rest is the driver's, other programs', and lost between blocks.
+_SHARE = 0.9
+
+
+def free_bytes(device: torch.device) -> int:
+    """Memory of a CUDA device that torch can still hand out."""
+    unused = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return torch.cuda.mem_get_info(device)[0] + unused
+
+
+def projections_stay(size: int, device: torch.device) -> bool:
+    """Whether projections of ``size`` bytes fit on the device, with what is made of them at the start."""
+    return device.type == "cpu" or _COPIES * size <= _SHARE * free_bytes(device)
+
+
+def require_room(
+    device: torch.device, *, gaussians: int, views: int, pixels: int, voxels: int, projections: int
+) -> str:
+    """The estimate in words.
+
+    Parameters
+    ----------
+    gaussians : int
+    views, pixels : int
+        Of a step, and of a view.
+    voxels : int
+    projections : int
+        Bytes of them on the device already; 0 where they stay on the host.
+
+    Raises
+    ------
+    ValueError
+        If a CUDA device has too little memory left.
+    """
+    parts = {
+        "Gaussians": gaussians * (_GAUSSIAN + _FOOTPRINT * views),
+        "images of a step": views * pixels * _PIXEL,
+        "volumes": voxels * _VOXEL + min(_SAMPLES, 27 * 12 * voxels),
+    }
+    need = sum(parts.values())
+    words = ", ".join(f"{name} {_gigabytes(size)}" for name, size in parts.items())
+    words = f"about {_gigabytes(need)} ({words})"
+    if device.type == "cpu":
+        return words
+    free = free_bytes(device)
+    where = f"on the GPU, {_gigabytes(projections)}" if projections else "streamed from the host"
+    if need > _SHARE * free:
+        remedy = "lower settings max_gaussians or views_per_step, take fewer voxels, or device='cpu'"
+        raise fail("device", f"a GPU with {words} free", f"{_gigabytes(free)} on {device}", remedy)
+    words = f"{words} of {_gigabytes(free)} free; projections {where}"
+    logger.info("Memory: %s.", words)
+    return words
+
+
+def _gigabytes(size: int) -> str:
+    return f"{size / 1e9:.2f} GB"
