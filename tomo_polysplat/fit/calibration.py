@@ -35,6 +35,8 @@ _SHARE_OF_BUDGET = 0.1
 _LEAST_SCATTER, _LEAST_CHANGE = 2e-3, 0.02
 # Held-out errors of two fits of the same scan differ by up to 2 % by chance.
 _MARGIN = 0.03
+# A known density is taken at its word unless the rays contradict it by as much.
+_CONTRADICTION = 0.1
 # Factors of the tube voltage and of the filters that are looked at.
 _BOUNDS = {"kvp": (0.8, 1.25), "filter": (0.4, 2.5)}
 _CHANGES: dict[str, Callable[[Spectrum, float], Spectrum]] = {"kvp": with_voltage, "filter": with_filtration}
@@ -207,5 +209,5 @@ def _judge(name: str, before: ShortFit, stage: Sequence[ShortFit]) -> tuple[bool
     if name == "scatter":
         better = after < (1 - _MARGIN) * before.held_out
         return better, f"{change} of the open beam, {'accepted' if better else 'not accepted'}: {errors}"
-    fits = after < (1 + _MARGIN) * before.held_out
+    fits = after < (1 + _CONTRADICTION) * before.held_out
     return fits, f"times {change} by the known density, {'accepted' if fits else 'not accepted'}: {errors}"

@@ -1,0 +1,84 @@
+"""What a calibration is asked for, what it finds on a small scan, and what it leaves alone."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from small_scans import reconstruct
+
+import tomo_polysplat as tps
+from tomo_polysplat.fit.calibration import Calibration
+from tomo_polysplat.fit.short_fit import main_density
+
+# Enough steps for the density of the main matter to settle.
+STEADY = {"passes": 4.0, "views_per_step": 4}
+SPECTRUM = tps.Spectrum.from_tube(90, filters={"Al": 0.1})
+
+
+@cache
+def fan(scatter, views=40):
+    return tps.simulate_scan("pins", size=48, views=views, geometry="fan", scatter=scatter, metal=False)
+
+
+@pytest.mark.parametrize(
+    "asked, names",
+    [(True, ("scatter",)), ("scatter", ("scatter",)), (["scatter", "filter"], ("scatter", "filter"))],
+)
+def test_what_is_asked_for(asked, names):
+    density = 1.0 if "filter" in names else None
+    assert Calibration.of(asked, density, SPECTRUM) == Calibration(names, density)
+    assert Calibration.of(False, None, SPECTRUM) is None
+    assert Calibration.of(True, 1.05, SPECTRUM).names == ("scatter", "kvp")
+
+
+@pytest.mark.parametrize(
+    "asked, density, spectrum, word",
+    [
+        ("kvp", None, SPECTRUM, "known density"),
+        (("kvp", "filter"), 1.0, SPECTRUM, "one known density"),
+        ("voltage", None, SPECTRUM, "one of scatter"),
+        (True, None, None, "a spectrum"),
+        (False, 1.0, SPECTRUM, "calibrate beside it"),
+        (True, -1.0, SPECTRUM, "soft_density"),
+        ("kvp", 1.0, tps.Spectrum(np.linspace(10, 25, 40), np.ones(40)), "x-ray tube"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(asked, density, spectrum, word):
+    with pytest.raises(ValueError, match=word):
+        Calibration.of(asked, density, spectrum)
+
+
+def test_scatter_is_found_and_used():
+    scan = fan(0.05)
+    result = reconstruct(scan, valid=scan.valid, calibrate=True)
+    found = result.plan["calibration"]
+    assert found["accepted"] == {"scatter": True}
+    assert found["fitted"]["scatter"] == pytest.approx(0.05, rel=0.1)
+    assert found["held_out_after"] < found["held_out_before"]
+    assert result.spectrum == scan.spectrum
+
+
+def test_without_scatter_the_result_is_as_if_nothing_had_been_asked():
+    scan = fan(0.0)
+    plain = reconstruct(scan, valid=scan.valid)
+    asked = reconstruct(scan, valid=scan.valid, calibrate=True)
+    assert asked.plan["calibration"]["fitted"] == {}
+    np.testing.assert_array_equal(asked.volume, plain.volume)
+
+
+def test_a_known_density_brings_the_voltage_back():
+    scan = fan(0.0, views=120)
+    wrong = tps.Spectrum.from_tube(81, filters={"Al": 0.1})
+    options = {"spectrum": wrong, "materials": ("pmma", "aluminium", "iron"), "settings": STEADY}
+    result = reconstruct(scan, valid=scan.valid, calibrate="kvp", soft_density=1.19, **options)
+    found = result.plan["calibration"]
+    assert found["accepted"] == {"kvp": True}
+    assert 81 * found["fitted"]["kvp"] == pytest.approx(90, abs=4.5)
+    assert result.energy_kev == result.spectrum.effective_energy > wrong.effective_energy
+
+
+def test_the_main_matter_is_where_voxels_crowd():
+    rng = np.random.default_rng(1)
+    density = np.concatenate([rng.normal(1.05, 0.02, 5001), rng.uniform(0, 1.5, 2001), np.full(33, 7.9)])
+    assert main_density(density) == pytest.approx(1.05, abs=0.01)
+    assert main_density(np.zeros(5)) == 0.0
