@@ -17,6 +17,7 @@ import numpy as np
 
 from tomo_polysplat.checks import fail
 from tomo_polysplat.files import existing_file, require_plausible_size
+from tomo_polysplat.scan.hdf5_heaps import require_sound_heaps
 
 if TYPE_CHECKING:
     import h5py
@@ -42,6 +43,7 @@ def opened(path: str | Path) -> Iterator[h5py.File]:
     import h5py
 
     file = existing_file(path)
+    require_sound_heaps(file)
     try:
         with h5py.File(file, "r") as handle:
             yield handle
