@@ -221,7 +221,7 @@ def image(datasets, attributes, tricks) -> bytes:
     """The bytes of an HDF5 file."""
     with h5py.File("scan.h5", "w", driver="core", backing_store=False) as file:
         for path, value in datasets.items():
-            if path not in tricks:
+            if not any(f"{path}/".startswith(f"{trick}/") for trick in tricks):
                 _put(file, path, value)
         for path, trick in tricks.items():
             with suppress(*IMPOSSIBLE):
