@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tomo_polysplat.cli import bench_physics
 from tomo_polysplat.cli.options import add_solver_options, write_json
 
 if TYPE_CHECKING:
@@ -36,7 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     hard = what.add_parser("hard", help="cases at the limits, each with what must come of it")
     hard.add_argument("--device", default="auto", help="auto (default), cpu, cuda or cuda:N")
     hard.add_argument("--only", nargs="+", default=[], metavar="NAME", help="these cases (default: all)")
-    for child in (kernels, recon, accuracy, ablation, hard):
+    spectrum, materials = bench_physics.add_parsers(what)
+    for child in (kernels, recon, accuracy, ablation, hard, spectrum, materials):
         child.add_argument(
             "--record",
             metavar="FOLDER",
@@ -121,12 +125,14 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.record:
         Path(arguments.record).mkdir(parents=True, exist_ok=True)
     arguments.device = _device(arguments.device)
-    commands = {
+    commands: dict[str, Callable[[argparse.Namespace], int]] = {
         "kernels": _kernels,
         "recon": _recon,
         "accuracy": _accuracy,
         "ablation": _ablation,
         "hard": _hard,
+        "spectrum": partial(bench_physics.spectrum, write=_write),
+        "materials": partial(bench_physics.materials, write=_write),
     }
     return commands[arguments.what](arguments)
 

@@ -85,6 +85,8 @@ def best_stand_in(
                 np.mean((projection(np.exp(log_density) * paths[None], log_weights, curve) - target) ** 2)
             )
 
+        if curve.min() <= 0:  # below 0 the mixture takes the middle curve away, which may be too much
+            return np.nan, np.inf
         middle = float(np.log((own / curve[0]).mean()))
         found = minimize_scalar(
             error, bounds=(middle - 3.0, middle + 3.0), method="bounded", options={"xatol": 1e-9}

@@ -1,0 +1,38 @@
+"""Benchmarks of the physics: that they run, and say what they measured."""
+
+import json
+
+import pytest
+
+from tomo_polysplat.bench import materials, spectrum
+from tomo_polysplat.cli.main import main
+
+
+def test_materials_without_scans(tmp_path):
+    assert main(["bench", "materials", "--size", "0", "--record", str(tmp_path)]) == 0
+    record = json.loads((tmp_path / "materials.json").read_text())
+    errors = {entry["name"]: entry["free"]["attenuation_error"] for entry in record["materials"]}
+    assert abs(errors["titanium"]) < 0.01 < 0.1 < abs(errors["iodine"])
+    table = (tmp_path / "materials.md").read_text()
+    assert all(f"| {name} |" in table for name in errors) and (tmp_path / "materials.png").stat().st_size > 0
+
+
+def test_one_case_of_the_spectrum(tmp_path):
+    bench = spectrum.SpectrumBench(scenes=("pins",), cases=("scatter 10 %",), size=12, views=24)
+    record = spectrum.run_spectrum_bench(bench, cache=tmp_path)
+    without, calibrated = record["runs"]
+    assert without["fitted"] is None and "scatter" in calibrated["why"]
+    assert "| scatter 10 % |" in spectrum.as_markdown(record)
+    spectrum.write_figure(tmp_path / "spectrum.png", record)
+    assert (tmp_path / "spectrum.png").stat().st_size > 0
+    json.dumps(record)
+
+
+@pytest.mark.parametrize("wrong", [{"scenes": ("kidney",)}, {"cases": ("kVp x 3",)}])
+def test_unknown_names_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        spectrum.SpectrumBench(**wrong)
+
+
+def test_every_material_is_known():
+    assert len({entry[0] for entry in materials.MATERIALS}) == len(materials.MATERIALS) > 15

@@ -1,0 +1,81 @@
+"""``tomo-polysplat bench spectrum`` and ``materials``: what the assumed physics is worth."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from tomo_polysplat.cli.options import add_solver_options
+from tomo_polysplat.files import replacing
+
+__all__ = ["add_parsers", "materials", "spectrum"]
+
+
+def add_parsers(what: Any) -> tuple[argparse.ArgumentParser, argparse.ArgumentParser]:
+    """The parsers of the two commands."""
+    spectrum = what.add_parser("spectrum", help="what wrong physics costs, without and with calibration")
+    _spectrum_arguments(spectrum)
+    materials = what.add_parser("materials", help="which materials the three curves stand in for")
+    _materials_arguments(materials)
+    return spectrum, materials
+
+
+def _spectrum_arguments(parser: argparse.ArgumentParser) -> None:
+    add_solver_options(parser)
+    scenes = ["pins", "teeth", "lung"]
+    parser.add_argument("--scenes", nargs="+", default=scenes, help="default: pins teeth lung")
+    parser.add_argument("--size", type=int, default=48, help="voxels per edge (default: 48)")
+    parser.add_argument("--views", type=int, default=120, help="projection images (default: 120)")
+    parser.add_argument("--quality", default="fast", help="fast (default), balanced or best")
+
+
+def _materials_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--device", default="auto", help="auto (default), cpu, cuda or cuda:N")
+    parser.add_argument("--kvp", type=float, default=90.0, help="tube voltage (default: 90)")
+    parser.add_argument("--aluminium-cm", type=float, default=0.1, help="its filter in cm (default: 0.1)")
+    parser.add_argument("--largest", type=float, default=5.0, help="largest P of the rays (default: 5)")
+    parser.add_argument("--size", type=int, default=32, help="voxels of the pins; 0: none (default: 32)")
+
+
+def spectrum(arguments: argparse.Namespace, write: Callable[..., None]) -> int:
+    """``bench spectrum``; ``write`` keeps a record."""
+    from tomo_polysplat.bench.spectrum import SpectrumBench, as_markdown, run_spectrum_bench, write_figure
+
+    names = ("scenes", "size", "views", "quality", "device", "seed")
+    record = run_spectrum_bench(
+        SpectrumBench(**{name: getattr(arguments, name) for name in names}),
+        progress=lambda words: print(words, file=sys.stderr, flush=True),
+        update=lambda so_far: write(arguments, "spectrum.json", so_far, quiet=True),
+    )
+    write(arguments, "spectrum.json", record)
+    return _tell(arguments, "spectrum", record, as_markdown(record), write_figure)
+
+
+def materials(arguments: argparse.Namespace, write: Callable[..., None]) -> int:
+    """``bench materials``; ``write`` keeps a record."""
+    from tomo_polysplat.bench.materials import MaterialsBench, as_markdown, run_materials_bench, write_figure
+
+    names = ("kvp", "aluminium_cm", "largest", "size", "device")
+    record = run_materials_bench(
+        MaterialsBench(**{name: getattr(arguments, name) for name in names}),
+        progress=lambda words: print(words, file=sys.stderr, flush=True),
+    )
+    write(arguments, "materials.json", record)
+    return _tell(arguments, "materials", record, as_markdown(record), write_figure)
+
+
+def _tell(
+    arguments: argparse.Namespace, name: str, record: dict[str, Any], table: str, figure: Callable[..., None]
+) -> int:
+    """Print a table, and keep it with its figure."""
+    print(table)
+    if arguments.record:
+        folder = Path(arguments.record)
+        with replacing(folder / f"{name}.md", overwrite=True) as temporary:
+            temporary.write_text(table, encoding="utf-8")
+        figure(folder / f"{name}.png", record)
+        print(f"wrote {folder / name}.md and .png")
+    return 0
