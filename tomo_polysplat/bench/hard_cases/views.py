@@ -30,14 +30,14 @@ from tomo_polysplat.simulate.orbit import circular_orbit
 
 __all__ = ["CASES"]
 
-# A pass over a few views is a few steps: as many steps in all as the easy case makes.
-_STEPS = 75
+# A pass over a few views is a few steps: as many in all as a balanced run of the easy case makes.
+_STEPS, _VIEWS_PER_STEP = 150, 4
 
 
 def _few(scan: Scan, device: str) -> Findings:
     """Explained as the truth on the same voxels explains it, to the error of P that the loss forgives."""
     assert scan.truth is not None
-    settings = {"passes": float(4 * _STEPS / scan.views)}
+    settings = {"passes": float(_STEPS * min(scan.views, _VIEWS_PER_STEP) / scan.views)}
     result = fit(scan, device, settings=settings)
     findings = sound(result)
     findings.at_most(
