@@ -143,3 +143,18 @@ def test_the_start_is_not_written_to():
     start.flags.writeable = False
     seeds(start, grid, polychromatic=True)
     assert np.array_equal(start, before)
+
+
+@pytest.mark.gpu
+def test_seeds_on_the_gpu_are_those_of_the_cpu():
+    grid = grid_of((24, 19, 31))
+    start = np.zeros(grid.shape, np.float32)
+    start[3:21, 4:16, 5:27] = 1.0
+    start[9:13, 7:11, 8:13], start[15, 12, 20:23] = 9.0, 3.0
+    clouds = [
+        seed_gaussians(start, grid, 0.17, SETTINGS, True, False, torch.device(device))
+        for device in ("cpu", "cuda")
+    ]
+    assert len(clouds[0]) == len(clouds[1]) and torch.equal(clouds[0].group, clouds[1].group.cpu())
+    for name, expected in clouds[0].parameters().items():
+        torch.testing.assert_close(clouds[1].parameters()[name].cpu(), expected, rtol=1e-5, atol=1e-6)

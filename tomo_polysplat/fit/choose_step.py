@@ -50,7 +50,10 @@ def make_step(
 
         try:
             return GraphStep(gaussians, spacing, rays, scene, settings, batch, box)
-        except RuntimeError as problem:  # of torch or the driver; the slower way gives the same result
+        except (
+            Exception
+        ) as problem:  # of compiler or driver, of any kind; the slower way gives the same result
+            logger.debug("no CUDA graph", exc_info=True)
             logger.warning("Steps one operation at a time: no CUDA graph could be recorded: %s", problem)
     else:
         logger.info("Steps one operation at a time: %s.", reason)

@@ -36,8 +36,10 @@ from tomo_polysplat.settings import Settings
 
 __all__ = ["FusedStep"]
 
-# Of the control tensor: the update's three numbers, then a place to align what follows.
-_HEAD, _VIEW, _BOX = 4, 21, 6
+# Numbers of the control tensor, in its order: of the update (three and a place left free), of the box, of each view
+# its number and slot, and its geometry. Every part begins at 16 bytes whatever the batch: elsewhere the kernels
+# would be compiled once more.
+_HEAD, _BOX, _CHOSEN, _VIEW = 4, 6, 2, 21
 
 
 class FusedStep:
@@ -81,7 +83,9 @@ class FusedStep:
         self._largest = torch.zeros((2, 1), dtype=torch.float32, device=device)
         self._grad_shared = torch.zeros(len(gaussians.shared_material), dtype=torch.int64, device=device)
         self._grad_blur = torch.zeros(1, dtype=torch.int64, device=device)
-        self._control = torch.zeros(_HEAD + batch * (_VIEW + 2) + _BOX, dtype=torch.float64, device=device)
+        self._control = torch.zeros(
+            _HEAD + _BOX + batch * (_CHOSEN + _VIEW), dtype=torch.float64, device=device
+        )
         self._curves = None
         if scene.reference_curve is not None and scene.output_curve is not None:
             self._curves = torch.cat([scene.reference_curve, scene.output_curve])
@@ -142,12 +146,12 @@ class FusedStep:
         root = math.sqrt(1 - SECOND_DECAY**self.done)
         head = [rate, root, float(share >= self.settings.material_from), 0.0]
         slots = self.feed.place(views)
-        return np.concatenate([head, self._table[views].ravel(), views, slots, box.first, box.spacing])
+        return np.concatenate([head, box.first, box.spacing, views, slots, self._table[views].ravel()])
 
     def _enqueue(self) -> None:
         """All kernels of a step; what they read of it is in the control tensor."""
         gaussians, batch = self.gaussians, len(self._views)
-        head, table, chosen, box = self._control.split([_HEAD, batch * _VIEW, 2 * batch, _BOX])
+        head, box, chosen, table = self._control.split([_HEAD, _BOX, batch * _CHOSEN, batch * _VIEW])
         scale, weight, output = activate(
             gaussians.log_scale,
             gaussians.attenuation,

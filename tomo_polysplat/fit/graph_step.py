@@ -25,10 +25,7 @@ _AHEAD = 4
 class GraphStep(FusedStep):
     """Replays of a recorded `FusedStep`; see `fit.step.Step`.
 
-    Raises
-    ------
-    RuntimeError
-        Where the step cannot be recorded. The Gaussians are as they were.
+    Where it cannot be recorded the error leaves the Gaussians as they were.
     """
 
     def __init__(
@@ -65,9 +62,11 @@ class GraphStep(FusedStep):
         """The graph, after a trial run that compiles the kernels and leaves no trace."""
         before = self.gaussians.copy()
         with torch.no_grad(), torch.cuda.device(self.gaussians.position.device):
-            super().__call__(np.arange(batch), box, 0.0)
-            torch.cuda.synchronize()
-            self._forget(before)
+            try:
+                super().__call__(np.arange(batch), box, 0.0)
+                torch.cuda.synchronize()
+            finally:
+                self._forget(before)
             graph = torch.cuda.CUDAGraph()
             with torch.cuda.graph(graph, capture_error_mode="thread_local"):
                 self._enqueue()

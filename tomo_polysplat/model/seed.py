@@ -45,7 +45,8 @@ def seed_gaussians(
         Endless along z, for a scan of one plane.
     """
     dims = 2 if planar else 3
-    start = _sharpened(torch.as_tensor(start, device=device), settings.metal_level)
+    values = start if isinstance(start, torch.Tensor) else torch.tensor(start)
+    start = _sharpened(values.to(device), settings.metal_level)
     points, size, cell, value = _lattices(start, grid, spacing, dims, settings)
     reach = settings.free_radius * float(grid.voxel_size[:dims].min())
     own, shared, group = _materials(start, points, value, grid, reach, settings, polychromatic)
