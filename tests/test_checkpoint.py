@@ -2,7 +2,6 @@
 
 import json
 import os
-import time
 import zipfile
 
 import numpy as np
@@ -96,18 +95,13 @@ def test_a_run_that_a_callback_ended_goes_on(tmp_path):
 
 
 def test_the_time_budget_counts_both_parts(tmp_path):
-    path, long = tmp_path / "fit.npz", QUICK | {"passes": 1e5, "patience": 10**6}
-    reconstruct(fan())  # compiled and warm
-    options = {"settings": long, "time_budget": 1.0}
-    killed_after(3, fan(), path, **options)
-    begun = time.perf_counter()
+    """A first part that took 2000 s leaves nothing of a budget of 1000 s."""
+    path, options = tmp_path / "fit.npz", {"settings": LONG, "time_budget": 1000.0}
+    killed_after(1, fan(), path, **options)
+    rewritten(path, about=with_numbers(path, seconds=2000.0))
     resumed = reconstruct(fan(), checkpoint=path, resume=True, **options)
-    used = time.perf_counter() - begun
-    assert "time budget" in resumed.plan["stop"] and len(resumed.history) > 3
-    assert resumed.seconds > 1.0 and resumed.seconds - used > 0.05, (
-        "the first part's seconds are in the second's"
-    )
-    assert resumed.history[-1]["seconds"] < 1.6
+    assert "time budget" in resumed.plan["stop"] and len(resumed.history) == 1
+    assert resumed.seconds > 2000
 
 
 def test_resume_begins_anew_without_a_file_and_checkpoint_never_replaces_one(tmp_path):

@@ -103,9 +103,7 @@ def broken(*_, **__):
 STAGES = {
     "none": None,
     "start volume": "tomo_polysplat.fit.problem.Problem.start_volume",
-    "seeds": "tomo_polysplat.fit.problem.Problem.seeds",
     "fit": "tomo_polysplat.fit.scene.FitScene.projections",
-    "loss": "tomo_polysplat.fit.step.misfit",
     "volume": "tomo_polysplat.fit.scene.FitScene.basis",
 }
 

@@ -12,7 +12,7 @@ def test_hostile_input_is_refused_in_words(name, tmp_path):
     target, inputs = TARGETS[name]
     accepted = []
 
-    @settings(max_examples=50, deadline=None, derandomize=True, database=None, suppress_health_check=QUIET)
+    @settings(max_examples=30, deadline=None, derandomize=True, database=None, suppress_health_check=QUIET)
     @given(inputs)
     def run(case):
         accepted.append(target(case, tmp_path))
