@@ -102,7 +102,11 @@ def _slices(
     volumes = [("reconstruction", volume), *([] if truth is None else [("truth", truth)])]
     figure = slices_figure(volumes, result.unit, result.energy_kev, window, planes)
     note = f"All slices are shown from {window[0]:.3g} to {window[1]:.3g} 1/{result.unit}; brighter is white."
-    return ["<h2>Slices</h2>", f'<p class="note">{note}</p>', image(png_bytes(figure), "orthogonal slices")]
+    return [
+        "<h2>Slices</h2>",
+        f'<p class="note">{html.escape(note)}</p>',
+        image(png_bytes(figure), "orthogonal slices"),
+    ]
 
 
 def _errors(
