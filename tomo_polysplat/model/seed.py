@@ -56,9 +56,10 @@ def seed_gaussians(
     attenuation = value * cell / (math.sqrt(2 * math.pi) * width) ** dims
     rotation = points.new_zeros((len(points), 4))
     rotation[:, 0] = 1.0
-    parts = (points, width.log()[:, None].repeat(1, dims), rotation, attenuation, own, shared)
-    blur = rotation.new_tensor([settings.blur])
-    gaussians = Gaussians(*(part.float() for part in parts), group=group, blur=blur.float())
+    log_scale = width.log()[:, None].repeat(1, dims)
+    parts = (points, log_scale, rotation, attenuation, own, shared, rotation.new_tensor([settings.blur]))
+    position, log_scale, rotation, attenuation, own, shared, blur = (part.float() for part in parts)
+    gaussians = Gaussians(position, log_scale, rotation, attenuation, own, shared, group, blur)
     # Neighbours in space beside each other in memory, which the kernels use.
     order = spatial_order(gaussians.position)
     return gaussians.select(order)
