@@ -75,8 +75,11 @@ def work(name: str, inputs: int, seed: int) -> dict:
     from hypothesis import seed as seeded
     from targets import TARGETS
 
+    from tomo_polysplat.physics.materials import mass_attenuation
+
     target, cases = TARGETS[name]
     report = {"inputs": 0, "accepted": 0, "slowest": 0.0, "megabytes": 0.0, "found": {}}
+    mass_attenuation("iron", 60.0)  # loads its tables, which takes seconds once
     before = limit_memory()
 
     with tempfile.TemporaryDirectory() as folder:
