@@ -27,7 +27,7 @@ class Settings:
     """Upper bound of the number of Gaussians; 0 leaves it to the plan."""
     seed_spacing: float = 0.0
     """Distance of the seeds in voxels; 0 leaves it to the plan."""
-    seed_width: float = 0.5
+    seed_width: float = 0.6
     """Standard deviation of a seed in units of the spacing."""
     support_level: float = 0.1
     """Voxels of the start below this share of the soft reference get no Gaussian."""
@@ -51,7 +51,7 @@ class Settings:
     """Per step, relative."""
     learning_rate_rotation: float = 3e-3
     learning_rate_attenuation: float = 1e-2
-    learning_rate_material: float = 1e-2
+    learning_rate_material: float = 3e-3
     learning_rate_shared: float = 5e-3
     """Of each piece of metal's one number."""
     blur: float = 0.1
@@ -74,10 +74,8 @@ class Settings:
     """Weight of the total variation per voxel, in soft references."""
     tv_clip: float = 2.5
     """Attenuation above this many soft references does not count as variation, which would erode metal."""
-    tv_box: int = 32
-    """Edge in voxels of the random box whose total variation is taken."""
-    tv_box_planar: int = 256
-    """The same for a single slice."""
+    tv_box: int = 0
+    """Edge in voxels of the random box whose total variation is taken; 0 leaves it to the plan."""
     relocated: float = 0.03
     """Largest share of the Gaussians that, once a pass, moves from where it holds nothing to where it is wanted."""
     relocate_until: float = 0.5
@@ -86,7 +84,7 @@ class Settings:
     """Share of the rays kept from the fit to tell when it stops improving."""
     patience: int = 4
     """Checks without improvement of the held-out rays that end the run."""
-    metal_tail: float = 0.07
+    metal_tail: float = 0.1
     """A voxel with less than this share of a neighbour's metal holds a tail, which the neighbour gets back."""
     cutoff: float = 3.0
     """Standard deviations at which a projected Gaussian ends."""

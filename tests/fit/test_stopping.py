@@ -14,7 +14,11 @@ from tomo_polysplat.settings import Settings
 def cloud(mark):
     group = torch.zeros(1, dtype=torch.int64)
     return Gaussians(
-        *(torch.zeros(1, n) for n in (3, 3, 4)), torch.full((1,), float(mark)), *torch.zeros(2, 1), group, torch.zeros(1)
+        *(torch.zeros(1, n) for n in (3, 3, 4)),
+        torch.full((1,), float(mark)),
+        *torch.zeros(2, 1),
+        group,
+        torch.zeros(1),
     )
 
 

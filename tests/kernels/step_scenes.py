@@ -17,14 +17,14 @@ BATCH = 2
 CURVES = torch.tensor([[1.0, 2.1, 6.0], [0.8, 1.5, 3.5]])
 
 
-def fit_problem(kind, polychromatic, device, kernel, count=29, **changes):
+def fit_problem(kind, polychromatic, device, kernel, count=17, **changes):
     """Gaussians, spacing, rays, scene, settings and box of a fit that has far to go."""
     views, planar = {
         "cone": (cone_views, False),
         "parallel": (parallel_views, False),
         "fan": (planar_views, True),
     }[kind]
-    views = views(True, 5, 41) if planar else views(5, 11, 21, pixel=(0.2, 0.25))
+    views = views(True, 5, 41) if planar else views(5, 7, 13, pixel=(0.32, 0.4))
     generator = torch.Generator().manual_seed(3)
     values = 1.5 * torch.rand((5, views.rows, views.columns), generator=generator) - 0.1
     values[1, 0, 3:6] = float("nan")
@@ -39,9 +39,9 @@ def fit_problem(kind, polychromatic, device, kernel, count=29, **changes):
             weights, CURVES.T.double().numpy() @ np.ones((2, 3)) * [3.0, 1.0, 0.4], 0, 0, 0, 5
         )
         curves = CURVES.to(device)
-    shape = (1, 9, 11) if planar else (6, 7, 9)
-    box = VoxelBox(np.array([-0.6, -0.5, 0.0 if planar else -0.4]), np.array([0.13, 0.15, 0.17]), shape)
-    scene = FitScene(box, quadrature, 0.7, *curves, kernel, 3.0, 0.0, blurring)
+    shape = (1, 7, 9) if planar else (4, 5, 6)
+    box = VoxelBox(np.array([-0.6, -0.5, 0.0 if planar else -0.4]), np.array([0.2, 0.21, 0.23]), shape)
+    scene = FitScene(box, quadrature, 0.7, *curves, kernel, 3.0, 0.0, blurring, 20)
     return _gaussians(count, planar, device), 0.2, rays, scene, settings, box
 
 

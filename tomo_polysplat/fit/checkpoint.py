@@ -209,8 +209,9 @@ def _content(about: np.ndarray) -> dict[str, Any]:
 
 def _plan(parts: dict[str, Any]) -> Plan:
     plan = Plan(**parts)
-    above_zero = plan.reference > 0 and plan.spacing > 0 and plan.views_per_step > 0
-    if not (above_zero and isinstance(plan.views_per_step, int) and isinstance(plan.reasons, dict)):
+    above_zero = min(plan.reference, plan.spacing, plan.views_per_step, plan.tv_box) > 0
+    whole = isinstance(plan.views_per_step, int) and isinstance(plan.tv_box, int)
+    if not (above_zero and whole and isinstance(plan.reasons, dict)):
         raise TypeError(f"a plan, got {parts}")
     return plan
 

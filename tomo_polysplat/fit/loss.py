@@ -41,10 +41,9 @@ def weighted_huber(
     return value.sum() / weight.sum().clamp(min=1e-12)
 
 
-def random_box(whole: VoxelBox, settings: Settings, rng: np.random.Generator) -> VoxelBox:
-    """A box of ``settings.tv_box`` voxels an edge anywhere in the volume; its shape is always the same."""
-    edges = [settings.tv_box] * 3 if whole.shape[0] > 1 else [1, *[settings.tv_box_planar] * 2]
-    nz, ny, nx = (min(edge, n) for edge, n in zip(edges, whole.shape))
+def random_box(whole: VoxelBox, edge: int, rng: np.random.Generator) -> VoxelBox:
+    """A box of ``edge`` voxels an edge anywhere in the volume; its shape is always the same."""
+    nz, ny, nx = (min(edge, n) for n in whole.shape)
     z, y, x = (int(rng.integers(0, n - m + 1)) for n, m in zip(whole.shape, (nz, ny, nx)))
     return whole.part((z, y, x), (nz, ny, nx))
 

@@ -53,7 +53,7 @@ class _Fitter:
     ) -> None:
         self.gaussians, self.rays, self.scene, self.settings, self.rng = gaussians, rays, scene, settings, rng
         # Its shape is that of every box.
-        box = random_box(scene.box, settings, np.random.default_rng(0))
+        box = random_box(scene.box, scene.tv_box, np.random.default_rng(0))
         self.step = make_step(gaussians, spacing, rays, scene, settings, batch=batch, box=box)
         self.batch, self.order = batch, np.empty(0, int)
         self.relocated = 0
@@ -69,7 +69,7 @@ class _Fitter:
             if self.relocation_due:
                 self._relocate()
             views = self._next_views(self.batch)
-            self.step(views, random_box(self.scene.box, self.settings, self.rng), share)
+            self.step(views, random_box(self.scene.box, self.scene.tv_box, self.rng), share)
             clock.done += 1
             made += 1
             if made == steps:

@@ -148,6 +148,7 @@ class Problem:
             settings.cutoff,
             settings.metal_tail,
             settings.blur > 0 or settings.learning_rate_blur > 0,
+            plan.tv_box,
         )
 
     def _primary(self, device: torch.device) -> torch.Tensor:

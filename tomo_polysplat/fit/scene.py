@@ -40,6 +40,8 @@ class FitScene:
         Share of a neighbour's metal below which a voxel's metal is a tail; see ``render.metal_edges``.
     blurring : bool
         Whether rays are seen through the detector's blur; see ``physics.detector_blur``.
+    tv_box : int
+        Edge in voxels of the random box whose total variation a step takes.
     """
 
     box: VoxelBox
@@ -51,6 +53,7 @@ class FitScene:
     cutoff: float
     metal_tail: float
     blurring: bool
+    tv_box: int
 
     @property
     def polychromatic(self) -> bool:
