@@ -21,7 +21,7 @@ from splat_scenes import (
     run_voxelise,
     voxel_box,
 )
-from step_scenes import compare_steps
+from step_scenes import BATCH, compare_steps, fit_problem
 
 CASES = {}
 
@@ -242,6 +242,17 @@ def a_step_in_two_dimensions(device):
 @case
 def a_step_without_smoothing_held_out_rays_or_blur(device):
     compare_steps(_fused, device, ("cpu", "numba"), tv_weight=0.0, held_out=0.0, blurring=False)
+
+
+@case
+def what_is_not_a_number_shows_in_the_misfit(device):
+    """Hidden, it would spread through the volume and never end the run."""
+    for blurring in (True, False):
+        problem = fit_problem("cone", True, device, "triton", blurring=blurring, held_out=0.0)
+        step = _fused(*problem[:-1], BATCH, problem[-1])
+        problem[0].attenuation[3] = float("nan")
+        step(np.array([0, 3]), problem[-1], 0.0)
+        assert np.isnan(step.read()[0]), blurring
 
 
 def poison() -> None:

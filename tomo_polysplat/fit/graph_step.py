@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import logging
+import threading
 
 import numpy as np
 import torch
@@ -16,10 +16,10 @@ from tomo_polysplat.settings import Settings
 
 __all__ = ["GraphStep"]
 
-logger = logging.getLogger(__name__)
-
 # Steps that the host may be ahead of the device: enough to hide its work, few enough to keep a time budget.
 _AHEAD = 4
+# CUDA graphs of one process can be recorded only one after the other.
+_recording = threading.Lock()
 
 
 class GraphStep(FusedStep):
@@ -55,20 +55,23 @@ class GraphStep(FusedStep):
         self._waiting[turn].numpy()[:] = values
         self._control.copy_(self._waiting[turn], non_blocking=True)
         self._graph.replay()
-        self._passed[turn].record()
+        # On another GPU than the current one, the usual stream would say nothing about this one's work.
+        self._passed[turn].record(torch.cuda.current_stream(self._control.device))
         self.feed.used()
 
     def _record(self, batch: int, box: VoxelBox) -> torch.cuda.CUDAGraph:
         """The graph, after a trial run that compiles the kernels and leaves no trace."""
-        before = self.gaussians.copy()
-        with torch.no_grad(), torch.cuda.device(self.gaussians.position.device):
+        before, device = self.gaussians.copy(), self.gaussians.position.device
+        with torch.no_grad(), torch.cuda.device(device):
             try:
                 super().__call__(np.arange(batch), box, 0.0)
                 torch.cuda.synchronize()
             finally:
                 self._forget(before)
             graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+            # Torch's own stream for it belongs to whichever GPU came first in the process.
+            stream = torch.cuda.Stream(device)
+            with _recording, torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
                 self._enqueue()
         return graph
 

@@ -87,7 +87,8 @@ def _blurred_kernel(
             light = tl.exp(brightest - beside)
             passed += along_v * along_u * light
             by_variance += (slope_v * along_u + along_v * slope_u) * light
-    kept = passed > _TINY
+    # What is not a number stays so: it ends the run.
+    kept = ~(passed <= _TINY)
     passed = tl.where(kept, passed, _TINY)
     predicted = brightest - tl.log(passed)
     slope = ray_misfit(
