@@ -12,7 +12,7 @@ from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.detector_blur import blurred
 from tomo_polysplat.physics.quadrature import Quadrature
 from tomo_polysplat.physics.transmission import polychromatic_projection
-from tomo_polysplat.render.metal_edges import without_tails
+from tomo_polysplat.render.metal_edges import tail_factors
 from tomo_polysplat.render.renderer import project_gaussians, voxelise_gaussians, voxelise_means
 
 __all__ = ["FitScene"]
@@ -87,7 +87,14 @@ class FitScene:
         for chosen in (~metal, metal):
             index = chosen.nonzero()[:, 0]
             parts.append(voxelise_means(gaussians.select(index), weights[:, index], self.box, self.kernel))
-        return parts[0] + without_tails(parts[1], self.metal_tail)
+        rest, inside = parts
+        return rest + inside * tail_factors(self._seen(inside), self._seen(rest), self.metal_tail)
+
+    def _seen(self, densities: torch.Tensor) -> torch.Tensor:
+        """(nz, ny, nx) attenuation at the effective energy, of (channels, nz, ny, nx) densities or of itself."""
+        if len(densities) == 1 or self.output_curve is None:
+            return densities[0]
+        return torch.einsum("k,kzyx->zyx", self.output_curve, densities)
 
     def _output_weights(self, gaussians: Gaussians) -> torch.Tensor:
         weights = gaussians.weights(self.reference_curve)
