@@ -163,7 +163,11 @@ REFUSED = {
     "half a view": (lambda s: {"settings": {"views_per_step": 0.5}}, ValueError, "whole number"),
     "endless": (lambda s: {"settings": {"passes": np.inf}}, ValueError, r"settings\['passes'\]: .*finite"),
     "all held out": (lambda s: {"settings": {"held_out": 1.0}}, ValueError, r"settings\['held_out'\]"),
-    "unknown kernel": (lambda s: {"settings": {"kernel": "magic"}}, ValueError, r"kernel'\]: expected one of auto"),
+    "unknown kernel": (
+        lambda s: {"settings": {"kernel": "magic"}},
+        ValueError,
+        r"kernel'\]: expected one of auto",
+    ),
     "unknown device": (lambda s: {"device": "abacus"}, ValueError, "device: expected auto, cpu, cuda"),
     "other device": (lambda s: {"device": "meta"}, ValueError, "device: expected auto, cpu, cuda"),
     "absent device": (lambda s: {"device": "cuda:99"}, ValueError, "device: .*'cuda:99'"),
