@@ -5,6 +5,7 @@ The kernels themselves are compared with autograd in tests/kernels, in Triton's 
 
 import logging
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +37,14 @@ def test_the_cpu_steps_through_autograd():
     step = make_step(*problem[:-1], batch=BATCH, box=problem[-1])
     assert isinstance(step, EagerStep)
     assert "numba" in why_eager(problem[3], problem[4])
+
+
+def test_no_material_number_falls_below_what_the_curves_allow():
+    gaussians, *problem, box = fit_problem("cone", True, "cpu", "numba")
+    gaussians.own_material.fill_(-0.1)
+    problem[2] = replace(problem[2], least_u=-0.03)
+    EagerStep(gaussians, *problem)(np.array([0, 1]), box, 0.9)
+    assert float(gaussians.own_material.detach().min()) == pytest.approx(-0.03)
 
 
 def test_the_memory_of_a_step_can_be_put_back():

@@ -10,7 +10,7 @@ from typing import Any
 from tomo_polysplat.bench.environment import environment
 from tomo_polysplat.bench.scenes import cached_scan
 from tomo_polysplat.files import replacing
-from tomo_polysplat.fit.step import LEAST_U
+from tomo_polysplat.physics.material_range import LEAST_U
 from tomo_polysplat.physics.materials import MaterialLike, Materials
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.stand_in import StandIn, best_stand_in

@@ -14,7 +14,7 @@ import torch
 from tomo_polysplat.fit.feed import feed
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.fit.step import EPSILON, LEAST_U, held_out_mean, log_scale_bounds, new_moments, step_rates
+from tomo_polysplat.fit.step import EPSILON, held_out_mean, log_scale_bounds, new_moments, step_rates
 from tomo_polysplat.kernels.project import triton_backward as rays_backward
 from tomo_polysplat.kernels.project import triton_forward as rays_forward
 from tomo_polysplat.kernels.project.triton_pull_back import pull_back as rays_pull_back
@@ -75,7 +75,7 @@ class FusedStep:
         rates = step_rates(settings, spacing)
         self._rates = torch.tensor([rates[k] for k in parameters], dtype=torch.float32, device=device)
         bounds = log_scale_bounds(scene, spacing, gaussians.planar, settings)
-        self._bounds = Bounds(bounds, (LEAST_U, 1.0), LARGEST_BLUR, EPSILON)
+        self._bounds = Bounds(bounds, (scene.least_u, 1.0), LARGEST_BLUR, EPSILON)
         self._views, self._table = rays.views.select(np.arange(batch)), rays.views.host_table()
         self._sums = torch.zeros(3, dtype=torch.float64, device=device)
         self._skipped = torch.zeros((), dtype=torch.int64, device=device)

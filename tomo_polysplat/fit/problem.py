@@ -23,6 +23,7 @@ from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.kernels import select
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.model.seed import seed_gaussians
+from tomo_polysplat.physics.material_range import LEAST_U, least_material_number
 from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.quadrature import Quadrature, fit_quadrature
 from tomo_polysplat.physics.scatter import add_scatter, without_scatter
@@ -137,13 +138,14 @@ class Problem:
         """The forward model."""
         kernel, why = select.choose(device, settings.kernel)
         plan.reasons["kernel"] = f"{kernel}: {why}"
-        quadrature, reference_curve, output_curve = self._physics(plan, settings, device)
+        quadrature, reference_curve, output_curve, least_u = self._physics(plan, settings, device)
         return FitScene(
             voxel_box(self.grid),
             quadrature,
             self.depth * plan.reference,
             reference_curve,
             output_curve,
+            least_u,
             kernel,
             settings.cutoff,
             settings.metal_tail,
@@ -160,22 +162,23 @@ class Problem:
 
     def _physics(
         self, plan: Plan, settings: Settings, device: torch.device
-    ) -> tuple[Quadrature | None, torch.Tensor | None, torch.Tensor | None]:
-        """Nodes of the spectrum, and the curves at the Gaussians' energy and at the volume's."""
+    ) -> tuple[Quadrature | None, torch.Tensor | None, torch.Tensor | None, float]:
+        """Nodes of the spectrum, the curves at the Gaussians' energy and at the volume's, and the least u."""
         spectrum, materials = self.spectrum, self.materials
         if spectrum is None or materials is None:
-            return None, None, None
+            return None, None, None, LEAST_U
         primary = self._primary(device)
         most = float(primary.nan_to_num(nan=-math.inf).max())
         largest = min(max(most, 1.0), _LARGEST_PROJECTION)
         nodes = settings.spectral_nodes or None
         quadrature = fit_quadrature(spectrum, materials, max_path=largest, nodes=nodes)
+        least_u = least_material_number(materials, spectrum, quadrature.attenuation)
         quadrature = add_scatter(quadrature, self.scatter)
         energy = transmitted_energy(primary, spectrum)
         plan.reasons["spectrum"] = quadrature.describe()
         plan.reasons["reference_energy"] = f"{energy:.1f} keV: the mean of what a typical ray transmits"
         output = _relative(materials, spectrum.effective_energy, device)
-        return quadrature, _relative(materials, energy, device), output
+        return quadrature, _relative(materials, energy, device), output, least_u
 
     def seeds(
         self, start: np.ndarray | torch.Tensor, plan: Plan, settings: Settings, device: torch.device

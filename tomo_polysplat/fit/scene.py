@@ -34,6 +34,8 @@ class FitScene:
     reference_curve, output_curve : (3,) tensor or None
         Mass attenuation of the curves over that of the first, at the reference energy of the Gaussians and at
         the energy of the volume; None for a monochromatic model.
+    least_u : float
+        Least material number; see ``physics.material_range``.
     kernel : str
     cutoff : float
     metal_tail : float
@@ -49,6 +51,7 @@ class FitScene:
     areal_scale: float
     reference_curve: torch.Tensor | None
     output_curve: torch.Tensor | None
+    least_u: float
     kernel: str
     cutoff: float
     metal_tail: float

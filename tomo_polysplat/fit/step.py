@@ -19,7 +19,6 @@ from tomo_polysplat.settings import Settings
 
 __all__ = [
     "EPSILON",
-    "LEAST_U",
     "EagerStep",
     "Moments",
     "Step",
@@ -29,8 +28,6 @@ __all__ = [
     "step_rates",
 ]
 
-# Fat and plastics harden a beam less than water does: their curve is the mixture's continued a little below 0.
-LEAST_U = -0.1
 # Of Adam, so small that gradients of any unit give the same steps.
 EPSILON = 1e-15
 # Fewer held-out rays in a pass, counted by weight, go up and down by chance.
@@ -161,8 +158,8 @@ class EagerStep:
     @torch.no_grad()
     def _bound(self) -> None:
         self.gaussians.attenuation.clamp_(min=0.0)
-        self.gaussians.own_material.clamp_(LEAST_U, 1.0)
-        self.gaussians.shared_material.clamp_(LEAST_U, 1.0)
+        self.gaussians.own_material.clamp_(self.scene.least_u, 1.0)
+        self.gaussians.shared_material.clamp_(self.scene.least_u, 1.0)
         self.gaussians.blur.clamp_(0.0, LARGEST_BLUR)
         self.gaussians.log_scale.clamp_(*self.bounds)
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tomo_polysplat.physics.beer_lambert import projection
+from tomo_polysplat.physics.material_range import LEAST_U
 from tomo_polysplat.physics.materials import MaterialLike, Materials, mass_attenuation
 from tomo_polysplat.physics.spectrum import Spectrum
 
@@ -45,7 +46,7 @@ def best_stand_in(
     materials: Materials | None = None,
     *,
     largest: float = 5.0,
-    bounds: tuple[float, float] = (-0.1, 1.0),
+    bounds: tuple[float, float] = (LEAST_U, 1.0),
 ) -> StandIn:
     """The mixture that a fit would put in the place of a material.
 
