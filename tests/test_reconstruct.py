@@ -70,6 +70,7 @@ def test_attenuation_at_the_effective_energy_is_the_volume(metal_result):
 def test_the_plan_and_the_counts_say_what_was_done(metal_result, metal_scan):
     decisions = {"model", "dimensions", "soft_reference", "support", "seed_spacing_voxels", "views_per_step"}
     decisions |= {"start", "kernel", "spectrum", "reference_energy", "gaussians", "photons_per_ray", "stop"}
+    decisions |= {"detector_blur"}
     assert decisions <= set(metal_result.plan)
     for decision, words in metal_result.plan.items():
         assert len(words.split()) >= 3, f"{decision}: {words!r} gives no reason"

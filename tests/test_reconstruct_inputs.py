@@ -217,3 +217,12 @@ def test_materials_are_a_choice(expected):
     titanium = reconstruct(fan(), materials=tps.Materials(dense="titanium"))
     assert relative(titanium.volume, expected.volume) > 1e-3
     assert "titanium" in str(titanium.materials)
+
+
+def test_the_blur_that_was_used_is_told(expected):
+    assert "fitted" in expected.plan["detector_blur"]
+    held = reconstruct(fan(), settings=QUICK | {"blur": 0.2, "learning_rate_blur": 0.0})
+    assert "0.200" in held.plan["detector_blur"] and "held" in held.plan["detector_blur"]
+    thin = reconstruct(fan(), settings=QUICK | {"blur": 0.0, "learning_rate_blur": 0.0})
+    assert "infinitely thin" in thin.plan["detector_blur"]
+    assert relative(held.volume, thin.volume) > 1e-3

@@ -23,16 +23,13 @@ from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.interrupts import postponed_interrupts
 from tomo_polysplat.kernels.device import one_torch_thread, pick_device, usual_modes
 from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.physics.detector_blur import describe_blur
 from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.water_correction import describe_polynomial
 from tomo_polysplat.progress import progress_reports
 from tomo_polysplat.result.result import Result
-from tomo_polysplat.scan.geometry import (
-    VolumeGrid,
-    from_astra,
-    is_planar_geometry,
-)
+from tomo_polysplat.scan.geometry import VolumeGrid, from_astra, is_planar_geometry
 from tomo_polysplat.scan.usable import uncorrected, usable_rays
 from tomo_polysplat.settings import Settings, make_settings
 
@@ -166,6 +163,8 @@ def reconstruct(
         )
         with postponed_interrupts("the volume") as interruption:
             report(1.0, "volume")
+            fitted = chosen.learning_rate_blur > 0
+            plan.reasons["detector_blur"] = describe_blur(outcome.gaussians.blur, fitted=fitted)
             about = {
                 "unit": unit,
                 "spectrum": problem.spectrum or spectrum,

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import torch
 
-__all__ = ["LARGEST_BLUR", "blurred"]
+__all__ = ["LARGEST_BLUR", "blurred", "describe_blur"]
 
 # Three taps make no wider blur without a dip in their middle.
 LARGEST_BLUR = 0.6
@@ -47,3 +47,11 @@ def blurred(projections: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
             passed = (weights * torch.exp(brightest - taps)).sum(dim=0)
             projections = brightest - torch.log(passed.clamp(min=torch.finfo(passed.dtype).tiny))
     return projections
+
+
+def describe_blur(variance: torch.Tensor, *, fitted: bool) -> str:
+    """What a reconstruction took for the blur, in words; the ``variance``, (1,), in squared pixels."""
+    value = float(variance)
+    if not (fitted or value):
+        return "none: rays are infinitely thin"
+    return f"variance of {value:.3f} squared pixels, {'fitted' if fitted else 'held as asked for'}"
