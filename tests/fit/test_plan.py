@@ -157,3 +157,17 @@ def test_few_voxels_get_more_seeds_than_voxels(planar):
         chosen = plan(of, ball(of, 1))
         assert chosen.spacing == pytest.approx(spacing)
         assert ("few voxels" in chosen.reasons["seed_spacing_voxels"]) == (pixel < 1)
+
+
+@pytest.mark.parametrize(("edge", "words"), [(0, "all of the volume: what"), (5, "a box of 5 voxels")])
+def test_what_is_smoothed_is_told(edge, words):
+    of = problem(size=12)
+    assert words in plan(of, ball(of, WATER), tv_box=edge).reasons["smoothed_box"]
+
+
+@pytest.mark.parametrize(("passes", "views"), [(1.0, 1), (90.0, 4), (10_000.0, 8)])
+def test_views_of_a_step_leave_enough_steps(passes, views):
+    """20 views: 450 steps would take 20, 1800 and 200 000 views in all."""
+    of = problem()
+    made = plan(of, ball(of, WATER), passes=passes)
+    assert made.views_per_step == views and f"{views} of 20" in made.reasons["views_per_step"]

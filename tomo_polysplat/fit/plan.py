@@ -91,7 +91,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
         f" hold more than {settings.support_level:g} soft references",
         "seed_spacing_voxels": f"{spacing:.2f}: {because}",
         "views_per_step": f"{views} of {problem.geometry.views}: {reason}",
-        "smoothed_box": f"{box} voxels an edge: {'asked for' if settings.tv_box else 'what a step has time for'}",
+        "smoothed_box": _smoothed(box, start, settings),
     }
     return plan
 
@@ -151,9 +151,17 @@ def _finest_spacing(problem: Problem) -> tuple[float, str]:
     return 1.3, "1.3 voxels"
 
 
+def _smoothed(box: int, start: np.ndarray | torch.Tensor, settings: Settings) -> str:
+    whole = box >= max(start.shape)
+    where = "all of the volume" if whole else f"a box of {box} voxels an edge, elsewhere in each step"
+    return f"{where}: {'asked for' if settings.tv_box else 'what a step has time for'}"
+
+
 def _views_per_step(views: int, settings: Settings) -> tuple[int, str]:
     """As many as leave enough steps."""
     if settings.views_per_step:
         return min(views, settings.views_per_step), "asked for"
     steps = settings.passes * views / _STEPS
-    return max(1, min(views, _MOST_VIEWS, round(steps))), f"about {_STEPS} steps, or {_MOST_VIEWS} views"
+    return max(
+        1, min(views, _MOST_VIEWS, round(steps))
+    ), f"for {_STEPS} steps, with 1 to {_MOST_VIEWS} views each"
