@@ -28,10 +28,10 @@ logger = logging.getLogger(__name__)
 # in a handful of Gaussians would leave its mass wrong.
 _FEWEST_SEEDS = 12
 # Fewer steps than this leave edges blurred; more of one view each are noisier than fewer of several.
-_STEPS, _MOST_VIEWS = 450, 8
+_STEPS, _MOST_VIEWS = 300, 8
 # Voxels along an edge of the box that is smoothed. What a box seldom meets is smoothed by leaps, which upset the
 # optimiser's sense of scale (teeth, 128^3 voxels: 39.1, 39.7 and 40.2 dB with 32, 64 and 128).
-_TV_BOX, _TV_BOX_PLANAR = {"cpu": 64, "cuda": 128}, 256
+_TV_BOX, _TV_BOX_PLANAR = {"cpu": 48, "cuda": 128}, 256
 # Gaussians that a laptop and a GPU fit in a time people wait for.
 _MOST_GAUSSIANS = {"cpu": 60_000, "cuda": 300_000}
 
