@@ -162,6 +162,14 @@ REFUSED = {
     "passes in words": (lambda s: {"settings": {"passes": "ten"}}, TypeError, r"settings\['passes'\]"),
     "half a view": (lambda s: {"settings": {"views_per_step": 0.5}}, ValueError, "whole number"),
     "endless": (lambda s: {"settings": {"passes": np.inf}}, ValueError, r"settings\['passes'\]: .*finite"),
+    "seeds without a width": (
+        lambda s: {"settings": {"seed_width": 0}},
+        ValueError,
+        r"settings\['seed_width'\]",
+    ),
+    "a perfect model": (lambda s: {"settings": {"model_error": 0}}, ValueError, r"settings\['model_error'\]"),
+    "a blur with a dip": (lambda s: {"settings": {"blur": 1.0}}, ValueError, r"settings\['blur'\]: .*0.6"),
+    "denser than dense": (lambda s: {"settings": {"metal_u": 1.5}}, ValueError, r"settings\['metal_u'\]"),
     "all held out": (lambda s: {"settings": {"held_out": 1.0}}, ValueError, r"settings\['held_out'\]"),
     "unknown kernel": (
         lambda s: {"settings": {"kernel": "magic"}},

@@ -10,6 +10,15 @@ from tomo_polysplat.checks import fail, require_choice, require_number
 
 __all__ = ["PRESETS", "Settings", "make_settings"]
 
+# Of those that are not any number from 0 on. Material numbers reach a little below the first curve.
+_RANGES: dict[str, dict[str, Any]] = {
+    **dict.fromkeys(("soft_u", "bone_u", "metal_u"), {"at_least": -0.1, "at_most": 1.0}),
+    **dict.fromkeys(("seed_width", "smallest_scale", "largest_scale", "cutoff"), {"above": 0.0}),
+    **dict.fromkeys(("model_error", "huber_corner", "final_rate"), {"above": 0.0}),
+    "blur": {"at_least": 0.0, "at_most": 0.6},
+    "held_out": {"at_least": 0.0, "at_most": 0.5},
+}
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -100,14 +109,12 @@ class Settings:
             name, value = f"settings[{field.name!r}]", getattr(self, field.name)
             if isinstance(field.default, str):
                 continue
-            # Material numbers reach a little below the first curve.
-            number = require_number(name, value, at_least=-1.0 if field.name.endswith("_u") else 0.0)
+            number = require_number(name, value, **_RANGES.get(field.name, {"at_least": 0.0}))
             if isinstance(field.default, int):
                 if number != int(number):
                     raise fail(name, "a whole number", repr(value))
                 number = int(number)
             object.__setattr__(self, field.name, number)
-        require_number("settings['held_out']", self.held_out, at_most=0.5)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values by name."""

@@ -62,6 +62,16 @@ def test_a_hair_is_no_improvement_but_still_the_best():
     assert answers[-1] and best(watch) == 3
 
 
+def test_gaussians_that_are_no_numbers_are_never_kept_however_good_the_misfit():
+    watch, bad = Watch(Settings()), cloud(1)
+    assert judge(watch, [1.0]) == [""]
+    bad.rotation[0, 2] = math.nan
+    state = FitState(0.0, 0, 1, 0.5, 0.5, 0.5, lambda: None)
+    assert "finite" in watch.judge(state, bad) and watch.best.finite()
+    with pytest.raises(FloatingPointError):
+        Watch(Settings()).judge(state, bad)
+
+
 def test_patience_starts_again_with_every_improvement():
     watch = Watch(Settings(patience=2))
     assert not any(judge(watch, [1.0, 1.1, 0.9, 1.0, 0.8, 0.9, 0.7]))

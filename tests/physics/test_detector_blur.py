@@ -6,6 +6,7 @@ import torch
 from scipy import ndimage
 
 from tomo_polysplat.physics.detector_blur import LARGEST_BLUR, blurred
+from tomo_polysplat.settings import Settings
 
 
 def image(views=2, rows=7, columns=9, largest=3.0):
@@ -51,6 +52,12 @@ def test_opaque_rays_stay_finite():
     seen.sum().backward()
     assert all(bool(torch.isfinite(t).all()) for t in (seen, step.grad, variance.grad))
     assert float(seen[0, 0, -1].detach()) == 500
+
+
+def test_a_setting_starts_from_any_blur_that_is_fitted():
+    assert Settings(blur=LARGEST_BLUR).blur == LARGEST_BLUR
+    with pytest.raises(ValueError, match="blur"):
+        Settings(blur=1.001 * LARGEST_BLUR)
 
 
 @pytest.mark.parametrize("variance", [0.05, LARGEST_BLUR])

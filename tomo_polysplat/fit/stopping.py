@@ -88,12 +88,12 @@ class Watch:
 
     def judge(self, state: FitState, gaussians: Gaussians) -> str:
         """The reason to stop, or nothing."""
-        if not math.isfinite(state.loss):
+        if not (math.isfinite(state.loss) and gaussians.finite()):
             if self.best is None:
                 raise FloatingPointError(
                     "the fit diverged in its first pass; see the log for rays out of range"
                 )
-            return "the misfit stopped being finite"
+            return "the fit stopped being finite"
         held_out = math.isfinite(state.held_out)
         score = state.held_out if held_out else state.loss
         self.waited = 0 if score < (1 - _IMPROVEMENT) * self.lowest else self.waited + 1

@@ -58,6 +58,10 @@ class Gaussians:
         """What is fitted, by name."""
         return {field.name: getattr(self, field.name) for field in fields(self) if field.name != "group"}
 
+    def finite(self) -> bool:
+        """Whether every parameter is a finite number: some that are not show in no ray."""
+        return all(bool(torch.isfinite(tensor).all()) for tensor in self.parameters().values())
+
     def copy(self) -> Gaussians:
         """Detached copies of everything."""
         return self.to(self.position.device)
