@@ -77,6 +77,24 @@ def test_a_known_density_brings_the_voltage_back():
     assert result.energy_kev == result.spectrum.effective_energy > wrong.effective_energy
 
 
+@pytest.mark.parametrize("kvp, density, factors", [(210, 3.0, (1.0, 225 / 210)), (33, 0.3, (30 / 33, 1.0))])
+def test_a_voltage_stays_within_the_tables(kvp, density, factors):
+    """A density that no voltage explains asks for one beyond their end."""
+    scan, tube = fan(0.0), tps.Spectrum.from_tube(kvp, filters={"Al": 0.05})
+    result = reconstruct(scan, spectrum=tube, valid=scan.valid, calibrate="kvp", soft_density=density)
+    trials = result.plan["calibration"]["trials"]
+    assert len(trials) > 1
+    assert all(factors[0] <= trial.get("kvp", 1.0) <= factors[1] for trial in trials)
+
+
+def test_an_empty_scan_tells_nothing_about_the_tube():
+    scan = fan(0.0)
+    empty = np.zeros_like(scan.projections)
+    result = reconstruct(scan, empty, calibrate="kvp", soft_density=1.0)
+    assert result.plan["calibration"]["accepted"] == {"kvp": False}
+    assert not result.volume.any()
+
+
 def test_the_main_matter_is_where_voxels_crowd():
     rng = np.random.default_rng(1)
     density = np.concatenate([rng.normal(1.05, 0.02, 5001), rng.uniform(0, 1.5, 2001), np.full(33, 7.9)])

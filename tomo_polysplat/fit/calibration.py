@@ -22,6 +22,7 @@ from tomo_polysplat.fit.short_fit import ShortFit, short_fit
 from tomo_polysplat.physics.ray_estimates import estimate_scatter, matching_factor
 from tomo_polysplat.physics.spectral_change import tube_voltage, with_filtration, with_voltage
 from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.physics.tube_tables import voltage_range
 from tomo_polysplat.settings import Settings
 
 __all__ = ["Calibration", "calibrated", "with_fitted"]
@@ -186,13 +187,24 @@ def _estimate(name: str, old: float, last: ShortFit, wanted: Calibration, proble
         rays = (last.areal, last.measured, last.weight)
         return estimate_scatter(*rays, physics.spectrum, physics.materials, old)
     assert wanted.soft_density is not None
-    ratio = wanted.soft_density / last.soft_density
+    ratio = wanted.soft_density / last.soft_density if last.soft_density > 0 else 1.0
     if abs(ratio - 1.0) < _LEAST_CHANGE:
         return old
-    low, high = _BOUNDS[name]
+    low, high = _bounds(name, problem)
     longest, bounds = float(np.quantile(last.areal[0], 0.95)), (low / old, high / old)
     change, soft = _CHANGES[name], physics.materials.soft
     return old * matching_factor(change, physics.spectrum, soft, longest, ratio, bounds)
+
+
+def _bounds(name: str, problem: Problem) -> tuple[float, float]:
+    """Range of a factor of the assumed spectrum; voltages end where the tables of tubes do."""
+    low, high = _BOUNDS[name]
+    if name != "kvp":
+        return low, high
+    assert problem.spectrum is not None
+    # A hair inside: dividing and multiplying by a factor rounds.
+    first, last = (end / tube_voltage(problem.spectrum) for end in voltage_range("W"))
+    return max(low, first * (1 + 1e-9)), min(high, last * (1 - 1e-9))
 
 
 def _last(name: str, stage: Sequence[ShortFit]) -> ShortFit:
