@@ -140,7 +140,7 @@ def test_check_describes_a_scan(scan_file, capsys):
     ("options", "message"),
     [
         (["-o", "x.foo"], "--output: expected a name ending in"),
-        (["-o", "scan.h5"], "overwrite=True"),
+        (["-o", "scan.h5"], "pass --overwrite"),
         (["-o", "nowhere/x.h5"], "existing folder"),
         (["-o", "x.h5", "--filter", "Al:0.1"], "--filter: expected --kvp"),
         (["-o", "x.h5", "--kvp", "90", "--filter", "Al"], "--filter: expected MATERIAL:CM"),

@@ -170,7 +170,7 @@ def test_the_command_resumes(scan_file, tmp_path, capsys):
     kept, outputs = str(tmp_path / "fit.npz"), [str(tmp_path / f"{name}.npy") for name in "ab"]
     command = ["recon", str(scan_file), "--set", "passes=2", "--checkpoint", kept, "-o"]
     assert main([*command, outputs[0]]) == 0
-    assert main([*command, outputs[1]]) == 2 and "resume=True" in capsys.readouterr().err
+    assert main([*command, outputs[1]]) == 2 and "pass --resume" in capsys.readouterr().err
     assert main([*command, outputs[1], "--resume"]) == 0
     assert np.array_equal(*map(np.load, outputs))
     assert main([*command, outputs[1], "--overwrite", "--resume", "--seed", "3"]) == 2

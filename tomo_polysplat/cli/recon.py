@@ -134,10 +134,13 @@ def _require_outputs(arguments: argparse.Namespace) -> None:
         raise fail("--resume", "--checkpoint with it", "none")
     for path in (arguments.output, arguments.report, arguments.json):
         if path is not None:
-            require_replaceable(Path(path), arguments.overwrite)
+            require_replaceable(Path(path), arguments.overwrite, "pass --overwrite")
             require_writable(Path(path).parent)
+    if arguments.checkpoint is not None:
+        remedy = "pass --resume to go on from it, or remove it"
+        require_replaceable(Path(arguments.checkpoint), arguments.resume, remedy)
     if arguments.tiff is not None:
-        require_slices_folder(arguments.tiff, overwrite=arguments.overwrite)
+        require_slices_folder(arguments.tiff, overwrite=arguments.overwrite, remedy="pass --overwrite")
     named = ("scan", "output", "report", "json", "tiff", "checkpoint")
     files = [Path(path).resolve() for name in named if (path := getattr(arguments, name)) is not None]
     if len(set(files)) < len(files):

@@ -163,7 +163,9 @@ def save_npy(result: Result, path: str | os.PathLike, *, overwrite: bool = False
         np.save(file, volume, allow_pickle=False)
 
 
-def require_slices_folder(folder: str | os.PathLike, *, overwrite: bool) -> list[Path]:
+def require_slices_folder(
+    folder: str | os.PathLike, *, overwrite: bool, remedy: str = "pass overwrite=True"
+) -> list[Path]:
     """The slices in a folder; refused are slices that must stay, and folders that cannot be written to."""
     target = Path(folder)
     if target.exists() and not target.is_dir():
@@ -174,7 +176,7 @@ def require_slices_folder(folder: str | os.PathLike, *, overwrite: bool) -> list
             "folder",
             "one without slices",
             f"{len(present)} in {target}",
-            "pass overwrite=True",
+            remedy,
             FileExistsError,
         )
     require_writable(existing_parent(target))
