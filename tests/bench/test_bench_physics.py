@@ -28,10 +28,16 @@ def test_one_case_of_the_spectrum(tmp_path):
     json.dumps(record)
 
 
-@pytest.mark.parametrize("wrong", [{"scenes": ("kidney",)}, {"cases": ("kVp x 3",)}])
+@pytest.mark.parametrize("wrong", [{"scenes": ("kidney",)}, {"cases": ("kVp x 3",)}, {"quality": "good"}])
 def test_unknown_names_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         spectrum.SpectrumBench(**wrong)
+
+
+@pytest.mark.parametrize("wrong", [{"largest": -1.0}, {"size": -1}, {"kvp": 5.0}, {"aluminium_cm": -0.1}])
+def test_numbers_out_of_range_are_refused(wrong):
+    with pytest.raises(ValueError):
+        materials.MaterialsBench(**wrong)
 
 
 def test_every_material_is_known():

@@ -9,6 +9,7 @@ from typing import Any
 
 from tomo_polysplat.bench.environment import environment
 from tomo_polysplat.bench.scenes import cached_scan
+from tomo_polysplat.checks import require_number
 from tomo_polysplat.files import replacing
 from tomo_polysplat.physics.material_range import LEAST_U
 from tomo_polysplat.physics.materials import MaterialLike, Materials
@@ -80,6 +81,11 @@ class MaterialsBench:
     size: int = 32
     views: int = 90
     device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        require_number("largest", self.largest, above=0.0)
+        require_number("size", self.size, at_least=0)
+        _ = self.spectrum  # checks its numbers
 
     @property
     def spectrum(self) -> Spectrum:

@@ -21,6 +21,7 @@ from tomo_polysplat.reconstruction import reconstruct
 from tomo_polysplat.report.style import ACCENT, QUIET
 from tomo_polysplat.result.metrics import compare
 from tomo_polysplat.scan.scan import Scan
+from tomo_polysplat.settings import PRESETS
 from tomo_polysplat.simulate.scenes import SCENES
 from tomo_polysplat.units import cm_per
 
@@ -89,6 +90,7 @@ class SpectrumBench:
             require_choice("scenes", name, SCENES)
         for name in self.cases:
             require_choice("cases", name, CASES)
+        require_choice("quality", self.quality, PRESETS)
 
 
 def run_spectrum_bench(
