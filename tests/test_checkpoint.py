@@ -172,6 +172,7 @@ def with_numbers(path, **changes):
         lambda path: rewritten(path, about=with_numbers(path, steps=-1)),
         lambda path: rewritten(path, about=with_numbers(path, random={"bit_generator": "MT19937"})),
         lambda path: rewritten(path, about=with_numbers(path, seconds=float("nan"))),
+        lambda path: rewritten(path, about=with_numbers(path, largest=["much", 1.0])),
     ],
 )
 def test_a_damaged_file_is_refused(tmp_path, damage):

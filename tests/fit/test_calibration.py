@@ -4,10 +4,12 @@ from functools import cache
 
 import numpy as np
 import pytest
-from small_scans import reconstruct
+import torch
+from small_scans import geometries, reconstruct
 
 import tomo_polysplat as tps
-from tomo_polysplat.fit.calibration import Calibration
+from tomo_polysplat.fit.calibration import Calibration, with_fitted
+from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.short_fit import main_density
 
 # Enough steps for the density of the main matter to settle.
@@ -93,6 +95,16 @@ def test_an_empty_scan_tells_nothing_about_the_tube():
     result = reconstruct(scan, empty, calibrate="kvp", soft_density=1.0)
     assert result.plan["calibration"]["accepted"] == {"kvp": False}
     assert not result.volume.any()
+
+
+def test_other_physics_are_those_of_the_same_measurements():
+    scan = fan(0.0)
+    problem = Problem.of(scan.projections.swapaxes(0, 1), *geometries(scan), "cm", SPECTRUM, None)
+    other, device = with_fitted(problem, {"scatter": 0.01, "filter": 2.0}), torch.device("cpu")
+    assert other.scatter == 0.01 and other.spectrum.effective_energy > SPECTRUM.effective_energy
+    assert problem.scatter == 0 and problem.spectrum is SPECTRUM
+    # On a GPU they would be copied there once for every short fit.
+    assert other.measured(device) is problem.measured(device)
 
 
 def test_the_main_matter_is_where_voxels_crowd():

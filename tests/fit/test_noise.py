@@ -43,10 +43,11 @@ def test_an_order_of_magnitude_in_exposure_is_an_order_of_magnitude_found():
     [
         np.zeros((30, 4, 64), np.float32),
         np.full((30, 4, 64), 1.5, np.float32),
+        np.full((30, 4, 64), 740.0, np.float32),
         np.broadcast_to(np.arange(64, dtype=np.float32) / 64, (30, 4, 64)),
         np.where(np.arange(64) % 32 < 16, 0.0, 1.0).astype(np.float32) * np.ones((30, 4, 1), np.float32),
     ],
-    ids=["air", "flat", "ramp", "blocks"],
+    ids=["air", "flat", "opaque", "ramp", "blocks"],
 )
 def test_noiseless_data_have_infinitely_many_photons(projections):
     assert photons_per_ray(projections) == np.inf

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -102,7 +102,7 @@ def with_fitted(problem: Problem, fitted: Mapping[str, float]) -> Problem:
     for name, change in _CHANGES.items():
         if fitted.get(name, 1.0) != 1.0:
             spectrum = change(spectrum, fitted[name])
-    return replace(problem, spectrum=spectrum, scatter=float(fitted.get("scatter", 0.0)))
+    return problem.under(spectrum, float(fitted.get("scatter", 0.0)))
 
 
 def calibrated(

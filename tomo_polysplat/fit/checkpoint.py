@@ -241,6 +241,9 @@ def _require_numbers(numbers: dict[str, Any]) -> None:
         numbers["lowest"]
     ):
         raise TypeError("finite times")
+    largest = numbers["largest"]
+    if not isinstance(largest, list) or len(largest) not in (0, 2) or not all(map(math.isfinite, largest)):
+        raise TypeError("the largest sums")
     if not isinstance(numbers["history"], list) or not isinstance(numbers["reason"], str):
         raise TypeError("a history and a reason")
     try:

@@ -11,6 +11,7 @@ __all__ = ["photons_per_ray"]
 
 _VIEWS = 24
 _BINS = 16
+_LARGEST_EXPONENT = 700.0
 
 
 def photons_per_ray(projections: np.ndarray | torch.Tensor) -> float:
@@ -46,7 +47,9 @@ def photons_per_ray(projections: np.ndarray | torch.Tensor) -> float:
     rates = []
     for values, differences in zip(middle.tensor_split(_BINS), difference[order].tensor_split(_BINS)):
         deviation = 1.4826 * _median(differences.sort().values) / math.sqrt(6)
-        rates.append(deviation**2 / math.exp(_median(values)))
+        # What no float's exponential holds can be measured, if only by a broken detector.
+        level = min(max(_median(values), -_LARGEST_EXPONENT), _LARGEST_EXPONENT)
+        rates.append(deviation**2 / math.exp(level))
     variance = sorted(rates)[_BINS // 8]
     return max(1.0, 1 / variance) if variance > 0 else float("inf")
 

@@ -112,6 +112,12 @@ class Problem:
         """Shortest edge of a voxel, in the solver's coordinates."""
         return float(self.grid.voxel_size[: 2 if self.planar else 3].min())
 
+    def under(self, spectrum: Spectrum, scatter: float) -> Problem:
+        """The same measurements under other physics; copies of them on devices serve both."""
+        other = replace(self, spectrum=spectrum, scatter=scatter)
+        object.__setattr__(other, "_copies", self._copies)
+        return other
+
     def soft_attenuation(self) -> float:
         """Attenuation in 1/unit of a density of 1 at the volume's energy; 1 for a monochromatic model."""
         if self.spectrum is None or self.materials is None:
