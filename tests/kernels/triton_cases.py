@@ -23,6 +23,8 @@ from splat_scenes import (
 )
 from step_scenes import BATCH, compare_steps, fit_problem
 
+from tomo_polysplat.fit.step import EagerStep
+
 CASES = {}
 
 
@@ -242,6 +244,20 @@ def a_step_in_two_dimensions(device):
 @case
 def a_step_without_smoothing_held_out_rays_or_blur(device):
     compare_steps(_fused, device, ("cpu", "numba"), tv_weight=0.0, held_out=0.0, blurring=False)
+
+
+@case
+def the_slope_by_the_blur_beside_opaque_rays(device):
+    """Without a blur it is large, and yet a sum of whole numbers."""
+    slopes = []
+    for where, kernel, form in ((device, "triton", _fused), ("cpu", "numba", lambda *p: EagerStep(*p[:-2]))):
+        problem = fit_problem("cone", True, where, kernel, held_out=0.0, loss="l1")
+        problem[0].blur.zero_()
+        problem[0].attenuation.mul_(60.0)
+        step = form(*problem[:-1], BATCH, problem[-1])
+        step(np.array([0, 3]), problem[-1], 0.0)
+        slopes.append(10 * float(step.moments["blur"][0]))
+    assert abs(slopes[0] / slopes[1] - 1) < 1e-3 and abs(slopes[1]) > 100, slopes
 
 
 @case

@@ -21,7 +21,7 @@ from tomo_polysplat.kernels.step.triton_misfit import (
     sharp_projection,
     store_gradients,
 )
-from tomo_polysplat.kernels.step.triton_update import WHOLE
+from tomo_polysplat.kernels.step.triton_update import WHOLE_OF_BLUR
 from tomo_polysplat.kernels.triton_maths import on_device
 from tomo_polysplat.kernels.views import DetectorViews
 
@@ -29,6 +29,9 @@ __all__ = ["blurred_misfit_gradient"]
 
 _BLOCK = 256
 _TINY = tl.constexpr(1.1754944e-38)
+# d log(passed) / dv counts so much at most: without a blur it is e^P in an opaque ray beside a free one. As the slopes
+# of all rays add up to 1 at most, what is added up in whole numbers then never exceeds an int64.
+_STEEPEST = tl.constexpr(2.0**22)
 
 
 @triton.jit
@@ -96,8 +99,9 @@ def _blurred_kernel(
         HUBER, MANY,
     )  # fmt: skip
     slope = tl.where(kept & inside, slope, 0.0)
-    total = tl.sum(tl.where(kept & inside, -slope * by_variance / passed, 0.0).to(tl.float64), 0)
-    tl.atomic_add(grad_blur, (total * WHOLE).to(tl.int64), sem="relaxed")
+    steep = tl.minimum(tl.maximum(by_variance / passed, -_STEEPEST), _STEEPEST)
+    total = tl.sum(tl.where(kept & inside, -slope * steep, 0.0).to(tl.float64), 0)
+    tl.atomic_add(grad_blur, (total * WHOLE_OF_BLUR).to(tl.int64), sem="relaxed")
     tl.store(seen + k * area + pixel, predicted, mask=inside)
     tl.store(slopes + k * area + pixel, slope, mask=inside)
 
@@ -153,7 +157,7 @@ def blurred_misfit_gradient(
     blur : (1,) float32 tensor
         Variance of the detector's blur, in squared pixels.
     grad_blur : (1,) int64 tensor
-        To which the gradient by it is added, times `WHOLE`.
+        To which the gradient by it is added, times `WHOLE_OF_BLUR`.
     """
     many, area, device = len(views), views.rows * views.columns, raw.device
     channels = 1 if measurement.nodes is None else 3

@@ -16,12 +16,14 @@ import triton.language as tl  # noqa: TID253
 from tomo_polysplat.kernels.step.triton_activate import material, mixture
 from tomo_polysplat.kernels.triton_maths import dot, on_device
 
-__all__ = ["FIRST_DECAY", "SECOND_DECAY", "WHOLE", "Bounds", "update"]
+__all__ = ["FIRST_DECAY", "SECOND_DECAY", "WHOLE", "WHOLE_OF_BLUR", "Bounds", "update"]
 
 FIRST_DECAY, SECOND_DECAY = 0.9, 0.999
 _KEEP_FIRST, _KEEP_SECOND = tl.constexpr(FIRST_DECAY), tl.constexpr(SECOND_DECAY)
 # Gradients of what many share are added up in whole numbers of 1 / WHOLE, in any order to the same bits.
 WHOLE = tl.constexpr(2.0**50)
+# The blur's can be millions of times as steep.
+WHOLE_OF_BLUR = tl.constexpr(2.0**40)
 _BLOCK = 128
 
 
@@ -138,12 +140,12 @@ def _update_kernel(
 @triton.jit
 def _common_kernel(
     parameter, first, second, gradient, rate, control, count, held, low, high, epsilon,
-    FREED: tl.constexpr, BLOCK: tl.constexpr,
+    UNITS: tl.constexpr, FREED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = n < count
     whole = tl.load(gradient + n, mask=live, other=0)
-    slope = tl.where(n < held, 0.0, (whole.to(tl.float64) / WHOLE).to(tl.float32))
+    slope = tl.where(n < held, 0.0, (whole.to(tl.float64) / UNITS).to(tl.float32))
     if FREED:
         slope *= tl.load(control + 2).to(tl.float32)
     share, root = tl.load(control).to(tl.float32), tl.load(control + 1).to(tl.float32)
@@ -199,11 +201,11 @@ def update(
             num_warps=4,
         )  # fmt: skip
         # The soft matter's number is held, and the metals' until the control lets them go.
-        common = [("shared_material", grad_shared, 5, 1, least, most)] if curves is not None else []
-        common += [("blur", grad_blur, 6, 0, 0.0, bounds.blur)] if blurring else []
-        for name, gradient, k, held, low, high in common:
+        common = [("shared_material", grad_shared, WHOLE, 5, 1, least, most)] if curves is not None else []
+        common += [("blur", grad_blur, WHOLE_OF_BLUR, 6, 0, 0.0, bounds.blur)] if blurring else []
+        for name, gradient, units, k, held, low, high in common:
             parameter = parameters[name]
             _common_kernel[(triton.cdiv(len(parameter), _BLOCK),)](
                 parameter, *moments[name], gradient, rates[k:], control, len(parameter), held, low, high,
-                bounds.epsilon, FREED=name == "shared_material", BLOCK=_BLOCK, num_warps=4,
+                bounds.epsilon, UNITS=units.value, FREED=name == "shared_material", BLOCK=_BLOCK, num_warps=4,
             )  # fmt: skip
