@@ -10,6 +10,7 @@ from tomo_polysplat.physics.materials import Materials, mass_attenuation
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import VolumeGrid
+from tomo_polysplat.scan.io import load_scan
 
 GRID = VolumeGrid((3, 4, 5), (-1.0, -2.0, -0.3), (1.5, 2.0, 0.3))
 
@@ -217,3 +218,9 @@ def test_tiff_slices(tmp_path):
 def test_npy(tmp_path):
     polychromatic().save_npy(tmp_path / "volume.npy")
     np.testing.assert_array_equal(np.load(tmp_path / "volume.npy"), polychromatic().volume)
+
+
+def test_a_result_is_not_taken_for_a_scan(tmp_path):
+    polychromatic().save(tmp_path / "volume.h5")
+    with pytest.raises(ValueError, match=r"expected a scan, got the result.*Result\.load"):
+        load_scan(tmp_path / "volume.h5")

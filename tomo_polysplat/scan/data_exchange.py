@@ -62,6 +62,8 @@ LENGTH_NAMES |= dict.fromkeys(("micron", "microns", "micrometers"), "um")
 def scan_from_hdf5(path: Path, options: ReadOptions) -> Scan:
     """Read a scan; see :func:`tomo_polysplat.load_scan`."""
     with opened(path) as file:
+        if find_array(file, "polysplat/basis") is not None:
+            raise fail("path", "a scan", f"the result of a reconstruction in {path}", "Result.load reads it")
         exchange = find_group(file, "exchange")
         data = None if exchange is None else find_array(exchange, "data")
         if exchange is None or data is None or data.ndim != 3 or 0 in data.shape:
