@@ -28,13 +28,7 @@ _log = logging.getLogger(__name__)
 
 _PLANAR_TYPES = ("parallel", "parallel_vec", "fanflat", "fanflat_vec")
 _SPATIAL_TYPES = ("parallel3d", "parallel3d_vec", "cone", "cone_vec", "cyl_cone_vec")
-_VECTOR_LENGTH = {
-    "parallel_vec": 6,
-    "fanflat_vec": 6,
-    "parallel3d_vec": 12,
-    "cone_vec": 12,
-    "cyl_cone_vec": 13,
-}
+_VECTOR_SIZE = {"parallel_vec": 6, "fanflat_vec": 6, "parallel3d_vec": 12, "cone_vec": 12, "cyl_cone_vec": 13}
 
 
 def is_planar_geometry(geometry: Mapping[str, Any]) -> bool:
@@ -197,8 +191,8 @@ def _volume_grid(vol_geom: Mapping[str, Any]) -> VolumeGrid:
 
 def _checked_vectors(proj_geom: Mapping[str, Any], kind: str) -> np.ndarray:
     vectors = require_array("Vectors", _entry(proj_geom, "Vectors"), ndim=2).astype(np.float64)
-    if vectors.shape[1] != _VECTOR_LENGTH[kind]:
-        raise fail("Vectors", f"shape (views, {_VECTOR_LENGTH[kind]}) for {kind!r}", f"{vectors.shape}")
+    if vectors.shape[1] != _VECTOR_SIZE[kind]:
+        raise fail("Vectors", f"shape (views, {_VECTOR_SIZE[kind]}) for {kind!r}", f"{vectors.shape}")
     bad = ~np.isfinite(vectors).all(axis=1)
     if bad.any():
         raise fail(
