@@ -163,4 +163,5 @@ def _views_per_step(views: int, settings: Settings, most: int) -> tuple[int, str
     if settings.views_per_step:
         return min(views, settings.views_per_step), "asked for"
     steps = settings.passes * views / _STEPS
-    return max(1, min(views, most, round(steps))), f"for about {_STEPS} steps, and at most {most} views in each"
+    together = max(1, min(views, most, round(steps)))
+    return together, f"for about {_STEPS} steps, and at most {most} views in each"
