@@ -33,15 +33,15 @@ class Settings:
     views_per_step: int = 0
     """Views whose gradients make one step of the optimiser; 0 leaves it to the plan."""
     max_gaussians: int = 0
-    """Upper bound of the number of Gaussians; 0 leaves it to the plan."""
+    """About how many Gaussians at most, not counting that metal is seeded twice as finely; 0 leaves it to the plan."""
     seed_spacing: float = 0.0
     """Distance of the seeds in voxels; 0 leaves it to the plan."""
     seed_width: float = 0.6
     """Standard deviation of a seed in units of the spacing."""
     support_level: float = 0.1
-    """Voxels of the start below this share of the soft reference get no Gaussian."""
+    """Where the start is below this share of the soft reference in a seed's cell and those around it, there is none."""
     smallest_scale: float = 0.2
-    """Smallest standard deviation in voxels."""
+    """Smallest standard deviation in voxels, or in seed spacings where seeds are closer."""
     largest_scale: float = 8.0
     """Largest standard deviation in seed spacings."""
     bone_level: float = 2.2
@@ -92,7 +92,7 @@ class Settings:
     held_out: float = 0.01
     """Share of the rays kept from the fit to tell when it stops improving."""
     patience: int = 4
-    """Checks without improvement of the held-out rays that end the run."""
+    """Passes over the views without improvement of the held-out rays that end the run."""
     metal_tail: float = 0.1
     """A voxel with less than this share of a neighbour's metal holds a tail, which the neighbour gets back."""
     cutoff: float = 3.0

@@ -50,6 +50,12 @@ def test_what_makes_no_sense_is_refused(asked, density, spectrum, word):
         Calibration.of(asked, density, spectrum)
 
 
+def test_a_number_is_no_name():
+    assert Calibration.of(np.True_, None, SPECTRUM) == Calibration(("scatter",), None)
+    with pytest.raises(TypeError, match="calibrate: .*names"):
+        Calibration.of(3, None, SPECTRUM)
+
+
 def test_scatter_is_found_and_used():
     scan = fan(0.05)
     result = reconstruct(scan, valid=scan.valid, calibrate=True)

@@ -49,6 +49,13 @@ def test_scatter_is_found_although_the_matter_has_taken_some_of_it_up(scatter):
     assert found == pytest.approx(scatter, abs=1e-3)
 
 
+def test_rays_that_nothing_passes_tell_nothing():
+    areal = np.concatenate([rays(), np.full((3, 5), 1e6)], axis=1)
+    measured = polychromatic_projection_numpy(rays(), FULL)
+    measured = np.append(measured, np.full(5, 700.0))
+    assert estimate_scatter(areal, measured, np.ones_like(measured), SPECTRUM, MATERIALS) < 1e-3
+
+
 @pytest.mark.parametrize("kvp", [81, 99])
 def test_a_known_density_tells_the_voltage(kvp):
     """Rays of water of density 1 at 90 kV, fitted under another voltage, look like water of another density."""

@@ -73,9 +73,11 @@ class Calibration:
             raise fail("calibrate", "a spectrum to calibrate", "none")
         if soft_density is not None:
             soft_density = require_number("soft_density", soft_density, above=0.0)
-        if calibrate is True:
+        if isinstance(calibrate, (bool, np.bool_)):
             names: tuple[str, ...] = ("scatter",) if soft_density is None else ("scatter", "kvp")
         else:
+            if not isinstance(calibrate, (str, Sequence)):
+                raise fail("calibrate", "True, False or names", repr(calibrate), error=TypeError)
             names = (calibrate,) if isinstance(calibrate, str) else tuple(calibrate)
         for name in names:
             require_choice("calibrate", name, ("scatter", *_CHANGES))

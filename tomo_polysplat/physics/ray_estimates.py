@@ -54,7 +54,7 @@ def estimate_scatter(
     primary, slopes = np.exp(-value), (curves @ share) * areal
     scatter, robust = start, np.ones_like(value)
     for _ in range(_GAUSS_NEWTON_STEPS):
-        total = primary + scatter
+        total = np.maximum(primary + scatter, np.finfo(np.float64).tiny)
         columns = np.concatenate([(-1.0 / total)[None], slopes * (primary / total)]) * weight
         target = (measured + np.log(total)) * weight
         step = np.linalg.lstsq((columns * robust).T, target * robust, rcond=None)[0]
