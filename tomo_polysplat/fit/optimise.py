@@ -6,7 +6,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,10 @@ from tomo_polysplat.settings import Settings
 __all__ = ["FitOutcome", "FitState", "fit"]
 
 logger = logging.getLogger(__name__)
+
+# The learning rates of place and size are for this many steps. Fewer steps take larger ones, up to twice (pins,
+# 64^3, 160 steps: 25.8 dB as they are, 27.0 with 1.5 times).
+_STEPS, _MOST_HURRY = 450, 2.0
 
 
 @dataclass
@@ -196,9 +200,9 @@ def fit(
         logger.warning("The start volume is empty: no Gaussians, a volume of zeros.")
         return FitOutcome(gaussians, reason="nothing to fit: the start volume is empty")
     batch = min(views_per_step, len(rays.views))
-    fitter = _Fitter(gaussians, spacing, rays, scene, settings, batch, rng)
-    outcome, watch = FitOutcome(gaussians), Watch(settings)
     clock = Clock(max(1, math.ceil(settings.passes * len(rays.views) / batch)), deadline)
+    fitter = _Fitter(gaussians, spacing, rays, scene, _hurried(settings, clock.steps), batch, rng)
+    outcome, watch = FitOutcome(gaussians), Watch(settings)
     run = _Run(fitter, outcome, watch, clock, started, checkpoint)
     run.restore()
     try:
@@ -231,6 +235,16 @@ def fit(
     outcome.reason = outcome.reason or used_up
     outcome.gaussians = watch.best or gaussians.copy()
     return outcome
+
+
+def _hurried(settings: Settings, steps: int) -> Settings:
+    """The settings with learning rates for a run of so many steps."""
+    factor = min(max(1.0, _STEPS / steps), _MOST_HURRY)
+    return replace(
+        settings,
+        learning_rate_position=factor * settings.learning_rate_position,
+        learning_rate_scale=factor * settings.learning_rate_scale,
+    )
 
 
 def _is_true(answer: Any) -> bool:
