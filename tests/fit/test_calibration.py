@@ -8,9 +8,9 @@ import torch
 from small_scans import geometries, reconstruct
 
 import tomo_polysplat as tps
-from tomo_polysplat.fit.calibration import Calibration, with_fitted
+from tomo_polysplat.fit.calibration import Calibration, _judge, with_fitted
 from tomo_polysplat.fit.problem import Problem
-from tomo_polysplat.fit.short_fit import main_density
+from tomo_polysplat.fit.short_fit import ShortFit, main_density
 
 # Enough steps for the density of the main matter to settle.
 STEADY = {"passes": 4.0, "views_per_step": 4}
@@ -101,6 +101,17 @@ def test_an_empty_scan_tells_nothing_about_the_tube():
     result = reconstruct(scan, empty, calibrate="kvp", soft_density=1.0)
     assert result.plan["calibration"]["accepted"] == {"kvp": False}
     assert not result.volume.any()
+
+
+@pytest.mark.parametrize(
+    ("factor", "held_out", "taken"),
+    [(1.1, 1.0, True), (1.1, 1.2, False), (1.25, 0.9, False), (0.8, 0.9, False)],
+)
+def test_a_density_is_not_followed_against_the_rays_or_past_the_end(factor, held_out, taken):
+    def fit(fitted, error):
+        return ShortFit(fitted, error, 1.0, np.zeros((3, 0)), np.zeros(0), np.zeros(0))
+
+    assert _judge("kvp", fit({}, 1.0), [fit({"kvp": factor}, held_out)])[0] == taken
 
 
 def test_other_physics_are_those_of_the_same_measurements():

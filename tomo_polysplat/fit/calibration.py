@@ -223,5 +223,8 @@ def _judge(name: str, before: ShortFit, stage: Sequence[ShortFit]) -> tuple[bool
     if name == "scatter":
         better = after < (1 - _MARGIN) * before.held_out
         return better, f"{change} of the open beam, {'accepted' if better else 'not accepted'}: {errors}"
+    low, high = _BOUNDS[name]
+    if not 1.001 * low < _last(name, stage).fitted[name] < 0.999 * high:
+        return False, f"times {change} is as far as is looked, and the density asks for more: not accepted"
     fits = after < (1 + _CONTRADICTION) * before.held_out
     return fits, f"times {change} by the known density, {'accepted' if fits else 'not accepted'}: {errors}"
