@@ -18,7 +18,7 @@ from tomo_polysplat.cli import main
 
 # One or two of every kind, the quick ones.
 SHORT = (
-    *("starved-20", "nan", "saturated", "all-dead", "one-view", "truncated", "source-near", "source-inside"),
+    *("starved-20", "nan", "saturated", "all-dead", "two-views", "truncated", "source-near", "source-inside"),
     *(
         "one-voxel",
         "offset-1000",

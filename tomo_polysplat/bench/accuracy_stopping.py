@@ -23,6 +23,9 @@ class _Pass:
     def copy(self) -> _Pass:
         return self
 
+    def finite(self) -> bool:
+        return True
+
 
 def stopping(history: Sequence[Mapping[str, Any]], settings: Mapping[str, Any]) -> dict[str, Any] | None:
     """Let the stopping rule judge a run that went on, pass by pass.

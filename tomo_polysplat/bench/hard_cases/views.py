@@ -37,7 +37,8 @@ _STEPS, _VIEWS_PER_STEP = 150, 4
 def _few(scan: Scan, device: str) -> Findings:
     """Explained as the truth on the same voxels explains it, to the error of P that the loss forgives."""
     assert scan.truth is not None
-    settings = {"passes": float(_STEPS * min(scan.views, _VIEWS_PER_STEP) / scan.views)}
+    # Below ten views a pass makes the steps of one over ten.
+    settings = {"passes": float(_STEPS * min(scan.views, _VIEWS_PER_STEP) / max(scan.views, 10))}
     result = fit(scan, device, settings=settings)
     findings = sound(result)
     findings.at_most(
