@@ -55,7 +55,7 @@ class Settings:
     free_radius: float = 6.0
     """Gaussians have a material number of their own within this many voxels of bone-like or denser matter."""
     learning_rate_position: float = 0.03
-    """Per step, in seed spacings; up to 1.5 times as much in a run of fewer than 450 steps, as for the scale."""
+    """Per step, in seed spacings; up to twice as much in a run of fewer than 450 steps, as for the scale."""
     learning_rate_scale: float = 4e-2
     """Per step, relative."""
     learning_rate_rotation: float = 3e-3
