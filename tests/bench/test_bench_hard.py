@@ -27,7 +27,7 @@ SHORT = (
         "empty",
         "metal-one-voxel",
         "one-energy",
-        "ten-kev",
+        "two-metals",
     ),
     *("gaussian-alone", "gaussians-ordinary", "needles", "behind-the-source", "densities", "material-ends"),
 )
