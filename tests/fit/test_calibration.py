@@ -22,6 +22,10 @@ def fan(scatter, views=40):
     return tps.simulate_scan("pins", size=48, views=views, geometry="fan", scatter=scatter, metal=False)
 
 
+def problem_of(scan, spectrum):
+    return Problem.of(scan.projections.swapaxes(0, 1), *geometries(scan), "cm", spectrum, None)
+
+
 @pytest.mark.parametrize(
     "asked, names",
     [(True, ("scatter",)), ("scatter", ("scatter",)), (["scatter", "filter"], ("scatter", "filter"))],
@@ -104,19 +108,24 @@ def test_an_empty_scan_tells_nothing_about_the_tube():
 
 
 @pytest.mark.parametrize(
-    ("factor", "held_out", "taken"),
-    [(1.1, 1.0, True), (1.1, 1.2, False), (1.25, 0.9, False), (0.8, 0.9, False)],
+    ("factor", "held_out", "taken", "kvp"),
+    [
+        *((1.1, 1.0, True, 90), (1.1, 1.2, False, 90), (1.25, 0.9, False, 90), (0.8, 0.9, False, 90)),
+        # The tables of tubes end before the factors do.
+        *((225 / 210, 0.9, False, 210), (1.05, 0.9, True, 210)),
+    ],
 )
-def test_a_density_is_not_followed_against_the_rays_or_past_the_end(factor, held_out, taken):
+def test_a_density_is_not_followed_against_the_rays_or_past_the_end(factor, held_out, taken, kvp):
+    problem = problem_of(fan(0.0), tps.Spectrum.from_tube(kvp, filters={"Al": 0.05}))
+
     def fit(fitted, error):
         return ShortFit(fitted, error, 1.0, np.zeros((3, 0)), np.zeros(0), np.zeros(0))
 
-    assert _judge("kvp", fit({}, 1.0), [fit({"kvp": factor}, held_out)])[0] == taken
+    assert _judge("kvp", fit({}, 1.0), [fit({"kvp": factor}, held_out)], problem)[0] == taken
 
 
 def test_other_physics_are_those_of_the_same_measurements():
-    scan = fan(0.0)
-    problem = Problem.of(scan.projections.swapaxes(0, 1), *geometries(scan), "cm", SPECTRUM, None)
+    problem = problem_of(fan(0.0), SPECTRUM)
     other, device = with_fitted(problem, {"scatter": 0.01, "filter": 2.0}), torch.device("cpu")
     assert other.scatter == 0.01 and other.spectrum.effective_energy > SPECTRUM.effective_energy
     assert problem.scatter == 0 and problem.spectrum is SPECTRUM

@@ -145,7 +145,7 @@ def calibrated(
     for name in sorted(wanted.names, key=lambda name: name != "scatter"):
         stage = _stage(name, best, wanted, problem, trial)
         trials += stage
-        accepted[name], reason = _judge(name, best, stage)
+        accepted[name], reason = _judge(name, best, stage, problem)
         why.append(f"{name}: {reason}")
         if accepted[name]:
             best = _last(name, stage)
@@ -214,7 +214,7 @@ def _last(name: str, stage: Sequence[ShortFit]) -> ShortFit:
     return min(stage, key=lambda trial: trial.held_out) if name == "scatter" else stage[-1]
 
 
-def _judge(name: str, before: ShortFit, stage: Sequence[ShortFit]) -> tuple[bool, str]:
+def _judge(name: str, before: ShortFit, stage: Sequence[ShortFit], problem: Problem) -> tuple[bool, str]:
     """Whether a stage's last fit is taken, and why."""
     if not stage:
         return False, "nothing to change"
@@ -223,7 +223,7 @@ def _judge(name: str, before: ShortFit, stage: Sequence[ShortFit]) -> tuple[bool
     if name == "scatter":
         better = after < (1 - _MARGIN) * before.held_out
         return better, f"{change} of the open beam, {'accepted' if better else 'not accepted'}: {errors}"
-    low, high = _BOUNDS[name]
+    low, high = _bounds(name, problem)
     if not 1.001 * low < _last(name, stage).fitted[name] < 0.999 * high:
         return False, f"times {change} is as far as is looked, and the density asks for more: not accepted"
     fits = after < (1 + _CONTRADICTION) * before.held_out

@@ -50,9 +50,8 @@ def make_step(
 
         try:
             return GraphStep(gaussians, spacing, rays, scene, settings, batch, box)
-        except (
-            Exception
-        ) as problem:  # of compiler or driver, of any kind; the slower way gives the same result
+        # Of compiler or driver, of any kind: the slower way gives the same result.
+        except Exception as problem:
             logger.debug("no CUDA graph", exc_info=True)
             logger.warning("Steps one operation at a time: no CUDA graph could be recorded: %s", problem)
     else:
