@@ -33,7 +33,7 @@ _FIT_GRID = (4, np.linspace(0.0, 1.0, 21)[1:] ** 2)
 # The rays its errors are taken from: finer, and other mixtures but for the pure materials.
 _JUDGE_GRID = (11, np.linspace(0.0, 1.0, 41)[1:] ** 2)
 
-_Nodes = tuple[np.ndarray, np.ndarray]  # log weights (n,) and attenuation (3, n)
+_Nodes = tuple[np.ndarray, np.ndarray]  # log weights (n,) and attenuation (3, n) or (1, n)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +44,8 @@ class Quadrature:
     ----------
     log_weights : (n,) float64 array
         Logarithms of weights that add up to 1.
-    attenuation : (3, n) float64 array
-        Mass attenuation (cm2/g) of the soft, middle and dense material at each node.
+    attenuation : (3, n) or (1, n) float64 array
+        Mass attenuation (cm2/g) of the soft, middle and dense material at each node, or of the soft one alone.
     error_bound : float
         Largest ``|error of P|`` found on an independent, dense set of rays over the range ``max_path``.
     rms_error : float
@@ -78,7 +78,7 @@ class Quadrature:
 
     @property
     def mean_attenuation(self) -> np.ndarray:
-        """``dP/da_k`` at ``P = 0``, ``(3,)`` in cm2/g."""
+        """``dP/da_k`` at ``P = 0``, ``(3,)`` or ``(1,)`` in cm2/g."""
         return self.attenuation @ self.weights
 
     def describe(self) -> str:
@@ -97,6 +97,7 @@ def fit_quadrature(
     max_path: MaxPath = 8.0,
     nodes: int | None = None,
     tolerance: float = 5e-4,
+    curves: int = 3,
 ) -> Quadrature:
     """The fewest nodes that reproduce the measurement over the range of a scan.
 
@@ -113,6 +114,8 @@ def fit_quadrature(
     tolerance : float
         Root mean square error of ``P`` to reach. If 16 nodes do not, every energy of the spectrum becomes a
         node.
+    curves : 3 or 1
+        Rays of mixtures of the three materials, or of the first one alone, which takes fewer nodes.
 
     Returns
     -------
@@ -124,7 +127,7 @@ def fit_quadrature(
     ValueError
         For a range or number of nodes that is not positive.
     """
-    full = _nodes_of(spectrum, materials or Materials())
+    full = _nodes_of(spectrum, materials or Materials(), curves)
     bins = full[0].size
     judge = _Judge(full, max_path)
     require_number("tolerance", tolerance, above=0.0)
@@ -148,10 +151,10 @@ def sampled_quadrature(
     return _Judge(full, max_path)(chosen)
 
 
-def _nodes_of(spectrum: Spectrum, materials: Materials) -> _Nodes:
-    """A spectrum's energies as nodes, those without weight left out."""
+def _nodes_of(spectrum: Spectrum, materials: Materials, curves: int = 3) -> _Nodes:
+    """A spectrum's energies as nodes of the first ``curves`` materials, those without weight left out."""
     lit = spectrum.weights > 0
-    return np.log(spectrum.weights[lit]), materials.mass_attenuation(spectrum.energies[lit])
+    return np.log(spectrum.weights[lit]), materials.mass_attenuation(spectrum.energies[lit])[:curves]
 
 
 class _Judge:

@@ -24,16 +24,16 @@ def fit_nodes(log_weights: np.ndarray, attenuation: np.ndarray, rays: np.ndarray
 
     Parameters
     ----------
-    log_weights, attenuation : (bins,) and (3, bins) arrays
-        The full spectrum.
-    rays : (3, m) array
+    log_weights, attenuation : (bins,) and (k, bins) arrays
+        The full spectrum, for k materials.
+    rays : (k, m) array
         Areal densities in g/cm2 that span the range of the scan.
     count : int
         Number of nodes, fewer than ``bins``.
 
     Returns
     -------
-    log_weights, attenuation : (count,) and (3, count) arrays
+    log_weights, attenuation : (count,) and (k, count) arrays
         Fewer where most of the signal sits at fewer energies.
     """
     from scipy.optimize import least_squares
@@ -41,16 +41,18 @@ def fit_nodes(log_weights: np.ndarray, attenuation: np.ndarray, rays: np.ndarray
     target = projection(rays, log_weights, attenuation)
     slope = attenuation @ np.exp(log_weights)
     start = _grouped(log_weights, attenuation, count)
+    materials = len(attenuation)
 
     def residuals(unknowns: np.ndarray) -> np.ndarray:
-        nodes = _unpack(unknowns)
+        nodes = _unpack(unknowns, materials)
         return np.concatenate([projection(rays, *nodes) - target, nodes[1] @ np.exp(nodes[0]) / slope - 1.0])
 
     def jacobian(unknowns: np.ndarray) -> np.ndarray:
-        return np.concatenate([_ray_rows(rays, *_unpack(unknowns)), _slope_rows(slope, *_unpack(unknowns))])
+        nodes = _unpack(unknowns, materials)
+        return np.concatenate([_ray_rows(rays, *nodes), _slope_rows(slope, *nodes)])
 
     solution = least_squares(residuals, _pack(*start), jacobian, method="lm", max_nfev=_MAX_EVALUATIONS)
-    return _unpack(solution.x)
+    return _unpack(solution.x, materials)
 
 
 def _grouped(log_weights: np.ndarray, attenuation: np.ndarray, count: int) -> Nodes:
@@ -68,17 +70,17 @@ def _pack(log_weights: np.ndarray, attenuation: np.ndarray) -> np.ndarray:
     return np.concatenate([log_weights[1:] - log_weights[0], np.log(attenuation).ravel()])
 
 
-def _unpack(unknowns: np.ndarray) -> Nodes:
-    count = (unknowns.size + 1) // 4
+def _unpack(unknowns: np.ndarray, materials: int) -> Nodes:
+    count = (unknowns.size + 1) // (materials + 1)
     unknowns = np.clip(unknowns, -_LOG_LIMIT, _LOG_LIMIT)
     relative = np.concatenate([[0.0], unknowns[: count - 1]])
     largest = relative.max()
     log_weights = relative - largest - np.log(np.exp(relative - largest).sum())
-    return log_weights, np.exp(unknowns[count - 1 :].reshape(3, count))
+    return log_weights, np.exp(unknowns[count - 1 :].reshape(materials, count))
 
 
 def _ray_rows(rays: np.ndarray, log_weights: np.ndarray, attenuation: np.ndarray) -> np.ndarray:
-    """Derivatives of ``P`` along each ray by the unknowns, ``(rays, 4 count - 1)``."""
+    """Derivatives of ``P`` along each ray by the unknowns, ``(rays, (k + 1) count - 1)``."""
     share = shares(rays, log_weights, attenuation)[1]
     by_weight = np.exp(log_weights)[:, None] - share
     by_curve = share * rays[:, None] * attenuation[:, :, None]
@@ -86,9 +88,9 @@ def _ray_rows(rays: np.ndarray, log_weights: np.ndarray, attenuation: np.ndarray
 
 
 def _slope_rows(slope: np.ndarray, log_weights: np.ndarray, attenuation: np.ndarray) -> np.ndarray:
-    """Derivatives of the relative slope of each material at ``P = 0``, ``(3, 4 count - 1)``."""
-    weights = np.exp(log_weights)
+    """Derivatives of the relative slope of each of k materials at ``P = 0``, ``(k, (k + 1) count - 1)``."""
+    weights, materials = np.exp(log_weights), np.arange(len(attenuation))
     by_weight = weights * (attenuation - (attenuation @ weights)[:, None])
-    by_curve = np.zeros((3, 3, weights.size))
-    by_curve[[0, 1, 2], [0, 1, 2]] = weights * attenuation
-    return np.concatenate([by_weight[:, 1:], by_curve.reshape(3, -1)], axis=1) / slope[:, None]
+    by_curve = np.zeros((len(materials), len(materials), weights.size))
+    by_curve[materials, materials] = weights * attenuation
+    return np.concatenate([by_weight[:, 1:], by_curve.reshape(len(materials), -1)], axis=1) / slope[:, None]

@@ -23,14 +23,14 @@ _BISECTIONS = 50
 def span_rays(
     log_weights: np.ndarray, attenuation: np.ndarray, max_path: MaxPath, divisions: int, levels: np.ndarray
 ) -> np.ndarray:
-    """Areal densities ``(3, rays)`` in g/cm2 of rays that span the range of a scan.
+    """Areal densities ``(3, rays)``, or ``(1, rays)`` for the first material alone, in g/cm2 of rays that span the range of a scan.
 
     Parameters
     ----------
-    log_weights, attenuation : (n,) and (3, n) arrays
+    log_weights, attenuation : (n,) and (3, n) or (1, n) arrays
         The full spectrum.
     max_path : float or three floats
-        Largest projection value, or largest areal density of each base material.
+        Largest projection value, or, with three materials, the largest areal density of each.
     divisions : int
         The mixtures are a lattice of this many steps between the pure materials.
     levels : (m,) array
@@ -49,24 +49,29 @@ def span_rays(
 def _directions(
     log_weights: np.ndarray, attenuation: np.ndarray, max_path: MaxPath, divisions: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mixtures ``(3, m)`` and how far along each the scan reaches ``(m,)``."""
-    shares = np.array(
-        [(i, j, divisions - i - j) for i in range(divisions + 1) for j in range(divisions + 1 - i)]
-    )
-    lattice = shares.T / divisions
+    """Mixtures ``(3, m)`` or ``(1, 1)``, and how far along each the scan reaches ``(m,)``."""
+    lattice = _lattice(len(attenuation), divisions)
     if np.ndim(max_path) == 0:
         largest = require_number(
             "max_path", max_path, above=0.0, remedy="the largest projection value of the scan"
         )
-        pure = _reach(np.eye(3), log_weights, attenuation, largest)
+        pure = _reach(np.eye(len(attenuation)), log_weights, attenuation, largest)
         directions = lattice * pure[:, None]
         return directions, _reach(directions, log_weights, attenuation, largest)
     maxima = require_array("max_path", max_path, ndim=1).astype(np.float64)
-    if maxima.shape != (3,) or not (np.isfinite(maxima).all() and (maxima >= 0).all() and maxima.any()):
+    if maxima.shape != (len(lattice),) or not (np.isfinite(maxima).all() and (maxima >= 0).all() and maxima.any()):
         raise fail("max_path", "a projection value or three areal densities in g/cm2", repr(max_path))
     directions = lattice * maxima[:, None]
     present = directions.any(axis=0)
     return directions[:, present], 1.0 / lattice[maxima > 0].max(axis=0)[present]
+
+
+def _lattice(materials: int, divisions: int) -> np.ndarray:
+    """Shares ``(materials, m)`` of one material or of three, a lattice between the pure ones."""
+    if materials == 1:
+        return np.ones((1, 1))
+    shares = [(i, j, divisions - i - j) for i in range(divisions + 1) for j in range(divisions + 1 - i)]
+    return np.array(shares).T / divisions
 
 
 def _reach(

@@ -22,7 +22,7 @@ def add_scatter(quadrature: Quadrature, scatter: float) -> Quadrature:
     if require_number("scatter", scatter, at_least=0.0) == 0:
         return quadrature
     log_weights = np.append(quadrature.log_weights, np.log(scatter))
-    attenuation = np.concatenate([quadrature.attenuation, np.zeros((3, 1))], axis=1)
+    attenuation = np.pad(quadrature.attenuation, ((0, 0), (0, 1)))
     return replace(quadrature, log_weights=log_weights, attenuation=attenuation)
 
 

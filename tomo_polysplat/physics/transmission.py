@@ -27,7 +27,8 @@ def polychromatic_projection(areal: torch.Tensor, quadrature: Quadrature) -> tor
     Parameters
     ----------
     areal : (3, ...) float32 or float64 tensor
-        Areal densities in g/cm2 of the soft, middle and dense material along each ray.
+        Areal densities in g/cm2 of the soft, middle and dense material along each ray; (1, ...) for nodes of
+        the soft one alone.
     quadrature : Quadrature
         Nodes of the detected spectrum.
 
@@ -39,10 +40,9 @@ def polychromatic_projection(areal: torch.Tensor, quadrature: Quadrature) -> tor
     Raises
     ------
     ValueError
-        If the first axis is not 3, or the type is not floating point.
+        If the first axis is not that of the nodes, or the type is not floating point.
     """
-    if areal.ndim < 1 or areal.shape[0] != 3:
-        raise fail("areal", "shape (3, ...), one channel per base material", f"{tuple(areal.shape)}")
+    _require_channels(tuple(areal.shape), quadrature)
     if areal.dtype not in (torch.float32, torch.float64):
         raise fail("areal", "float32 or float64", f"{areal.dtype}")
     log_weights, attenuation = nodes_on(quadrature, areal.dtype, areal.device)
@@ -50,18 +50,23 @@ def polychromatic_projection(areal: torch.Tensor, quadrature: Quadrature) -> tor
 
 
 def polychromatic_projection_numpy(areal: np.ndarray, quadrature: Quadrature) -> np.ndarray:
-    """The same in NumPy and float64: ``(3, ...)`` areal densities in g/cm2 to ``(...)`` projection values."""
+    """The same in NumPy and float64: ``(3, ...)`` or ``(1, ...)`` areal densities in g/cm2 to ``(...)`` projection values."""
     areal = np.asarray(areal, dtype=np.float64)
-    if areal.ndim < 1 or areal.shape[0] != 3:
-        raise fail("areal", "shape (3, ...), one channel per base material", f"{areal.shape}")
+    _require_channels(areal.shape, quadrature)
     return beer_lambert.projection(areal, quadrature.log_weights, quadrature.attenuation)
+
+
+def _require_channels(shape: tuple[int, ...], quadrature: Quadrature) -> None:
+    channels = len(quadrature.attenuation)
+    if shape[:1] != (channels,):
+        raise fail("areal", f"shape ({channels}, ...), one channel per base material", f"{shape}")
 
 
 @lru_cache(maxsize=16)
 def nodes_on(
     quadrature: Quadrature, dtype: torch.dtype, device: torch.device
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Log weights ``(n, 1)`` and attenuation ``(n, 3)`` where they are needed, copied there once."""
+    """Log weights ``(n, 1)`` and attenuation ``(n, 3)`` or ``(n, 1)`` where they are needed, copied there once."""
     log_weights = torch.tensor(quadrature.log_weights[:, None], dtype=dtype, device=device)
     return log_weights, torch.tensor(quadrature.attenuation.T.copy(), dtype=dtype, device=device)
 
@@ -88,6 +93,6 @@ class _Projection(torch.autograd.Function):
 def _exponents(areal: torch.Tensor, log_weights: torch.Tensor, attenuation: torch.Tensor) -> torch.Tensor:
     """``(nodes, rays)``. No matrix product: reduced-precision ones (TF32, autocast) would cost 1e-3 of P."""
     exponents = log_weights
-    for path, curve in zip(areal.reshape(3, -1), attenuation.unbind(1)):
+    for path, curve in zip(areal.reshape(len(areal), -1), attenuation.unbind(1)):
         exponents = torch.addcmul(exponents, curve[:, None], path, value=-1.0)
     return exponents
