@@ -29,16 +29,15 @@ def fit_problem(kind, polychromatic, device, kernel, count=17, **changes):
     values = 1.5 * torch.rand((5, views.rows, views.columns), generator=generator) - 0.1
     values[1, 0, 3:6] = float("nan")
     values[:, -1, 7] = 400.0
-    blurring = changes.pop("blurring", True)
+    blurring, one_curve = changes.pop("blurring", True), changes.pop("one_curve", False)
     settings = Settings(**({"held_out": 0.2, "tv_weight": 0.3, "material_from": 0.5} | changes))
     rays = Rays(values.to(device), views, 1e3, settings.model_error, settings.held_out)
     quadrature, curves = None, (None, None)
     if polychromatic:
         weights = np.log([0.2, 0.5, 0.3])
-        quadrature = Quadrature(
-            weights, CURVES.T.double().numpy() @ np.ones((2, 3)) * [3.0, 1.0, 0.4], 0, 0, 0, 5
-        )
-        curves = CURVES.to(device)
+        attenuation = CURVES.T.double().numpy() @ np.ones((2, 3)) * [3.0, 1.0, 0.4]
+        quadrature = Quadrature(weights, attenuation[:1] if one_curve else attenuation, 0, 0, 0, 5)
+        curves = (None, None) if one_curve else CURVES.to(device)
     shape = (1, 7, 9) if planar else (4, 5, 6)
     box = VoxelBox(np.array([-0.6, -0.5, 0.0 if planar else -0.4]), np.array([0.2, 0.21, 0.23]), shape)
     scene = FitScene(box, quadrature, 0.7, *curves, -0.1, kernel, 3.0, 0.0, blurring, 20)

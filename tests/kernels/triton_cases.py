@@ -237,6 +237,14 @@ def a_step_of_a_monochromatic_parallel_scan(device):
 
 
 @case
+def a_step_of_one_curve_under_a_spectrum(device):
+    for kind, blurring in (("cone", True), ("parallel", False)):
+        moved = compare_steps(_fused, device, ("cpu", "numba"), kind, blurring=blurring, one_curve=True)
+        assert bool(moved["attenuation"].any()) and bool(moved["blur"].any()) == blurring
+        assert not any(bool(moved[name].any()) for name in ("own_material", "shared_material"))
+
+
+@case
 def a_step_in_two_dimensions(device):
     compare_steps(_fused, device, ("cpu", "numba"), "fan", material_from=2.0)
 

@@ -52,13 +52,13 @@ def _taps(index, count, STEP: tl.constexpr, variance):
 @triton.jit
 def _sharp_kernel(
     raw, sharp, table, log_weights, attenuation, largest, area, columns, nodes, areal_scale,
-    CHANNELS: tl.constexpr, CONE: tl.constexpr, BLOCK: tl.constexpr,
+    CURVES: tl.constexpr, CONE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     k = tl.program_id(1).to(tl.int64)
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     factor = pixel_factor(table, k, pixel, columns, CONE) * areal_scale
     at = k * area + tl.minimum(pixel, area - 1)
-    most, predicted, _, _, _ = sharp_projection(raw, at, factor, log_weights, attenuation, nodes, CHANNELS)
+    most, predicted, _, _, _ = sharp_projection(raw, at, factor, log_weights, attenuation, nodes, CURVES)
     tl.atomic_max(largest, tl.max(most, 0), sem="relaxed")
     tl.store(sharp + at, predicted, mask=pixel < area)
 
@@ -110,7 +110,7 @@ def _blurred_kernel(
 def _gather_kernel(
     raw, pixels, table, sharp, seen, slopes, blur, log_weights, attenuation,
     area, rows, columns, beyond, nodes, areal_scale,
-    CHANNELS: tl.constexpr, CONE: tl.constexpr, MANY: tl.constexpr, BLOCK: tl.constexpr,
+    CURVES: tl.constexpr, CONE: tl.constexpr, MANY: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     k = tl.program_id(1).to(tl.int64)
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -119,7 +119,7 @@ def _gather_kernel(
     row, column, variance = pixel // columns, pixel % columns, tl.load(blur)
     factor = pixel_factor(table, k, pixel, columns, CONE) * areal_scale
     at = k * area + tl.minimum(pixel, area - 1)
-    _, _, d0, d1, d2 = sharp_projection(raw, at, factor, log_weights, attenuation, nodes, CHANNELS)
+    _, _, d0, d1, d2 = sharp_projection(raw, at, factor, log_weights, attenuation, nodes, CURVES)
     own = tl.load(sharp + at)
     gathered = tl.zeros([BLOCK], tl.float32)
     for i in tl.static_range(-1, 2):
@@ -133,7 +133,7 @@ def _gather_kernel(
             # The product is at most 1; what it is made of may be beyond a float.
             share = tl.exp(tl.minimum(shift + tl.log(tl.maximum(weight, _TINY)), 0.0))
             gathered += tl.where(weight > 0, slope * share, 0.0)
-    store_gradients(pixels, k * area + pixel, gathered * factor, d0, d1, d2, live, CHANNELS)
+    store_gradients(pixels, k * area + pixel, gathered * factor, d0, d1, d2, live, CURVES)
 
 
 def blurred_misfit_gradient(
@@ -160,16 +160,16 @@ def blurred_misfit_gradient(
         To which the gradient by it is added, times `WHOLE_OF_BLUR`.
     """
     many, area, device = len(views), views.rows * views.columns, raw.device
-    channels = 1 if measurement.nodes is None else 3
+    curves = measurement.curves
     nodes = 0 if measurement.nodes is None else len(measurement.nodes[0])
     sharp, seen, slopes = torch.empty((3, many * area), dtype=torch.float32, device=device)
-    pixels = raw.new_empty((many * area + beyond) * spread(channels))
+    pixels = raw.new_empty((many * area + beyond) * spread(max(1, curves)))
     log_weights, attenuation = measurement.nodes or (raw, raw)
     with on_device(raw):
         grid = (triton.cdiv(area, _BLOCK), many)
         _sharp_kernel[grid](
             raw, sharp, table, log_weights, attenuation, largest, area, views.columns, nodes,
-            measurement.areal_scale, CHANNELS=channels, CONE=views.cone, BLOCK=_BLOCK, num_warps=4,
+            measurement.areal_scale, CURVES=curves, CONE=views.cone, BLOCK=_BLOCK, num_warps=4,
         )  # fmt: skip
         _blurred_kernel[grid](
             sharp, seen, slopes, blur, grad_blur, chosen, measurement.projections, measurement.totals, sums,
@@ -179,6 +179,6 @@ def blurred_misfit_gradient(
         _gather_kernel[(triton.cdiv(area + beyond, _BLOCK), many)](
             raw, pixels, table, sharp, seen, slopes, blur, log_weights, attenuation,
             area, views.rows, views.columns, beyond, nodes, measurement.areal_scale,
-            CHANNELS=channels, CONE=views.cone, MANY=many, BLOCK=_BLOCK, num_warps=4,
+            CURVES=curves, CONE=views.cone, MANY=many, BLOCK=_BLOCK, num_warps=4,
         )  # fmt: skip
     return pixels

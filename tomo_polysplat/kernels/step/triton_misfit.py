@@ -42,7 +42,7 @@ class Measurement:
     areal_scale : float
         Line integral of the kernels to g/cm2, or to -log(I/I0) without nodes.
     nodes : pair of tensors or None
-        (n, 1) log weights and (n, 3) attenuation of the spectrum.
+        (n, 1) log weights and (n, 3) or (n, 1) attenuation of the spectrum.
     """
 
     projections: torch.Tensor
@@ -52,6 +52,26 @@ class Measurement:
     corner: float
     areal_scale: float
     nodes: tuple[torch.Tensor, torch.Tensor] | None
+
+    @property
+    def curves(self) -> int:
+        """Curves that the spectrum is attenuated by; 0 without nodes."""
+        return 0 if self.nodes is None else self.nodes[1].shape[1]
+
+
+@triton.jit
+def _one_curve(a, log_weights, attenuation, nodes):
+    """P and its derivative by the areal density of the first material."""
+    largest = tl.full(a.shape, float("-inf"), tl.float32)
+    for k in range(nodes):
+        largest = tl.maximum(largest, tl.load(log_weights + k) - a * tl.load(attenuation + k))
+    total, slope = tl.zeros_like(a), tl.zeros_like(a)
+    for k in range(nodes):
+        b = tl.load(attenuation + k)
+        term = tl.exp(tl.load(log_weights + k) - a * b - largest)
+        total += term
+        slope += term * b
+    return -(largest + tl.log(total)), slope / total
 
 
 @triton.jit
@@ -89,12 +109,16 @@ def _is_held_out(view, pixel, held_out):
 
 
 @triton.jit
-def sharp_projection(raw, at, factor, log_weights, attenuation, nodes, CHANNELS: tl.constexpr):
+def sharp_projection(raw, at, factor, log_weights, attenuation, nodes, CURVES: tl.constexpr):
     """Largest number of the splat's image, P of the rays through pixels' centres, and its derivatives."""
-    if CHANNELS == 1:
+    if CURVES == 0:
         a0 = tl.load(raw + at)
         one = tl.full(a0.shape, 1.0, tl.float32)
         return a0, a0 * factor, one, one, one
+    if CURVES == 1:
+        a0 = tl.load(raw + at)
+        predicted, d0 = _one_curve(a0 * factor, log_weights, attenuation, nodes)
+        return a0, predicted, d0, d0, d0
     a0, a1, a2, _ = load_four(raw + 4 * at)
     most = tl.maximum(a0, tl.maximum(a1, a2))
     predicted, d0, d1, d2 = _beer_lambert(
@@ -137,10 +161,10 @@ def ray_misfit(
 
 
 @triton.jit
-def store_gradients(pixels, to, slope, d0, d1, d2, live, CHANNELS: tl.constexpr):
+def store_gradients(pixels, to, slope, d0, d1, d2, live, CURVES: tl.constexpr):
     """Gradients by the line integrals of the channels, in the layout of triton_image."""
-    if CHANNELS == 1:
-        tl.store(pixels + to, slope, mask=live)
+    if CURVES < 3:
+        tl.store(pixels + to, slope * d0, mask=live)
     else:
         store_four(pixels + 4 * to, slope * d0, slope * d1, slope * d2, tl.zeros_like(slope), live)
 
@@ -149,7 +173,7 @@ def store_gradients(pixels, to, slope, d0, d1, d2, live, CHANNELS: tl.constexpr)
 def _misfit_kernel(
     raw, pixels, table, chosen, projections, totals, log_weights, attenuation, sums, largest,
     area, columns, beyond, nodes, noise, held_out, corner, areal_scale,
-    CHANNELS: tl.constexpr, CONE: tl.constexpr, HUBER: tl.constexpr, MANY: tl.constexpr,
+    CURVES: tl.constexpr, CONE: tl.constexpr, HUBER: tl.constexpr, MANY: tl.constexpr,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
     k = tl.program_id(1).to(tl.int64)
@@ -158,13 +182,13 @@ def _misfit_kernel(
     live = pixel < tl.where(k == MANY - 1, area + beyond, area)
     factor = pixel_factor(table, k, pixel, columns, CONE) * areal_scale
     at = k * area + tl.minimum(pixel, area - 1)
-    most, predicted, d0, d1, d2 = sharp_projection(raw, at, factor, log_weights, attenuation, nodes, CHANNELS)
+    most, predicted, d0, d1, d2 = sharp_projection(raw, at, factor, log_weights, attenuation, nodes, CURVES)
     tl.atomic_max(largest, tl.max(most, 0), sem="relaxed")
     slope = ray_misfit(
         predicted, projections, totals, chosen, sums, k, pixel, inside, area, noise, held_out, corner,
         HUBER, MANY,
     )  # fmt: skip
-    store_gradients(pixels, k * area + pixel, slope * factor, d0, d1, d2, live, CHANNELS)
+    store_gradients(pixels, k * area + pixel, slope * factor, d0, d1, d2, live, CURVES)
 
 
 def misfit_gradient(
@@ -196,15 +220,14 @@ def misfit_gradient(
         Raised to the largest value of ``raw``.
     """
     many, area = len(views), views.rows * views.columns
-    channels = 1 if measurement.nodes is None else 3
-    pixels = raw.new_empty((many * area + beyond) * spread(channels))
+    pixels = raw.new_empty((many * area + beyond) * spread(max(1, measurement.curves)))
     log_weights, attenuation = measurement.nodes or (raw, raw)
     with on_device(raw):
         _misfit_kernel[(triton.cdiv(area + beyond, _BLOCK), many)](
             raw, pixels, table, chosen, measurement.projections, measurement.totals, log_weights, attenuation,
             sums, largest, area, views.columns, beyond, 0 if measurement.nodes is None else len(log_weights),
             measurement.noise, measurement.held_out, measurement.corner, measurement.areal_scale,
-            CHANNELS=channels, CONE=views.cone, HUBER=measurement.corner > 0, MANY=many, BLOCK=_BLOCK,
+            CURVES=measurement.curves, CONE=views.cone, HUBER=measurement.corner > 0, MANY=many, BLOCK=_BLOCK,
             num_warps=4,
         )  # fmt: skip
     return pixels
