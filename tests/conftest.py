@@ -18,3 +18,15 @@ def pytest_runtest_setup(item):
 def devices() -> list[torch.device]:
     """Every device of this machine, CPU first."""
     return [torch.device("cpu"), *(torch.device("cuda", k) for k in range(torch.cuda.device_count()))]
+
+
+@pytest.fixture
+def scan_file(tmp_path):
+    """A file with a scan that takes a fraction of a second to reconstruct."""
+    from small_scans import fan
+
+    from tomo_polysplat.scan.io import save_scan
+
+    path = tmp_path / "scan.npz"
+    save_scan(fan(), path)
+    return path

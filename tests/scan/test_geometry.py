@@ -1,17 +1,13 @@
 """Geometry against ASTRA's own projection of points, and the laws that any geometry obeys."""
 
-import re
-
 import numpy as np
 import pytest
+from geometry_scans import ANGLES, VOLUME, scan_2d, scan_3d
 
-from tomo_polysplat.scan.curved_detector import flat_geometry, flatten_projections
 from tomo_polysplat.scan.geometry import (
     Geometry,
-    VolumeGrid,
     from_astra,
     is_planar_geometry,
-    projections_from_astra,
     to_astra,
     volume_from_astra,
     volume_to_astra,
@@ -19,30 +15,6 @@ from tomo_polysplat.scan.geometry import (
 
 astra = pytest.importorskip("astra")
 pytest.importorskip("astra.experimental")  # not loaded by astra itself
-
-ANGLES = np.linspace(0, 2 * np.pi, 5, endpoint=False) + 0.3
-VOLUME = astra.create_vol_geom(4, 5, 6)
-
-
-def scan_3d(kind, seed=0):
-    """A geometry of any 3D type; the vector ones have every vector disturbed (tilts, offsets, skew)."""
-    cone = "cone" in kind
-    distances = (50.0, 30.0) if cone else ()
-    base = "cone" if cone else "parallel3d"
-    geometry = astra.create_proj_geom(base, 1.1, 0.7, 7, 12, ANGLES, *distances)
-    if kind == base:
-        return geometry
-    vectors = astra.geom_2vec(geometry)["Vectors"]
-    vectors = vectors + 0.05 * np.random.default_rng(seed).normal(size=vectors.shape)
-    return astra.create_proj_geom(kind, 7, 12, vectors)
-
-
-def scan_2d(kind):
-    if kind.startswith("fanflat"):
-        geometry = astra.create_proj_geom("fanflat", 1.3, 11, ANGLES, 50.0, 30.0)
-    else:
-        geometry = astra.create_proj_geom("parallel", 1.3, 11, ANGLES)
-    return astra.geom_2vec(geometry) if kind.endswith("_vec") else geometry
 
 
 def rotation(axis, angle):
@@ -221,187 +193,3 @@ def test_a_geometry_is_a_value():
     with pytest.raises(ValueError, match="read-only"):
         geometry.origin[0, 0] = 1.0
     assert "5 views of 7 x 12 pixels" in geometry.describe()
-
-
-def curved_scan(radius, shift=(0.0, 0.0)):
-    plain = astra.create_proj_geom("cone", 1.0, 1.0, 9, 41, ANGLES[:2], 60.0, 30.0)
-    vectors = astra.geom_2vec(astra.geom_postalignment(plain, shift))["Vectors"]
-    vectors = np.column_stack([vectors, np.full(2, radius)])
-    return astra.create_proj_geom("cyl_cone_vec", 9, 41, vectors)
-
-
-@pytest.mark.parametrize(("radius", "shift"), [(90.0, (0.0, 0.0)), (60.0, (6.0, 2.0)), (1e6, (0.0, 0.0))])
-def test_a_curved_detector_becomes_flat(radius, shift):
-    """Resampled column and row numbers are those that ASTRA gives for points on the flat rays."""
-    proj_geom = curved_scan(radius, shift)
-    geometry, _ = from_astra(proj_geom, VOLUME)
-    rows, columns = np.mgrid[:9, :41].astype(np.float32)
-    for index, image in ((0, columns), (1, rows)):
-        given = np.repeat(image[:, None], 2, axis=1)
-        flat = projections_from_astra(given, proj_geom)
-        assert flat.shape == geometry.shape
-        covered = np.isfinite(flat)
-        assert covered.mean() > 0.75
-        for view in range(2):
-            origins, directions = geometry.rays(view)
-            points = (origins + 70.0 * directions)[covered[view]]
-            expected = [
-                astra.experimental.projectPoint(proj_geom, *map(float, p), view)[index] for p in points
-            ]
-            np.testing.assert_allclose(flat[view][covered[view]], expected, atol=2e-5)
-
-
-def test_the_flat_detector_takes_in_the_whole_curved_one():
-    vectors = curved_scan(90.0)["Vectors"]
-    vectors[:, 6:9] *= 2  # a fan of 48 degrees
-    flat = flat_geometry(vectors, 9, 41)
-    ramp = np.repeat(np.arange(41, dtype=np.float32)[None, None], 2, axis=0).repeat(9, axis=1)
-    middle = flatten_projections(ramp, vectors)[:, 4]
-    assert np.isfinite(middle).all()
-    assert middle.min() < 1.0
-    assert middle.max() > 39.0
-    assert flat.columns > 41
-
-
-def test_projections_are_put_in_our_order():
-    proj_geom = scan_3d("cone")
-    given = np.arange(7 * 5 * 12, dtype=np.float64).reshape(7, 5, 12)
-    ours = projections_from_astra(given, proj_geom)
-    assert ours.dtype == np.float32
-    assert ours.flags.c_contiguous
-    np.testing.assert_array_equal(ours, given.transpose(1, 0, 2))
-    planar = projections_from_astra(given[0, :, :11], scan_2d("fanflat"))
-    np.testing.assert_array_equal(planar[:, 0], given[0, :, :11])
-
-
-@pytest.mark.parametrize(
-    ("shape", "said"),
-    [
-        ((5, 7, 12), "look like (views, rows, columns) where ASTRA wants (rows, views, columns)"),
-        ((5, 7, 12), "use numpy.swapaxes(projections, 0, 1)"),
-        ((12, 7, 5), "use numpy.transpose(projections, (1, 2, 0))"),
-        ((7, 5, 13), "expected shape (7, 5, 12) (rows, views, columns), got (7, 5, 13)"),
-        ((5, 12), "expected shape (7, 5, 12)"),
-    ],
-)
-def test_a_wrong_order_is_named(shape, said):
-    with pytest.raises(ValueError, match=re.escape(said)):
-        projections_from_astra(np.zeros(shape), scan_3d("cone"))
-
-
-@pytest.mark.parametrize("order", [(5, 7, 12), (12, 7, 5), (12, 5, 7), (5, 12, 7), (7, 12, 5)])
-def test_the_advice_about_the_order_works(order):
-    wrong = np.zeros(order)
-    with pytest.raises(ValueError, match="use numpy") as caught:
-        projections_from_astra(wrong, scan_3d("cone"))
-    advice = re.search(r"use (numpy\..*)$", str(caught.value)).group(1)
-    assert eval(advice, {"numpy": np, "projections": wrong}).shape == (7, 5, 12)
-
-
-def test_a_wrong_planar_order_is_named():
-    with pytest.raises(ValueError, match="numpy.swapaxes"):
-        projections_from_astra(np.zeros((11, 5)), scan_2d("parallel"))
-    with pytest.raises(TypeError, match="real numbers"):
-        projections_from_astra(np.zeros((5, 11), complex), scan_2d("parallel"))
-
-
-@pytest.mark.parametrize(
-    "degrees",
-    [
-        np.linspace(0, 180, 181),
-        np.linspace(0, 360, 120, endpoint=False),
-        np.linspace(-180, 180, 360, endpoint=False),
-        np.linspace(0, 200, 401),
-        np.arange(8) * 45.0,
-    ],
-)
-def test_degrees_are_refused(degrees):
-    proj_geom = astra.create_proj_geom("cone", 1.0, 1.0, 7, 11, degrees, 50.0, 30.0)
-    with pytest.raises(ValueError, match="look like degrees.*numpy.deg2rad"):
-        from_astra(proj_geom, VOLUME)
-
-
-@pytest.mark.parametrize(
-    "radians",
-    [
-        np.linspace(0, np.pi, 181),
-        np.linspace(-2 * np.pi, 2 * np.pi, 100),
-        np.linspace(0, 20 * np.pi, 1000, endpoint=False),
-        np.arange(200) * np.deg2rad(111.246),
-    ],
-)
-def test_radians_are_not_taken_for_degrees(radians):
-    proj_geom = astra.create_proj_geom("cone", 1.0, 1.0, 7, 11, radians, 50.0, 30.0)
-    assert from_astra(proj_geom, VOLUME)[0].views == len(radians)
-
-
-def with_vectors(change):
-    proj_geom = scan_3d("cone_vec")
-    change(proj_geom["Vectors"])
-    return proj_geom
-
-
-def set_nan(vectors):
-    vectors[2, 4] = np.nan
-
-
-def zero_u(vectors):
-    vectors[1, 6:9] = 0
-
-
-def parallel_steps(vectors):
-    vectors[:, 9:12] = -2 * vectors[:, 6:9]
-
-
-def edge_on(vectors):
-    vectors[:, 9:12] = vectors[:, 3:6] - vectors[:, 0:3]
-
-
-def source_inside(vectors):
-    vectors[3, 0:3] = (0.5, 0.5, 1.0)
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (set_nan, "Vectors: expected finite numbers"),
-        (zero_u, "u: expected a vector of length > 0, got zero in 1 of 5 views, first in view 1"),
-        (parallel_steps, "u and v: expected two different directions"),
-        (edge_on, "detector: expected rays that cross its plane"),
-        (source_inside, "source positions: expected all outside the volume, got 1 of 5"),
-    ],
-)
-def test_broken_vectors_are_named(change, said):
-    with pytest.raises(ValueError, match=re.escape(said)):
-        from_astra(with_vectors(change), VOLUME)
-
-
-def test_other_mistakes_are_named():
-    cone = scan_3d("cone")
-    with pytest.raises(ValueError, match="vol_geom: expected a 3D one"):
-        from_astra(cone, astra.create_vol_geom(4, 5))
-    with pytest.raises(ValueError, match="vol_geom: expected a 2D one"):
-        from_astra(scan_2d("parallel"), VOLUME)
-    with pytest.raises(ValueError, match="minimum < maximum"):
-        from_astra(cone, astra.create_vol_geom(4, 5, 6, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0))
-    with pytest.raises(ValueError, match="whole number"):
-        from_astra({**cone, "DetectorRowCount": 7.5}, VOLUME)
-    with pytest.raises(ValueError, match="whole number"):
-        from_astra(cone, {**VOLUME, "GridSliceCount": 0})
-    with pytest.raises(ValueError, match="DistanceOriginSource"):
-        from_astra({**cone, "DistanceOriginSource": -50.0}, VOLUME)
-    with pytest.raises(ValueError, match="a matrix has no rays"):
-        from_astra({"type": "sparse_matrix"}, VOLUME)
-    with pytest.raises(TypeError, match="create_proj_geom"):
-        from_astra(VOLUME["option"], VOLUME)
-    with pytest.raises(ValueError, match=r"shape \(views, 12\)"):
-        from_astra({**scan_3d("cone_vec"), "Vectors": np.zeros((5, 6))}, VOLUME)
-    with pytest.raises(ValueError, match="volume: expected shape"):
-        volume_from_astra(np.zeros((4, 5, 6)), VOLUME)
-
-
-def test_counts_of_other_types_are_accepted():
-    proj_geom = {**scan_3d("cone"), "DetectorRowCount": np.int64(7), "DetectorColCount": 12.0}
-    geometry, _ = from_astra(proj_geom, VOLUME)
-    assert (geometry.rows, geometry.columns) == (7, 12)
-    assert isinstance(VolumeGrid((np.int64(2), 3, 4), np.zeros(3), np.ones(3)).shape[0], int)
