@@ -18,10 +18,10 @@ def grid_of(shape, voxel=(0.1, 0.1, 0.1), shift=(0.0, 0.0, 0.0)):
     return VolumeGrid(shape, np.array(shift) - half, np.array(shift) + half)
 
 
-def seeds(start, grid, spacing=1.3, polychromatic=False, settings=SETTINGS):
+def seeds(start, grid, spacing=1.3, polychromatic=False, settings=SETTINGS, finer=0.0):
     planar = grid.planar
     distance = spacing * float(grid.voxel_size[: 2 if planar else 3].min())
-    return seed_gaussians(start, grid, distance, settings, polychromatic, planar, torch.device("cpu"))
+    return seed_gaussians(start, grid, distance, settings, polychromatic, planar, torch.device("cpu"), finer)
 
 
 def mass(cloud, dims):
@@ -106,6 +106,39 @@ def test_metal_gets_seeds_half_as_far_apart_and_keeps_its_mass():
     assert len(fine) > len(plain)
     assert float(fine.log_scale.min()) == pytest.approx(float(plain.log_scale.min()) - math.log(2), abs=1e-5)
     assert mass(fine, 3) == pytest.approx(float(start.sum()) * 1e-3, rel=0.15)
+
+
+@pytest.mark.parametrize("shape", [(15, 17, 61), (1, 47, 51)])
+def test_seeds_are_finer_where_the_start_varies_and_no_more_of_them(shape):
+    grid = grid_of(shape)
+    dims = 2 if grid.planar else 3
+    start = np.ones(shape, np.float32)
+    start[..., shape[-1] // 2 :] = 1.5
+    edge = float(grid.lower[0] + (shape[-1] // 2) * grid.voxel_size[0])
+    even, uneven = seeds(start, grid, 2.0), seeds(start, grid, 2.0, finer=0.5)
+    # Whole numbers of cells fill the window.
+    assert 0.8 * len(even) < len(uneven) < 1.1 * len(even)
+    assert mass(uneven, dims) == pytest.approx(mass(even, dims), rel=0.02)
+    near = (uneven.position[:, 0] - edge).abs() < 0.1
+    assert bool(near.any()) and bool((~near).any())
+    widths = uneven.scale()[:, 0]
+    assert float(widths[near].max()) < 0.6 * float(widths.max())
+    far = (uneven.position[:, 0] - edge).abs() > 0.6
+    share = float((widths[far] > 0.9 * widths.max()).float().mean())
+    assert share > 0.9
+
+
+def test_metal_is_seeded_more_finely_than_what_varies():
+    grid = grid_of((20, 21, 22))
+    start = np.ones((20, 21, 22), np.float32)
+    start[8:12, 8:12, 8:12] = 30.0
+    start[:, :, :4] = 0.5
+    cloud = seeds(start, grid, 2.0, polychromatic=True, finer=0.5)
+    widths = cloud.scale()[:, 0]
+    metal = cloud.group > 0
+    assert float(widths[metal].max()) < 0.3 * float(widths.max())
+    inside = float(start[8:12, 8:12, 8:12].sum()) * 1e-3
+    assert mass(cloud.select(metal.nonzero()[:, 0]), 3) == pytest.approx(inside, rel=0.15)
 
 
 def test_every_piece_of_metal_shares_one_number_of_its_own():

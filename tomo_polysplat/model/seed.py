@@ -1,6 +1,7 @@
 """Gaussians to start from: a regular grid over the support of a first reconstruction.
 
-The grid is twice as fine at metal, whose edges are where an error of position costs most.
+The grid is twice as fine at metal, whose edges are where an error of position costs most. Where there are fewer
+Gaussians than the detector could tell apart, it is also finer where the start varies, and coarser where it is flat.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ def seed_gaussians(
     polychromatic: bool,
     planar: bool,
     device: torch.device,
+    finer: float = 0.0,
 ) -> Gaussians:
     """Seed the support of a start volume.
 
@@ -43,11 +45,14 @@ def seed_gaussians(
         Wanted distance of the seeds in the grid's unit; a whole number of them fills the window.
     planar : bool
         Endless along z, for a scan of one plane.
+    finer : float
+        Share of the Gaussians, below 1, that lie where the start varies most, on a grid twice as fine as the
+        rest; as many as a grid of one ``spacing`` would have in all.
     """
     dims = 2 if planar else 3
     values = start if isinstance(start, torch.Tensor) else torch.tensor(start)
     start = _sharpened(values.to(device), settings.metal_level)
-    points, size, cell, value = _lattices(start, grid, spacing, dims, settings)
+    points, size, cell, value = _lattices(start, grid, spacing, dims, settings, finer)
     reach = settings.free_radius * float(grid.voxel_size[:dims].min())
     own, shared, group = _materials(start, points, value, grid, reach, settings, polychromatic)
     # Round, whatever the cell: thinner than the rays are apart, a Gaussian would be held by none. At this
@@ -99,13 +104,20 @@ def _sharpened(start: torch.Tensor, level: float) -> torch.Tensor:
 
 
 def _lattices(
-    start: torch.Tensor, grid: VolumeGrid, spacing: float, dims: int, settings: Settings
+    start: torch.Tensor, grid: VolumeGrid, spacing: float, dims: int, settings: Settings, finer: float
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """Points (n, 3) on the support; spacing, volume of the cell and the start's mean over it, (n,) each."""
+    spacing = spacing / (1 - finer) ** (1 / dims)
     coarse, step = _lattice(grid, spacing, dims, start.device)
     metal = _reaches(start, coarse, grid, settings.metal_level, spacing)
+    plain = coarse[~metal]
+    lattices = [(plain, 1.0), (_split(coarse[metal], step), 0.5)]
+    if finer:
+        varied = _varied(start, plain, grid, step, settings, finer)
+        of_metal = _split(lattices[1][0], 0.5 * step)
+        lattices = [(plain[~varied], 1.0), (_split(plain[varied], step), 0.5), (of_metal, 0.25)]
     parts = []
-    for points, share in ((coarse[~metal], 1.0), (_split(coarse[metal], step), 0.5)):
+    for points, share in lattices:
         value, nearby = _sample(start, points, grid, share * step)
         keep = nearby > settings.support_level
         points, value = points[keep], value[keep].clamp(min=_LEAST)
@@ -113,6 +125,37 @@ def _lattices(
         parts.append((points, torch.full_like(value, share * spacing), torch.full_like(value, cell), value))
     points, sizes, cells, values = (torch.cat(tensors) for tensors in zip(*parts))
     return points, sizes, cells, values
+
+
+def _varied(
+    start: torch.Tensor,
+    points: torch.Tensor,
+    grid: VolumeGrid,
+    step: np.ndarray,
+    settings: Settings,
+    finer: float,
+) -> torch.Tensor:
+    """Which seeds' cells the start varies most in: as many as make ``finer`` of all Gaussians, once split."""
+    dims = len(step)
+    supported = _sample(start, points, grid, step)[1] > settings.support_level
+    # Splitting one of n cells adds 2^dims - 1 Gaussians; there may be n finer / (1 - finer) more.
+    most = int(int(supported.sum()) * finer / (1 - finer) / (2**dims - 1))
+    # Means over cells of half the step, against noise; from one such cell's middle to the next it is half a step.
+    half = np.ones(3, int)
+    half[3 - dims :] = np.maximum(np.round(0.5 * step / grid.voxel_size[:dims]).astype(int), 1)[::-1]
+    mean = _box_mean(start.clamp(0.0, settings.tv_clip), half)
+    reach = [int(n) if size > 1 else 0 for n, size in zip(half, start.shape)]
+    spread = (_largest_around(mean, reach) + _largest_around(-mean, reach))[_voxel_of(points, grid)]
+    chosen = torch.zeros_like(supported)
+    chosen[spread.masked_fill(~supported, -1.0).topk(min(most, len(points))).indices] = True
+    return chosen & supported
+
+
+def _largest_around(volume: torch.Tensor, reach: list[int]) -> torch.Tensor:
+    """The largest value within ``reach`` voxels along each axis."""
+    margins = [n for n in reversed(reach) for _ in range(2)]
+    padded = torch.nn.functional.pad(volume[None, None], margins, mode="replicate")
+    return torch.nn.functional.max_pool3d(padded, [2 * n + 1 for n in reach], stride=1)[0, 0]
 
 
 def _lattice(
