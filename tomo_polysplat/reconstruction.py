@@ -280,6 +280,9 @@ def _result(
     gaussians, length = outcome.gaussians, problem.length
     with torch.no_grad():
         basis = scene.basis(gaussians).cpu().numpy() * np.float32(plan.reference)
+        if problem.materials is not None and len(basis) == 1:
+            # A model of the first curve alone: there is none of the others.
+            basis = np.concatenate([basis, np.zeros((2, *basis.shape[1:]), np.float32)])
         heights = gaussians.weights(scene.reference_curve).sum(dim=0)
         parts = {
             "position": gaussians.position.cpu().numpy() * length + problem.centre,

@@ -97,6 +97,8 @@ class Settings:
     """A voxel with less than this share of a neighbour's metal holds a tail, which the neighbour gets back."""
     cutoff: float = 3.0
     """Standard deviations at which a projected Gaussian ends."""
+    curves: int = 0
+    """Material curves under a spectrum: 1 for the soft one alone, or 3; 0 leaves it to the plan."""
     spectral_nodes: int = 0
     """Nodes of the spectrum; 0 takes as few as keep the error of P small."""
     kernel: str = "auto"
@@ -115,6 +117,10 @@ class Settings:
                     raise fail(name, "a whole number", repr(value))
                 number = int(number)
             object.__setattr__(self, field.name, number)
+        if self.curves not in (0, 1, 3):
+            raise fail("settings['curves']", "1, 3, or 0 for the plan to decide", repr(self.curves))
+        if self.curves == 1 and self.soft_u:
+            raise fail("settings['curves']", "3 with a soft_u other than 0", "1", "name the soft material")
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values by name."""

@@ -1,9 +1,11 @@
 """What is decided from the data, in any unit."""
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from tomo_polysplat.fit.plan import make_plan, mass_level
 from tomo_polysplat.fit.problem import Problem
@@ -175,3 +177,49 @@ def test_views_of_a_step_leave_enough_steps(passes):
         and f"{views} of 20" in made.reasons["views_per_step"]
     )
     assert 200 < steps < 600 or views in (1, 8)
+
+
+@pytest.mark.parametrize(("density", "curves"), [(1.0, 1), (2.0, 1), (2.5, 3)])
+def test_three_curves_are_for_dense_matter(density, curves):
+    of = problem(polychromatic=True)
+    start = ball(of, 1)
+    start[4, 5, 6] = density * of.depth
+    chosen = plan(of, start)
+    assert chosen.curves == curves
+    assert f"{density:g}"[:1] in chosen.reasons["curves"]
+
+
+def test_curves_can_be_asked_for():
+    of = problem(polychromatic=True)
+    assert plan(of, ball(of, 1), curves=3).curves == 3
+    assert plan(of, ball(of, 8), curves=1).curves == 1
+    assert plan(of, ball(of, 1), soft_u=0.1).curves == 3, "no curve is the soft matter's"
+    assert plan(problem(), ball(of, 8), curves=3).curves == 1, "one energy has one curve"
+
+
+@pytest.mark.parametrize("wrong", [{"curves": 2}, {"curves": 4}, {"curves": 1, "soft_u": 0.1}])
+def test_curves_that_make_no_sense_are_refused(wrong):
+    with pytest.raises(ValueError, match="curves"):
+        Settings(**wrong)
+
+
+def test_seeds_of_one_curve_have_no_material_of_their_own():
+    of = problem(polychromatic=True)
+    start = ball(of, 8)
+    for curves, free in ((1, False), (3, True)):
+        settings = Settings(curves=curves)
+        chosen = make_plan(start, of, settings, "cpu")
+        seeds = of.seeds(start, chosen, settings, torch.device("cpu"))
+        assert bool((seeds.group != 0).any()) == free == (len(seeds.shared_material) > 1)
+        assert not seeds.own_material.any() or free
+
+
+def test_no_hardening_leaves_one_energy():
+    """Thin rays tell nothing of the spectrum: one node, and a line integral as of a monochromatic scan."""
+    of, settings = problem(polychromatic=True), Settings()
+    for largest, nodes in ((1e-3, 1), (3.0, 2)):
+        thin = replace(of, projections=of.projections * np.float32(largest))
+        chosen = make_plan(ball(of, 1), thin, settings, "cpu")
+        scene = thin.scene(chosen, settings, torch.device("cpu"))
+        assert (scene.quadrature is None) == (nodes == 1)
+        assert ("one energy" in chosen.reasons["hardening"]) == (nodes == 1)

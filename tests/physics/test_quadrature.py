@@ -141,3 +141,33 @@ def test_wrong_range(wrong):
         fit_quadrature(TUBES["90 kVp"], MATERIALS, wrong)
     with pytest.raises(ValueError, match="nodes"):
         fit_quadrature(TUBES["90 kVp"], MATERIALS, 8.0, nodes=0)
+
+
+@pytest.mark.parametrize("largest", [0.02, 1.0, 10.0])
+def test_nodes_of_one_curve_hold_for_its_own_rays(largest):
+    spectrum = TUBES["90 kVp"]
+    one, three = (fit_quadrature(spectrum, MATERIALS, largest, curves=k) for k in (1, 3))
+    areal = np.random.default_rng(3).uniform(0, 5 * largest, (1, 500))
+    truth = exact(np.concatenate([areal, 0 * areal, 0 * areal]), spectrum)
+    keep = truth <= largest
+    assert keep.sum() > 50 and one.attenuation.shape == (1, one.nodes)
+    assert np.abs(approximate(areal, one) - truth)[keep].max() <= 1.1 * one.error_bound <= 2e-3
+    assert one.nodes <= three.nodes and (one.nodes == 1) == (largest < 0.1)
+
+
+def test_more_nodes_than_the_fewest_can_be_asked_for():
+    """Even many more than rays of one material at a few levels would settle."""
+    for curves in (1, 3):
+        asked = fit_quadrature(TUBES["90 kVp"], MATERIALS, 3.0, nodes=25, curves=curves)
+        assert 4 < asked.nodes <= 25 and asked.error_bound < 5e-4
+
+
+@pytest.mark.parametrize("value", [0.1, 2.0, 8.0])
+def test_the_straight_line_is_the_ray_without_hardening(value):
+    spectrum = TUBES["90 kVp"]
+    quadrature = fit_quadrature(spectrum, MATERIALS, 10.0)
+    line = quadrature.straight_line(value)
+    water = line / (MATERIALS.mass_attenuation(spectrum.energies)[0] @ spectrum.weights)
+    # As far as the nodes hold.
+    assert exact(np.array([[water], [0], [0]]), spectrum)[0] == pytest.approx(value, abs=5e-3)
+    assert line > value

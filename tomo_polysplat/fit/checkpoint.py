@@ -32,7 +32,7 @@ __all__ = ["Checkpoint", "Snapshot"]
 
 logger = logging.getLogger(__name__)
 
-FORMAT = 1
+FORMAT = 2
 # Writing takes at most this share of the time.
 _LARGEST_SHARE = 0.05
 _PARTS = tuple(field.name for field in fields(Gaussians))
@@ -211,7 +211,7 @@ def _plan(parts: dict[str, Any]) -> Plan:
     plan = Plan(**parts)
     above_zero = min(plan.reference, plan.spacing, plan.views_per_step, plan.tv_box) > 0
     whole = isinstance(plan.views_per_step, int) and isinstance(plan.tv_box, int)
-    if not (above_zero and whole and isinstance(plan.reasons, dict)):
+    if not (above_zero and whole and plan.curves in (1, 3) and isinstance(plan.reasons, dict)):
         raise TypeError(f"a plan, got {parts}")
     return plan
 

@@ -50,6 +50,8 @@ class Plan:
     views_per_step : int
     tv_box : int
         Edge in voxels of the random box whose total variation a step takes.
+    curves : int
+        Material curves of the model: three, or the first alone, as for a monochromatic one.
     reasons : dict
         Decision by decision, what was chosen and why; it becomes ``Result.plan``.
     """
@@ -58,6 +60,7 @@ class Plan:
     spacing: float
     views_per_step: int
     tv_box: int
+    curves: int
     reasons: dict[str, Any] = field(default_factory=dict)
 
 
@@ -78,12 +81,14 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     spacing, because = _seed_spacing(support, problem, settings, device)
     views, reason = _views_per_step(problem.geometry.views, settings, _MOST_VIEWS[device])
     box = settings.tv_box or (_TV_BOX_PLANAR if problem.planar else _TV_BOX[device])
-    plan = Plan(reference, spacing, views, box)
+    curves, needed = _curves(start, reference * problem.depth, problem.polychromatic, settings)
+    plan = Plan(reference, spacing, views, box, curves)
     unit = "g/cm3" if problem.polychromatic else "per unit of length"
     plan.reasons = {
         "model": "polychromatic: a spectrum was given"
         if problem.polychromatic
         else "monochromatic: no spectrum was given, or one of a single energy",
+        "curves": f"{curves}: {needed}",
         "dimensions": "2D Gaussians: one row and one slice in one plane"
         if problem.planar
         else "3D Gaussians: several rows or slices, or rays that leave the plane",
@@ -122,6 +127,25 @@ def _reference(level: float, polychromatic: bool) -> tuple[float, str]:
     return (
         factor,
         f"water, with lengths off by a factor of {factor:g}: the object looks {level:.3g} times as dense",
+    )
+
+
+def _curves(
+    start: np.ndarray | torch.Tensor, soft: float, polychromatic: bool, settings: Settings
+) -> tuple[int, str]:
+    """How many material curves, for a start whose soft reference is ``soft``."""
+    if not polychromatic:
+        return 1, "there is one energy, and no material to tell by it"
+    if settings.curves:
+        return settings.curves, "asked for"
+    if settings.soft_u:
+        return 3, "soft matter has a material number other than 0"
+    dense = int((start > settings.bone_level * soft).sum())
+    if dense:
+        return 3, f"{dense} voxels of the start are denser than {settings.bone_level:g} soft references"
+    largest = float(start.max()) / soft if soft else 0.0
+    return 1, (
+        f"the densest voxel of the start has {largest:.2g} soft references, so that no material number would be free"
     )
 
 

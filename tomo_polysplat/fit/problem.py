@@ -39,6 +39,8 @@ __all__ = ["Problem"]
 
 # Beyond this a ray says "opaque", not how opaque: the spectral nodes are fitted up to it at most.
 _LARGEST_PROJECTION = 15.0
+# And to this at least: a scan of nothing has no range.
+_LEAST_PROJECTION = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,10 +147,13 @@ class Problem:
         kernel, why = select.choose(device, settings.kernel)
         plan.reasons["kernel"] = f"{kernel}: {why}"
         quadrature, reference_curve, output_curve, least_u = self._physics(plan, settings, device)
+        # One node of one curve: -log(I/I0) is in proportion to the areal density.
+        straight = quadrature is not None and quadrature.attenuation.size == 1
+        slope = float(quadrature.attenuation[0, 0]) if quadrature is not None and straight else 1.0
         return FitScene(
             voxel_box(self.grid),
-            quadrature,
-            self.depth * plan.reference,
+            None if straight else quadrature,
+            self.depth * plan.reference * slope,
             reference_curve,
             output_curve,
             least_u,
@@ -175,16 +180,20 @@ class Problem:
             return None, None, None, LEAST_U
         primary = self._primary(device)
         most = float(primary.nan_to_num(nan=-math.inf).max())
-        largest = min(max(most, 1.0), _LARGEST_PROJECTION)
+        # Mixtures of three curves are told apart by more than what thin rays use of them.
+        largest = min(max(most, 1.0 if plan.curves > 1 else _LEAST_PROJECTION), _LARGEST_PROJECTION)
         nodes = settings.spectral_nodes or None
-        quadrature = fit_quadrature(spectrum, materials, max_path=largest, nodes=nodes)
-        least_u = least_material_number(materials, spectrum, quadrature.attenuation)
-        quadrature = add_scatter(quadrature, self.scatter)
-        energy = transmitted_energy(primary, spectrum)
+        quadrature = fit_quadrature(spectrum, materials, largest, nodes, curves=plan.curves)
         plan.reasons["spectrum"] = quadrature.describe()
+        plan.reasons["hardening"] = quadrature.describe_hardening(most)
+        lit_by_scatter = add_scatter(quadrature, self.scatter)
+        if plan.curves == 1:
+            return lit_by_scatter, None, None, LEAST_U
+        least_u = least_material_number(materials, spectrum, quadrature.attenuation)
+        energy = transmitted_energy(primary, spectrum)
         plan.reasons["reference_energy"] = f"{energy:.1f} keV: the mean of what a typical ray transmits"
         output = _relative(materials, spectrum.effective_energy, device)
-        return quadrature, _relative(materials, energy, device), output, least_u
+        return lit_by_scatter, _relative(materials, energy, device), output, least_u
 
     def seeds(
         self, start: np.ndarray | torch.Tensor, plan: Plan, settings: Settings, device: torch.device
@@ -192,11 +201,14 @@ class Problem:
         """Gaussians to start from."""
         relative = start / (self.depth * plan.reference)
         spacing = plan.spacing * self.voxel
-        gaussians = seed_gaussians(
-            relative, self.grid, spacing, settings, self.polychromatic, self.planar, device
-        )
+        several = plan.curves > 1
+        gaussians = seed_gaussians(relative, self.grid, spacing, settings, several, self.planar, device)
         free = int((gaussians.group < 0).sum())
-        plan.reasons["gaussians"] = f"{len(gaussians)}, the material number free for {free}"
+        plan.reasons["gaussians"] = f"{len(gaussians)}" + (
+            f", the material number free for {free} and for {len(gaussians.shared_material) - 1} pieces of metal"
+            if several
+            else ", none with a material number of its own"
+        )
         values = self.measured(device)
         plan.reasons["memory"] = require_room(
             device,

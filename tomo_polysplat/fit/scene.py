@@ -27,13 +27,12 @@ class FitScene:
     box : VoxelBox
         All voxels, in the solver's coordinates.
     quadrature : Quadrature or None
-        Nodes of the spectrum; None for a monochromatic model.
+        Nodes of the spectrum, for three curves or for the first alone; None for a model of one energy.
     areal_scale : float
-        Line integral in the solver's units (length times density) to g/cm2, or to -log(I/I0) when
-        monochromatic.
+        Line integral in the solver's units (length times density) to g/cm2, or to -log(I/I0) for one energy.
     reference_curve, output_curve : (3,) tensor or None
         Mass attenuation of the curves over that of the first, at the reference energy of the Gaussians and at
-        the energy of the volume; None for a monochromatic model.
+        the energy of the volume; None for a model of one curve, whose own these are.
     least_u : float
         Least material number; see ``physics.material_range``.
     kernel : str
@@ -57,11 +56,6 @@ class FitScene:
     metal_tail: float
     blurring: bool
     tv_box: int
-
-    @property
-    def polychromatic(self) -> bool:
-        """Whether energies differ."""
-        return self.quadrature is not None
 
     def projections(self, gaussians: Gaussians, views: DetectorViews) -> tuple[torch.Tensor, int]:
         """(views, rows, columns) predicted -log(I/I0), and the pairs skipped at the source plane."""

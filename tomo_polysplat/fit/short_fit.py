@@ -84,7 +84,8 @@ def short_fit(
         After Ctrl-C: what a calibration has so far is no result.
     """
     start, _ = problem.start_volume(device)
-    plan = make_plan(start, problem, settings, device.type)
+    # What is calibrated is judged by the areal densities of all three curves.
+    plan = make_plan(start, problem, replace(settings, curves=3), device.type)
     passes = max(_PASSES, _FEWEST_STEPS * plan.views_per_step / problem.geometry.views)
     short = replace(settings, passes=min(passes, settings.passes))
     scene, rays = problem.scene(plan, short, device), problem.rays(plan, short, device)

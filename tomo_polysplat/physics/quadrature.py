@@ -26,10 +26,12 @@ from tomo_polysplat.physics.spectrum import Spectrum
 __all__ = ["Quadrature", "fit_quadrature", "sampled_quadrature"]
 
 MAX_FITTED_NODES = 16
+# Of a table of P along the first material.
+_STEPS = 2048
 _SLOPE_TOLERANCE = 1e-3  # relative, of dP/da at P = 0: thin objects keep their attenuation
-# Steps between pure materials and levels of P, of the rays that a quadrature is fitted to. The levels are
-# dense near 0, where P bends fastest: the softest photons go first.
-_FIT_GRID = (4, np.linspace(0.0, 1.0, 21)[1:] ** 2)
+# Steps between pure materials and levels of P, of the rays that a quadrature is fitted to: more levels where
+# there are too few rays for its unknowns.
+_FIT_STEPS, _FIT_LEVELS = 4, 20
 # The rays its errors are taken from: finer, and other mixtures but for the pure materials.
 _JUDGE_GRID = (11, np.linspace(0.0, 1.0, 41)[1:] ** 2)
 
@@ -90,6 +92,25 @@ class Quadrature:
             where = f"projection values up to {self.max_path:.3g}"
         return f"{nodes}: error at most {self.error_bound:.1e}, rms {self.rms_error:.1e}, for {where}"
 
+    def straight_line(self, value: float) -> float:
+        """What a ray through the first material that measures ``value`` would measure without hardening.
+
+        That is its areal density times ``dP/da`` at 0: rays as thin as can be are not hardened.
+        """
+        curve, slope = self.attenuation[:1], float(self.mean_attenuation[0])
+        # P rises at least as fast as at the node that penetrates best.
+        paths = value / float(curve.min()) * np.linspace(0.0, 1.0, _STEPS) ** 3
+        return slope * float(np.interp(value, projection(paths[None], self.log_weights, curve), paths))
+
+    def describe_hardening(self, value: float) -> str:
+        """One line for reports: what hardening does to the largest projection value of a scan."""
+        if self.nodes == 1:
+            return f"one energy stands for the spectrum: none above {self.error_bound:.1e} in the data"
+        line = self.straight_line(max(value, 0.0))
+        return (
+            f"soft matter that measures {value:.3g}, the largest, would measure {line:.3g} without hardening"
+        )
+
 
 def fit_quadrature(
     spectrum: Spectrum,
@@ -127,13 +148,14 @@ def fit_quadrature(
     ValueError
         For a range or number of nodes that is not positive.
     """
+    if nodes is not None:
+        nodes = int(require_number("nodes", nodes, at_least=1))
     full = _nodes_of(spectrum, materials or Materials(), curves)
     bins = full[0].size
     judge = _Judge(full, max_path)
     require_number("tolerance", tolerance, above=0.0)
-    rays = span_rays(*full, max_path, *_FIT_GRID)
+    rays = _rays_for(full, max_path, nodes or MAX_FITTED_NODES)
     if nodes is not None:
-        nodes = int(require_number("nodes", nodes, at_least=1))
         return judge(fit_nodes(*full, rays, nodes) if nodes < bins else full)
     for count in range(1, min(bins, MAX_FITTED_NODES + 1)):
         candidate = judge(fit_nodes(*full, rays, count))
@@ -155,6 +177,16 @@ def _nodes_of(spectrum: Spectrum, materials: Materials, curves: int = 3) -> _Nod
     """A spectrum's energies as nodes of the first ``curves`` materials, those without weight left out."""
     lit = spectrum.weights > 0
     return np.log(spectrum.weights[lit]), materials.mass_attenuation(spectrum.energies[lit])[:curves]
+
+
+def _rays_for(full: _Nodes, max_path: MaxPath, nodes: int) -> np.ndarray:
+    """Areal densities of rays that so many nodes are fitted to."""
+    curves = len(full[1])
+    mixtures = 1 if curves == 1 else (_FIT_STEPS + 1) * (_FIT_STEPS + 2) // 2
+    # A node has its weight and a number for each curve.
+    levels = max(_FIT_LEVELS, -(-2 * (curves + 1) * min(nodes, full[0].size) // mixtures))
+    # Dense near 0, where P bends fastest: the softest photons go first.
+    return span_rays(*full, max_path, _FIT_STEPS, np.linspace(0.0, 1.0, levels + 1)[1:] ** 2)
 
 
 class _Judge:

@@ -23,7 +23,7 @@ _BISECTIONS = 50
 def span_rays(
     log_weights: np.ndarray, attenuation: np.ndarray, max_path: MaxPath, divisions: int, levels: np.ndarray
 ) -> np.ndarray:
-    """Areal densities ``(3, rays)``, or ``(1, rays)`` for the first material alone, in g/cm2 of rays that span the range of a scan.
+    """Areal densities ``(3, rays)`` in g/cm2 of rays that span the range of a scan; ``(1, rays)`` of one material.
 
     Parameters
     ----------
@@ -59,7 +59,9 @@ def _directions(
         directions = lattice * pure[:, None]
         return directions, _reach(directions, log_weights, attenuation, largest)
     maxima = require_array("max_path", max_path, ndim=1).astype(np.float64)
-    if maxima.shape != (len(lattice),) or not (np.isfinite(maxima).all() and (maxima >= 0).all() and maxima.any()):
+    if maxima.shape != (len(lattice),) or not (
+        np.isfinite(maxima).all() and (maxima >= 0).all() and maxima.any()
+    ):
         raise fail("max_path", "a projection value or three areal densities in g/cm2", repr(max_path))
     directions = lattice * maxima[:, None]
     present = directions.any(axis=0)

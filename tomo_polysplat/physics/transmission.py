@@ -50,7 +50,7 @@ def polychromatic_projection(areal: torch.Tensor, quadrature: Quadrature) -> tor
 
 
 def polychromatic_projection_numpy(areal: np.ndarray, quadrature: Quadrature) -> np.ndarray:
-    """The same in NumPy and float64: ``(3, ...)`` or ``(1, ...)`` areal densities in g/cm2 to ``(...)`` projection values."""
+    """The same in NumPy and float64, from areal densities to projection values ``(...)``."""
     areal = np.asarray(areal, dtype=np.float64)
     _require_channels(areal.shape, quadrature)
     return beer_lambert.projection(areal, quadrature.log_weights, quadrature.attenuation)

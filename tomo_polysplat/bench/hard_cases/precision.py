@@ -71,7 +71,10 @@ def _material_ends(device: str) -> Findings:
 
 def _fit_in(scan: Scan, dtype: torch.dtype) -> np.ndarray:
     """The volume in 1/cm of a fit with the reference kernel in one precision, as ``reconstruct`` makes it."""
-    target, settings = torch.device("cpu"), make_settings(changes={"passes": PASSES, "kernel": "reference"})
+    target, settings = (
+        torch.device("cpu"),
+        make_settings(changes={"passes": PASSES, "kernel": "reference", "curves": 3}),
+    )
     geometry, grid = from_astra(scan.proj_geom, scan.vol_geom)
     values = projections_from_astra(scan.projections, scan.proj_geom)
     problem = Problem.of(values.copy(), geometry, grid, "cm", scan.spectrum, None)
