@@ -95,7 +95,7 @@ def find_group(group: h5py.Group, path: str) -> h5py.Group | None:
 
     found = _member(group, path)
     if found is not None and not isinstance(found, h5py.Group):
-        raise fail(f"{group.name}/{path}", "a group", repr(found))
+        raise fail(f"{group.name}/{path}", "a group", _described(found))
     return found
 
 
@@ -115,7 +115,7 @@ def find_array(group: h5py.Group, name: str) -> h5py.Dataset | None:
     where = f"{group.name}/{name}"
     dtype = _type_of(dataset)
     if dtype is None or dtype.kind not in "fiub" or dataset.shape is None:
-        raise fail(where, "a dataset of numbers", repr(dataset))
+        raise fail(where, "a dataset of numbers", _described(dataset))
     if dataset.is_virtual or dataset.external:
         raise fail(where, "data in the file", "a dataset that only refers to other files", _OUTSIDE)
     _require_stored(where, dataset, math.prod(dataset.shape) * dtype.itemsize)
@@ -131,6 +131,11 @@ def _require_chunks(where: str, dataset: h5py.Dataset) -> None:
     most = Path(dataset.file.filename).stat().st_size // _ADDRESS_BYTES
     if chunks > max(most, 1):
         raise fail(where, f"at most {most} chunks in a file of this size", f"{chunks}", "damaged file")
+
+
+def _described(item: Any) -> str:
+    """What a file has where numbers were expected; h5py's own repr fails on types that a file has made up."""
+    return f"{type(item).__name__} of type {_type_of(item)} and shape {getattr(item, 'shape', None)}"
 
 
 def _type_of(dataset: Any) -> np.dtype | None:
