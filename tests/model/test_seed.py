@@ -126,19 +126,6 @@ def test_seeds_are_finer_where_the_start_varies_and_no_more_of_them(shape):
     assert float(widths.max()) > 1.2 * float(even.scale()[:, 0].max())
 
 
-def test_metal_is_seeded_more_finely_than_what_varies():
-    grid = grid_of((20, 21, 22))
-    start = np.ones((20, 21, 22), np.float32)
-    start[8:12, 8:12, 8:12] = 30.0
-    start[:, :, :4] = 0.5
-    cloud = seeds(start, grid, 2.0, polychromatic=True, finer=0.5)
-    widths = cloud.scale()[:, 0]
-    metal = cloud.group > 0
-    assert float(widths[metal].max()) < 0.3 * float(widths.max())
-    inside = float(start[8:12, 8:12, 8:12].sum()) * 1e-3
-    assert mass(cloud.select(metal.nonzero()[:, 0]), 3) == pytest.approx(inside, rel=0.15)
-
-
 def test_every_piece_of_metal_shares_one_number_of_its_own():
     start, grid = with_metal()
     cloud = seeds(start, grid, 1.0, polychromatic=True)

@@ -1,7 +1,7 @@
 """Gaussians to start from: a regular grid over the support of a first reconstruction.
 
 The grid is twice as fine at metal, whose edges are where an error of position costs most. Where there are fewer
-Gaussians than the detector could tell apart, it is also finer where the start varies, and coarser where it is flat.
+Gaussians than the detector could tell apart, it is coarser, and twice as fine also where the start varies.
 """
 
 from __future__ import annotations
@@ -109,15 +109,11 @@ def _lattices(
     """Points (n, 3) on the support; spacing, volume of the cell and the start's mean over it, (n,) each."""
     spacing = spacing / (1 - finer) ** (1 / dims)
     coarse, step = _lattice(grid, spacing, dims, start.device)
-    metal = _reaches(start, coarse, grid, settings.metal_level, spacing)
-    plain = coarse[~metal]
-    lattices = [(plain, 1.0), (_split(coarse[metal], step), 0.5)]
+    fine = _reaches(start, coarse, grid, settings.metal_level, spacing)
     if finer:
-        varied = _varied(start, plain, grid, step, settings, finer)
-        of_metal = _split(lattices[1][0], 0.5 * step)
-        lattices = [(plain[~varied], 1.0), (_split(plain[varied], step), 0.5), (of_metal, 0.25)]
+        fine |= _varied(start, coarse, grid, step, settings, finer)
     parts = []
-    for points, share in lattices:
+    for points, share in ((coarse[~fine], 1.0), (_split(coarse[fine], step), 0.5)):
         value, nearby = _sample(start, points, grid, share * step)
         keep = nearby > settings.support_level
         points, value = points[keep], value[keep].clamp(min=_LEAST)
@@ -153,9 +149,12 @@ def _varied(
 
 def _largest_around(volume: torch.Tensor, reach: list[int]) -> torch.Tensor:
     """The largest value within ``reach`` voxels along each axis."""
-    margins = [n for n in reversed(reach) for _ in range(2)]
-    padded = torch.nn.functional.pad(volume[None, None], margins, mode="replicate")
-    return torch.nn.functional.max_pool3d(padded, [2 * n + 1 for n in reach], stride=1)[0, 0]
+    for axis, n in enumerate(reach):
+        window, margins = [1, 1, 1], [0] * 6
+        window[axis], margins[4 - 2 * axis], margins[5 - 2 * axis] = 2 * n + 1, n, n
+        padded = torch.nn.functional.pad(volume[None, None], margins, mode="replicate")
+        volume = torch.nn.functional.max_pool3d(padded, window, stride=1)[0, 0]
+    return volume
 
 
 def _lattice(
