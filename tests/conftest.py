@@ -1,9 +1,16 @@
 """What every test folder shares: which devices there are, and GPU tests that cannot vanish unnoticed."""
 
 import os
+import signal
 
 import pytest
 import torch
+
+
+def pytest_configure():
+    # A background job of a shell inherits an ignored Ctrl-C, which tests of interruptions would wait for in vain.
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_runtest_setup(item):
