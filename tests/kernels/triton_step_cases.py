@@ -1,0 +1,72 @@
+"""Steps of the optimiser by the Triton kernels against those by autograd."""
+
+import numpy as np
+from step_scenes import BATCH, compare_steps, fit_problem
+from triton_case import case
+
+from tomo_polysplat.fit.step import EagerStep
+
+
+def _fused(*problem):
+    from tomo_polysplat.fit.fused_step import FusedStep
+
+    return FusedStep(*problem[:-1])
+
+
+@case
+def a_step_of_our_kernels_is_that_of_autograd(device):
+    moved = compare_steps(_fused, device, ("cpu", "numba"))
+    # Every kind of parameter moved, but for the held number of the soft matter.
+    assert all(bool(t.any()) for t in moved.values()), moved
+    assert float(moved["shared_material"][0]) == 0 != float(moved["shared_material"][1])
+
+
+@case
+def a_step_of_a_monochromatic_parallel_scan(device):
+    moved = compare_steps(
+        _fused, device, ("cpu", "numba"), "parallel", False, loss="weighted-l1", blurring=False
+    )
+    assert not any(bool(moved[name].any()) for name in ("own_material", "shared_material", "blur"))
+
+
+@case
+def a_step_of_one_curve_under_a_spectrum(device):
+    for kind, blurring in (("cone", True), ("parallel", False)):
+        moved = compare_steps(_fused, device, ("cpu", "numba"), kind, blurring=blurring, one_curve=True)
+        assert bool(moved["attenuation"].any()) and bool(moved["blur"].any()) == blurring
+        assert not any(bool(moved[name].any()) for name in ("own_material", "shared_material"))
+
+
+@case
+def a_step_in_two_dimensions(device):
+    compare_steps(_fused, device, ("cpu", "numba"), "fan", material_from=2.0)
+
+
+@case
+def a_step_without_smoothing_held_out_rays_or_blur(device):
+    compare_steps(_fused, device, ("cpu", "numba"), tv_weight=0.0, held_out=0.0, blurring=False)
+
+
+@case
+def the_slope_by_the_blur_beside_opaque_rays(device):
+    """Without a blur it is large, and yet a sum of whole numbers."""
+    slopes = []
+    for where, kernel, form in ((device, "triton", _fused), ("cpu", "numba", lambda *p: EagerStep(*p[:-2]))):
+        problem = fit_problem("cone", True, where, kernel, held_out=0.0, loss="l1")
+        problem[0].blur.zero_()
+        problem[0].attenuation.mul_(60.0)
+        step = form(*problem[:-1], BATCH, problem[-1])
+        step(np.array([0, 3]), problem[-1], 0.0)
+        slopes.append(10 * float(step.moments["blur"][0]))
+    assert abs(slopes[0] / slopes[1] - 1) < 1e-3 and abs(slopes[1]) > 100, slopes
+
+
+@case
+def what_is_not_a_number_shows_in_the_misfit(device):
+    """Hidden, it would spread through the volume and never end the run."""
+    for blurring in (True, False):
+        problem = fit_problem("cone", True, device, "triton", blurring=blurring, held_out=0.0)
+        step = _fused(*problem[:-1], BATCH, problem[-1])
+        problem[0].attenuation[3] = float("nan")
+        step(np.array([0, 3]), problem[-1], 0.0)
+        assert np.isnan(step.read()[0]), blurring
