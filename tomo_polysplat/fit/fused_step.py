@@ -21,7 +21,7 @@ from tomo_polysplat.kernels.project.triton_pull_back import pull_back as rays_pu
 from tomo_polysplat.kernels.project.triton_setup import footprints
 from tomo_polysplat.kernels.step.triton_activate import activate
 from tomo_polysplat.kernels.step.triton_blur import blurred_misfit_gradient
-from tomo_polysplat.kernels.step.triton_misfit import Measurement, misfit_gradient
+from tomo_polysplat.kernels.step.triton_misfit import Measurement, Splat, misfit_gradient
 from tomo_polysplat.kernels.step.triton_update import FIRST_DECAY, SECOND_DECAY, Bounds, update
 from tomo_polysplat.kernels.step.triton_variation import variation_gradient
 from tomo_polysplat.kernels.voxelise import triton_backward as box_backward
@@ -185,12 +185,11 @@ class FusedStep:
         record = footprints(*drawn, views, table, cutoff, self._skipped)
         largest, beyond = self._largest[0], rays_backward.beyond(views)
         image = rays_forward.splat(record, channels, views, cutoff, largest)
-        measured, sums = self._measurement, self._sums
-        seen = (image, table, chosen, views, measured, sums, largest, beyond)
+        seen = Splat(image, table, chosen, views, self._measurement, self._sums, largest, beyond)
         if self.scene.blurring:
-            pixels = blurred_misfit_gradient(*seen, self.gaussians.blur, self._grad_blur)
+            pixels = blurred_misfit_gradient(seen, self.gaussians.blur, self._grad_blur)
         else:
-            pixels = misfit_gradient(*seen)
+            pixels = misfit_gradient(seen)
         moments = rays_backward.sum_moments(record, pixels, channels, views, cutoff)
         return rays_pull_back(*drawn, table, views, record, moments)
 

@@ -14,20 +14,19 @@ import torch
 import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
-from tomo_polysplat.kernels.project.triton_image import pixel_factor, spread
+from tomo_polysplat.kernels.project.triton_image import pixel_factor
 from tomo_polysplat.kernels.step.triton_misfit import (
-    Measurement,
+    PIXELS_A_PROGRAM,
+    Splat,
     ray_misfit,
     sharp_projection,
     store_gradients,
 )
 from tomo_polysplat.kernels.step.triton_update import WHOLE_OF_BLUR
 from tomo_polysplat.kernels.triton_maths import on_device
-from tomo_polysplat.kernels.views import DetectorViews
 
 __all__ = ["blurred_misfit_gradient"]
 
-_BLOCK = 256
 _TINY = tl.constexpr(1.1754944e-38)
 # d log(passed) / dv counts so much at most: without a blur it is e^P in an opaque ray beside a free one. As the slopes
 # of all rays add up to 1 at most, what is added up in whole numbers then never exceeds an int64.
@@ -136,49 +135,36 @@ def _gather_kernel(
     store_gradients(pixels, k * area + pixel, gathered * factor, d0, d1, d2, live, CURVES)
 
 
-def blurred_misfit_gradient(
-    raw: torch.Tensor,
-    table: torch.Tensor,
-    chosen: torch.Tensor,
-    views: DetectorViews,
-    measurement: Measurement,
-    sums: torch.Tensor,
-    largest: torch.Tensor,
-    beyond: int,
-    blur: torch.Tensor,
-    grad_blur: torch.Tensor,
-) -> torch.Tensor:
-    """The gradient of the misfit, as `misfit_gradient` lays it out.
+def blurred_misfit_gradient(splat: Splat, blur: torch.Tensor, grad_blur: torch.Tensor) -> torch.Tensor:
+    """The gradient of the misfit, as `Splat.gradient` lays it out.
 
     Parameters
     ----------
-    raw, table, chosen, views, measurement, sums, largest, beyond
-        Of `misfit_gradient`.
+    splat : Splat
     blur : (1,) float32 tensor
         Variance of the detector's blur, in squared pixels.
     grad_blur : (1,) int64 tensor
         To which the gradient by it is added, times `WHOLE_OF_BLUR`.
     """
-    many, area, device = len(views), views.rows * views.columns, raw.device
-    curves = measurement.curves
-    nodes = 0 if measurement.nodes is None else len(measurement.nodes[0])
-    sharp, seen, slopes = torch.empty((3, many * area), dtype=torch.float32, device=device)
-    pixels = raw.new_empty((many * area + beyond) * spread(max(1, curves)))
-    log_weights, attenuation = measurement.nodes or (raw, raw)
-    with on_device(raw):
-        grid = (triton.cdiv(area, _BLOCK), many)
-        _sharp_kernel[grid](
-            raw, sharp, table, log_weights, attenuation, largest, area, views.columns, nodes,
-            measurement.areal_scale, CURVES=curves, CONE=views.cone, BLOCK=_BLOCK, num_warps=4,
+    views, measurement, pixels = splat.views, splat.measurement, splat.gradient()
+    log_weights, attenuation, nodes = splat.spectrum()
+    size = (3, len(views) * splat.area)
+    sharp, seen, slopes = torch.empty(size, dtype=torch.float32, device=splat.raw.device)
+    with on_device(splat.raw):
+        _sharp_kernel[splat.blocks()](
+            splat.raw, sharp, splat.table, log_weights, attenuation, splat.largest,
+            splat.area, views.columns, nodes, measurement.areal_scale,
+            CURVES=measurement.curves, CONE=views.cone, BLOCK=PIXELS_A_PROGRAM, num_warps=4,
         )  # fmt: skip
-        _blurred_kernel[grid](
-            sharp, seen, slopes, blur, grad_blur, chosen, measurement.projections, measurement.totals, sums,
-            area, views.rows, views.columns, measurement.noise, measurement.held_out, measurement.corner,
-            HUBER=measurement.corner > 0, MANY=many, BLOCK=_BLOCK, num_warps=4,
+        _blurred_kernel[splat.blocks()](
+            sharp, seen, slopes, blur, grad_blur, splat.chosen, measurement.projections, measurement.totals,
+            splat.sums, splat.area, views.rows, views.columns,
+            measurement.noise, measurement.held_out, measurement.corner,
+            HUBER=measurement.corner > 0, MANY=len(views), BLOCK=PIXELS_A_PROGRAM, num_warps=4,
         )  # fmt: skip
-        _gather_kernel[(triton.cdiv(area + beyond, _BLOCK), many)](
-            raw, pixels, table, sharp, seen, slopes, blur, log_weights, attenuation,
-            area, views.rows, views.columns, beyond, nodes, measurement.areal_scale,
-            CURVES=curves, CONE=views.cone, MANY=many, BLOCK=_BLOCK, num_warps=4,
+        _gather_kernel[splat.blocks(splat.beyond)](
+            splat.raw, pixels, splat.table, sharp, seen, slopes, blur, log_weights, attenuation,
+            splat.area, views.rows, views.columns, splat.beyond, nodes, measurement.areal_scale,
+            CURVES=measurement.curves, CONE=views.cone, MANY=len(views), BLOCK=PIXELS_A_PROGRAM, num_warps=4,
         )  # fmt: skip
     return pixels

@@ -18,9 +18,17 @@ from tomo_polysplat.kernels.triton_lanes import load_four, store_four
 from tomo_polysplat.kernels.triton_maths import on_device
 from tomo_polysplat.kernels.views import DetectorViews
 
-__all__ = ["Measurement", "misfit_gradient", "ray_misfit", "sharp_projection", "store_gradients"]
+__all__ = [
+    "Measurement",
+    "PIXELS_A_PROGRAM",
+    "Splat",
+    "misfit_gradient",
+    "ray_misfit",
+    "sharp_projection",
+    "store_gradients",
+]
 
-_BLOCK = 256
+PIXELS_A_PROGRAM = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +65,58 @@ class Measurement:
     def curves(self) -> int:
         """Curves that the spectrum is attenuated by; 0 without nodes."""
         return 0 if self.nodes is None else self.nodes[1].shape[1]
+
+
+@dataclass(frozen=True, eq=False)
+class Splat:
+    """Splatted views, and what they are compared with.
+
+    Parameters
+    ----------
+    raw : (views, rows, columns, ...) tensor
+        Image of the splat.
+    table : (views, 21) float64 tensor
+    chosen : (2, views) float64 tensor
+        Number of each view in the scan, and its slot among the measured projections.
+    views : DetectorViews
+        As many views of the same detector; only its shape is read.
+    measurement : Measurement
+    sums : (3,) float64 tensor
+        To which the mean misfit of the fitted rays, the sum of that of the held-out rays, and their weight are
+        added.
+    largest : float32 tensor of one number
+        Raised to the largest value of ``raw``.
+    beyond : int
+        Zero pixels that the projection's adjoint wants after the gradient's last.
+    """
+
+    raw: torch.Tensor
+    table: torch.Tensor
+    chosen: torch.Tensor
+    views: DetectorViews
+    measurement: Measurement
+    sums: torch.Tensor
+    largest: torch.Tensor
+    beyond: int
+
+    @property
+    def area(self) -> int:
+        """Pixels of a view."""
+        return self.views.rows * self.views.columns
+
+    def gradient(self) -> torch.Tensor:
+        """Room for the gradient, laid out for the projection's adjoint."""
+        pixels = len(self.views) * self.area + self.beyond
+        return self.raw.new_empty(pixels * spread(max(1, self.measurement.curves)))
+
+    def spectrum(self) -> tuple[torch.Tensor, torch.Tensor, int]:
+        """Log weights, attenuation and number of the nodes; without nodes two tensors that are not read."""
+        log_weights, attenuation = self.measurement.nodes or (self.raw, self.raw)
+        return log_weights, attenuation, 0 if self.measurement.nodes is None else len(log_weights)
+
+    def blocks(self, beyond: int = 0) -> tuple[int, int]:
+        """The grid of a kernel over the pixels of each view, and so many after them."""
+        return triton.cdiv(self.area + beyond, PIXELS_A_PROGRAM), len(self.views)
 
 
 @triton.jit
@@ -191,43 +251,17 @@ def _misfit_kernel(
     store_gradients(pixels, k * area + pixel, slope * factor, d0, d1, d2, live, CURVES)
 
 
-def misfit_gradient(
-    raw: torch.Tensor,
-    table: torch.Tensor,
-    chosen: torch.Tensor,
-    views: DetectorViews,
-    measurement: Measurement,
-    sums: torch.Tensor,
-    largest: torch.Tensor,
-    beyond: int,
-) -> torch.Tensor:
-    """The gradient of the misfit, laid out for the projection's adjoint, with ``beyond`` zero pixels after it.
-
-    Parameters
-    ----------
-    raw : (views, rows, columns, ...) tensor
-        Image of the splat.
-    table : (views, 21) float64 tensor
-    chosen : (2, views) float64 tensor
-        Number of each view in the scan, and its slot among the measured projections.
-    views : DetectorViews
-        As many views of the same detector; only its shape is read.
-    measurement : Measurement
-    sums : (3,) float64 tensor
-        To which the mean misfit of the fitted rays, the sum of that of the held-out rays, and their weight are
-        added.
-    largest : float32 tensor of one number
-        Raised to the largest value of ``raw``.
-    """
-    many, area = len(views), views.rows * views.columns
-    pixels = raw.new_empty((many * area + beyond) * spread(max(1, measurement.curves)))
-    log_weights, attenuation = measurement.nodes or (raw, raw)
-    with on_device(raw):
-        _misfit_kernel[(triton.cdiv(area + beyond, _BLOCK), many)](
-            raw, pixels, table, chosen, measurement.projections, measurement.totals, log_weights, attenuation,
-            sums, largest, area, views.columns, beyond, 0 if measurement.nodes is None else len(log_weights),
+def misfit_gradient(splat: Splat) -> torch.Tensor:
+    """The gradient of the misfit, as `Splat.gradient` lays it out."""
+    measurement, pixels = splat.measurement, splat.gradient()
+    log_weights, attenuation, nodes = splat.spectrum()
+    with on_device(splat.raw):
+        _misfit_kernel[splat.blocks(splat.beyond)](
+            splat.raw, pixels, splat.table, splat.chosen, measurement.projections, measurement.totals,
+            log_weights, attenuation, splat.sums, splat.largest,
+            splat.area, splat.views.columns, splat.beyond, nodes,
             measurement.noise, measurement.held_out, measurement.corner, measurement.areal_scale,
-            CURVES=measurement.curves, CONE=views.cone, HUBER=measurement.corner > 0, MANY=many, BLOCK=_BLOCK,
-            num_warps=4,
+            CURVES=measurement.curves, CONE=splat.views.cone, HUBER=measurement.corner > 0,
+            MANY=len(splat.views), BLOCK=PIXELS_A_PROGRAM, num_warps=4,
         )  # fmt: skip
     return pixels
