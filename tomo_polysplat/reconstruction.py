@@ -170,10 +170,10 @@ def reconstruct(
                 "spectrum": problem.spectrum or spectrum,
                 "flipped_2d": flipped,
                 "counts": counts | _counts(outcome),
+                "settings": chosen.to_dict() | {"seed": seed, "quality": quality},
             }
             result = _result(outcome, scene, grid, problem, plan, **about)
     plan.reasons["stop"] = outcome.reason + (", then interrupted" if interruption.asked else "")
-    result.settings = chosen.to_dict() | {"seed": seed, "quality": quality}
     result.seconds = time.perf_counter() - started
     logger.info("Reconstructed in %.1f s: %s; %s", result.seconds, outcome.reason, result.counts)
     return result
@@ -279,10 +279,7 @@ def _result(
     """Volumes and Gaussians in the caller's coordinates."""
     gaussians, length = outcome.gaussians, problem.length
     with torch.no_grad():
-        basis = scene.basis(gaussians).cpu().numpy() * np.float32(plan.reference)
-        if problem.materials is not None and len(basis) == 1:
-            # A model of the first curve alone: there is none of the others.
-            basis = np.concatenate([basis, np.zeros((2, *basis.shape[1:]), np.float32)])
+        own = scene.basis(gaussians).cpu().numpy() * np.float32(plan.reference)
         heights = gaussians.weights(scene.reference_curve).sum(dim=0)
         parts = {
             "position": gaussians.position.cpu().numpy() * length + problem.centre,
@@ -292,7 +289,7 @@ def _result(
             "u": gaussians.material().cpu().numpy(),
         }
     return Result(
-        basis,
+        problem.all_curves(own, plan, about["settings"]["bone_level"]),
         grid,
         energy_kev=None if about["spectrum"] is None else about["spectrum"].effective_energy,
         materials=problem.materials,

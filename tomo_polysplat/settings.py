@@ -17,6 +17,7 @@ _RANGES: dict[str, dict[str, Any]] = {
     **dict.fromkeys(("model_error", "huber_corner", "final_rate"), {"above": 0.0}),
     "blur": {"at_least": 0.0, "at_most": 0.6},
     "held_out": {"at_least": 0.0, "at_most": 0.5},
+    "finer_seeds": {"at_least": 0.0, "at_most": 0.9},
 }
 
 
@@ -36,6 +37,8 @@ class Settings:
     """About how many Gaussians at most, not counting that metal is seeded twice as finely; 0 leaves it to the plan."""
     seed_spacing: float = 0.0
     """Distance of the seeds in voxels; 0 leaves it to the plan."""
+    finer_seeds: float = 0.5
+    """Where there are fewer Gaussians than the detector could tell apart, the share of them that lies twice as close."""
     seed_width: float = 0.6
     """Standard deviation of a seed in units of the spacing."""
     support_level: float = 0.1

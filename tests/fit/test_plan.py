@@ -1,7 +1,7 @@
 """What is decided from the data, in any unit."""
 
 import logging
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ from tomo_polysplat.fit.plan import make_plan, mass_level
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.render.renderer import project_gaussians
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.settings import Settings
 
@@ -141,8 +142,58 @@ def test_what_is_asked_for_is_taken_as_it_is():
 @pytest.mark.parametrize("polychromatic", [False, True])
 def test_every_decision_has_a_reason(polychromatic):
     of = problem(planar=True, polychromatic=polychromatic)
-    for decision, words in plan(of, ball(of, 1)).reasons.items():
+    reasons = plan(of, ball(of, 1)).reasons
+    assert {"curves", "support", "seed_spacing_voxels", "views_per_step", "passes"} <= reasons.keys()
+    for decision, words in reasons.items():
         assert len(words.split()) > 3, decision
+
+
+def seeded(of, start, **settings):
+    """The reasons of a plan, with what its Gaussians cost."""
+    chosen = make_plan(start, of, Settings(**settings), "cpu")
+    count = len(of.seeds(start, chosen, Settings(**settings), torch.device("cpu")))
+    return chosen.reasons, count
+
+
+@pytest.mark.parametrize("planar", [True, False])
+def test_alternatives_are_settings_by_name_and_say_what_they_cost(planar):
+    of = problem(size=24, planar=planar, polychromatic=True)
+    reasons, count = seeded(of, ball(of, 1))
+    told = reasons["alternatives"]
+    names = {field.name for field in fields(Settings)}
+    assert {"curves", "seed_spacing", "support_level", "passes"} <= told.keys() <= names
+    halved = seeded(of, ball(of, 1), seed_spacing=float(told["seed_spacing"].split(":")[0]))[1]
+    times = float(told["seed_spacing"].split()[1])
+    # The support has a rim of whole cells, which is thinner for smaller ones.
+    assert 0.5 * times < halved / count < 1.2 * times
+
+
+def test_pairs_are_those_that_the_kernels_draw():
+    """Counted pixel by pixel: where one Gaussian's image is not zero."""
+    of = problem(size=24, polychromatic=True)
+    start = ball(of, 1)
+    reasons, count = seeded(of, start)
+    settings = Settings()
+    chosen = make_plan(start, of, settings, "cpu")
+    seeds = of.seeds(start, chosen, settings, torch.device("cpu"))
+    scene = of.scene(chosen, settings, torch.device("cpu"))
+    middle = seeds.select(seeds.position.norm(dim=1).argmin()[None])
+    views = of.rays(chosen, settings, torch.device("cpu")).views.select([0])
+    image = project_gaussians(middle, middle.attenuation[None], views, scene.kernel, settings.cutoff)[0]
+    told = reasons["work"].split()
+    assert float(told[0]) == count
+    assert float(told[3]) == pytest.approx(int((image > 0).sum()), rel=0.35)
+
+
+def test_dense_matter_that_only_the_fit_shows_is_told(caplog):
+    of = problem(polychromatic=True)
+    chosen = plan(of, ball(of, 1))
+    basis = np.ones((1, 2, 2, 2), np.float32)
+    assert of.all_curves(basis, chosen, 2.2).shape == (3, 2, 2, 2) and not caplog.records
+    assert not of.all_curves(basis, chosen, 2.2)[1:].any()
+    with caplog.at_level(logging.WARNING):
+        of.all_curves(3 * basis, chosen, 2.2)
+    assert "bone_level" in caplog.text and "3 soft references" in chosen.reasons["curves"]
 
 
 def test_an_empty_start_can_be_planned():

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tomo_polysplat.cli import bench_physics
+from tomo_polysplat.cli import bench_physics, bench_plan
 from tomo_polysplat.cli.options import add_solver_options, write_json
 
 if TYPE_CHECKING:
@@ -40,7 +40,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     hard.add_argument("--device", default="auto", help="auto (default), cpu, cuda or cuda:N")
     hard.add_argument("--only", nargs="+", default=[], metavar="NAME", help="these cases (default: all)")
     spectrum, materials = bench_physics.add_parsers(what)
-    for child in (kernels, recon, accuracy, ablation, hard, spectrum, materials):
+    plan = bench_plan.add_parser(what)
+    for child in (kernels, recon, accuracy, ablation, hard, spectrum, materials, plan):
         child.add_argument(
             "--record",
             metavar="FOLDER",
@@ -133,6 +134,7 @@ def run(arguments: argparse.Namespace) -> int:
         "hard": _hard,
         "spectrum": partial(bench_physics.spectrum, write=_write),
         "materials": partial(bench_physics.materials, write=_write),
+        "plan": partial(bench_plan.plan, write=_write, write_text=_write_text),
     }
     return commands[arguments.what](arguments)
 

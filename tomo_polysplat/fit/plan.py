@@ -47,6 +47,8 @@ class Plan:
         Soft reference: g/cm3, or 1/unit when monochromatic.
     spacing : float
         Distance of the seeds in voxels.
+    finer : float
+        Share of the Gaussians that is seeded twice as finely as the rest; see ``model.seed``.
     views_per_step : int
     tv_box : int
         Edge in voxels of the random box whose total variation a step takes.
@@ -58,6 +60,7 @@ class Plan:
 
     reference: float
     spacing: float
+    finer: float
     views_per_step: int
     tv_box: int
     curves: int
@@ -78,11 +81,11 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     """
     reference, why = _reference(mass_level(start) / problem.depth, problem.polychromatic)
     support = int((start > settings.support_level * reference * problem.depth).sum())
-    spacing, because = _seed_spacing(support, problem, settings, device)
+    spacing, finer, because = _seed_spacing(support, problem, settings, device)
     views, reason = _views_per_step(problem.geometry.views, settings, _MOST_VIEWS[device])
     box = settings.tv_box or (_TV_BOX_PLANAR if problem.planar else _TV_BOX[device])
     curves, needed = _curves(start, reference * problem.depth, problem.polychromatic, settings)
-    plan = Plan(reference, spacing, views, box, curves)
+    plan = Plan(reference, spacing, finer, views, box, curves)
     unit = "g/cm3" if problem.polychromatic else "per unit of length"
     plan.reasons = {
         "model": "polychromatic: a spectrum was given"
@@ -98,6 +101,8 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
         "seed_spacing_voxels": f"{spacing:.2f}: {because}",
         "views_per_step": f"{views} of {problem.geometry.views}: {reason}",
         "smoothed_box": _smoothed(box, start, settings),
+        "passes": f"{settings.passes:g} over the views at most, fewer where {settings.held_out:.1%} of the rays, held"
+        f" out of the fit, have not improved for {settings.patience}",
     }
     return plan
 
@@ -149,18 +154,22 @@ def _curves(
     )
 
 
-def _seed_spacing(support: int, problem: Problem, settings: Settings, device: str) -> tuple[float, str]:
-    """Distance of the seeds in voxels (the shortest edge), for a support of as many voxels."""
+def _seed_spacing(
+    support: int, problem: Problem, settings: Settings, device: str
+) -> tuple[float, float, str]:
+    """Distance of the seeds in voxels (the shortest edge), for a support of as many voxels, and the finer share."""
     if settings.seed_spacing:
-        return settings.seed_spacing, "asked for"
+        return settings.seed_spacing, 0.0, "asked for"
     dims = 2 if problem.planar else 3
     most = settings.max_gaussians or _MOST_GAUSSIANS[device]
     finest, because = _finest_spacing(problem)
     cells = support * float(np.prod(problem.grid.voxel_size[:dims] / problem.voxel))
     crowded = (cells / most) ** (1 / dims)
-    if crowded > finest:
-        return crowded, f"at most {most} Gaussians over {support} voxels of support"
-    return finest, because
+    if crowded <= finest:
+        return finest, 0.0, because
+    because = f"at most {most} Gaussians over {support} voxels of support"
+    finer = settings.finer_seeds
+    return crowded, finer, f"{because}, {finer:.0%} of them closer where the start varies"
 
 
 def _finest_spacing(problem: Problem) -> tuple[float, str]:

@@ -6,6 +6,7 @@ the first reconstruction on happens in them, so that no choice, and not even rou
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -18,6 +19,7 @@ from tomo_polysplat.checks import require_choice
 from tomo_polysplat.fit.memory import projections_stay, require_room
 from tomo_polysplat.fit.noise import photons_per_ray
 from tomo_polysplat.fit.plan import Plan
+from tomo_polysplat.fit.plan_costs import alternatives, work
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.kernels import select
@@ -36,6 +38,8 @@ from tomo_polysplat.start.initial import initial_volume_on
 from tomo_polysplat.units import LENGTH_UNITS, cm_per
 
 __all__ = ["Problem"]
+
+logger = logging.getLogger(__name__)
 
 # Beyond this a ray says "opaque", not how opaque: the spectral nodes are fitted up to it at most.
 _LARGEST_PROJECTION = 15.0
@@ -202,13 +206,17 @@ class Problem:
         relative = start / (self.depth * plan.reference)
         spacing = plan.spacing * self.voxel
         several = plan.curves > 1
-        gaussians = seed_gaussians(relative, self.grid, spacing, settings, several, self.planar, device)
+        gaussians = seed_gaussians(
+            relative, self.grid, spacing, settings, several, self.planar, device, plan.finer
+        )
         free = int((gaussians.group < 0).sum())
         plan.reasons["gaussians"] = f"{len(gaussians)}" + (
             f", the material number free for {free} and for {len(gaussians.shared_material) - 1} pieces of metal"
             if several
             else ", none with a material number of its own"
         )
+        plan.reasons["work"] = work(plan, self, settings, len(gaussians))
+        plan.reasons["alternatives"] = alternatives(plan, self, settings, len(gaussians))
         values = self.measured(device)
         plan.reasons["memory"] = require_room(
             device,
@@ -219,6 +227,21 @@ class Problem:
             projections=values.nbytes if values.device.type == device.type else 0,
         )
         return gaussians
+
+    def all_curves(self, basis: np.ndarray, plan: Plan, dense: float) -> np.ndarray:
+        """(3, nz, ny, nx) densities of the material curves from those of the model, which may lack two.
+
+        Matter denser than so many soft references, which the start did not show, is told in the log and the plan.
+        """
+        if self.materials is None or len(basis) > 1:
+            return basis
+        found = float(basis.max(initial=0.0)) / plan.reference
+        if found > dense:
+            words = f"the fit found {found:.2g} soft references where the start had none above {dense:g}"
+            words += "; a lower bone_level would free material numbers"
+            plan.reasons["curves"] += f"; {words}"
+            logger.warning("One curve may be too few: %s.", words)
+        return np.concatenate([basis, np.zeros((2, *basis.shape[1:]), np.float32)])
 
     def rays(self, plan: Plan, settings: Settings, device: torch.device) -> Rays:
         """The measured rays on the device."""
