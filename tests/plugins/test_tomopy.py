@@ -234,11 +234,14 @@ def test_a_broken_tomopy_does_not_keep_astra_from_knowing(monkeypatch, caplog):
 
 def test_the_solver_itself_in_chunks(tomopy):
     tomo, theta, truth = measured(slices=2)
-    options = {"quality": "fast", "settings": {"passes": 4}}
+    options = {"quality": "fast", "settings": {"passes": 8}}
     first = tomopy.recon(tomo, theta, algorithm=polysplat, options=options, ncore=1)
     second = tomopy.recon(tomo, theta, algorithm="polysplat", options=options, ncore=2)
     np.testing.assert_array_equal(first, second)
-    assert np.sqrt(np.mean((first - truth) ** 2)) < 0.02 * truth.max()
+    # The passes leave a grain on the blobs, most at their middles: 2.4 to 3.7 % with one seed or another, 0.3 to 0.4 %
+    # rms. Twice as much after half the passes; the start alone, which was not fitted, is 6.1 % and 0.61 % off.
+    np.testing.assert_allclose(first, truth, rtol=0, atol=0.05 * truth.max())
+    assert np.sqrt(np.mean((first - truth) ** 2)) < 0.005 * truth.max()
 
 
 def rms(volume, scan):
