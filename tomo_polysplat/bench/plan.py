@@ -113,6 +113,7 @@ def variants(scan: PlanScan) -> list[Variant]:
     curves = 1 if scan.metal else 3
     return [
         DEFAULT,
+        Variant("no spectrum", one_energy=True),
         Variant(f"{curves} curve{'s' if curves > 1 else ''}", {"curves": curves}),
         Variant("every energy a node", every),
         Variant("u free everywhere", free),
