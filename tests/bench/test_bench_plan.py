@@ -9,7 +9,7 @@ from tomo_polysplat.bench.ablation_variants import DEFAULT
 from tomo_polysplat.bench.plan import SCANS, PlanBench, variants
 from tomo_polysplat.bench.plan_report import as_markdown
 from tomo_polysplat.cli import main
-from tomo_polysplat.settings import make_settings
+from tomo_polysplat.settings import PRESETS, make_settings
 
 
 @pytest.mark.parametrize("name", SCANS)
@@ -39,11 +39,12 @@ def test_unknown_scans_are_refused():
 
 def test_the_command_leaves_a_record(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("tomo_polysplat.bench.plan.variants", lambda scan: [DEFAULT, variants(scan)[2]])
+    monkeypatch.setitem(PRESETS, "balanced", {"passes": 2.0})
     chosen = ["--scans", "narrow spectrum", "--size", "7", "--views", "12", "--device", "cpu"]
     assert main(["bench", "plan", *chosen, "--record", str(tmp_path)]) == 0
     record = json.loads((tmp_path / "plan.json").read_text())
     assert [run["method"] for run in record["runs"]] == ["default", "3 curves"]
-    assert len(record["stopping"][0]["history"]) == record["stopping"][0]["rule"]["passes"] == 10
+    assert len(record["stopping"][0]["history"]) == record["stopping"][0]["rule"]["passes"] == 2
     table = (tmp_path / "plan.md").read_text()
     assert table == as_markdown(record) and "the plan" in table and "| 3 curves |" in table
     assert table.strip() in capsys.readouterr().out
