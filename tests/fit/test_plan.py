@@ -132,6 +132,24 @@ def test_the_number_of_seeds_keeps_its_bound_for_any_voxels(stretch):
     assert "100 Gaussians" in chosen.reasons["seed_spacing_voxels"]
 
 
+def test_seeds_are_uneven_only_where_they_are_too_few():
+    of = problem(32)
+    start = ball(of, 0.2)
+    assert plan(of, start).finer == 0.0
+    assert plan(of, start, seed_spacing=2.5).finer == 0.0
+    few = plan(of, start, max_gaussians=500)
+    assert few.finer == Settings().finer_seeds and "50%" in few.reasons["seed_spacing_voxels"]
+    assert plan(of, start, max_gaussians=500, finer_seeds=0.0).finer == 0.0
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5])
+def test_uneven_seeds_are_as_many_as_even_ones(share):
+    of = problem(32)
+    start = ball(of, 0.2)
+    even, uneven = (seeded(of, start, max_gaussians=1500, finer_seeds=s) for s in (0.0, share))
+    assert len(even) * 0.8 < len(uneven) < 1.1 * len(even)
+
+
 def test_what_is_asked_for_is_taken_as_it_is():
     of = problem(planar=True)
     chosen = plan(of, ball(of, 1), seed_spacing=3.0, views_per_step=7)
