@@ -12,8 +12,10 @@ from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.render.renderer import project_gaussians
-from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, from_astra
+from tomo_polysplat.scan.usable import usable_rays
 from tomo_polysplat.settings import Settings
+from tomo_polysplat.simulate.scenes import simulate_scan
 
 WATER = 0.2  # 1/cm, for monochromatic problems
 
@@ -292,3 +294,13 @@ def test_no_hardening_leaves_one_energy():
         scene = thin.scene(chosen, settings, torch.device("cpu"))
         assert (scene.quadrature is None) == (nodes == 1)
         assert ("one energy" in chosen.reasons["hardening"]) == (nodes == 1)
+
+
+@pytest.mark.parametrize(("views", "photons"), [(44, 1e5), (44, 300.0), (9, 1e4)])
+def test_metal_is_seen_in_a_start_and_noise_is_not_taken_for_it(views, photons):
+    for metal, curves in ((True, 3), (False, 1)):
+        scan = simulate_scan("pins", 20, views, metal=metal, photons=photons)
+        values, _ = usable_rays(scan.projections, scan.proj_geom, scan.valid)
+        of = Problem.of(values, *from_astra(scan.proj_geom, scan.vol_geom), "cm", scan.spectrum, None)
+        start, _ = of.start_volume(torch.device("cpu"))
+        assert plan(of, start).curves == curves, (metal, plan(of, start).reasons["curves"])
