@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.checks import fail, require_number
+from tomo_polysplat.fit.agent import settings_for_agent
 from tomo_polysplat.fit.calibration import Calibration, calibrated, with_fitted
 from tomo_polysplat.fit.checkpoint import Checkpoint
 from tomo_polysplat.fit.optimise import FitOutcome, FitState, fit
@@ -143,7 +144,7 @@ def reconstruct(
     with one_torch_thread(target), progress_reports(progress) as report:
         report(0.0, "start volume")
         problem, calibration = _calibration(problem, wanted, chosen, target, saved, options)
-        plan, gaussians, scene, rays = _begin(problem, chosen, target, saved)
+        plan, gaussians, scene, rays = _begin(problem, chosen, target, saved, options)
         plan.reasons |= calibration
         if water_correction is not None:
             plan.reasons["water_correction"] = f"undone: {describe_polynomial(water_correction)}"
@@ -169,7 +170,7 @@ def reconstruct(
                 "unit": unit,
                 "spectrum": problem.spectrum or spectrum,
                 "flipped_2d": flipped,
-                "counts": counts | _counts(outcome),
+                "counts": counts | outcome.counts(),
                 "settings": chosen.to_dict() | {"seed": seed, "quality": quality},
             }
             result = _result(outcome, scene, grid, problem, plan, **about)
@@ -208,25 +209,35 @@ def _calibration(
 
 
 def _begin(
-    problem: Problem, settings: Settings, device: torch.device, saved: Checkpoint | None
+    problem: Problem,
+    settings: Settings,
+    device: torch.device,
+    saved: Checkpoint | None,
+    options: Mapping[str, Any],
 ) -> tuple[Plan, Gaussians, FitScene, Rays]:
     """All that a fit starts from."""
     try:
-        plan, gaussians = _first_state(problem, settings, device, saved)
+        plan, gaussians = _first_state(problem, settings, device, saved, options)
         return plan, gaussians, problem.scene(plan, settings, device), problem.rays(plan, settings, device)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("interrupted before the fit had begun: there is no result yet") from None
 
 
 def _first_state(
-    problem: Problem, settings: Settings, device: torch.device, saved: Checkpoint | None
+    problem: Problem,
+    settings: Settings,
+    device: torch.device,
+    saved: Checkpoint | None,
+    options: Mapping[str, Any],
 ) -> tuple[Plan, Gaussians]:
     """The plan and Gaussians to go on with: those of a checkpoint, or seeds of a start volume."""
     if saved is not None and saved.snapshot is not None and saved.plan is not None:
         return saved.plan, saved.snapshot.gaussians.to(device)
     start, why = problem.start_volume(device)
     plan = make_plan(start, problem, settings, device.type)
-    plan.reasons["start"] = why
+    relative = start / (problem.depth * plan.reference)
+    settings, agent = settings_for_agent(relative, problem, settings, device, options)
+    plan.reasons |= {"start": why, **agent}
     gaussians = problem.seeds(start, plan, settings, device)
     if saved is not None:
         saved.plan = plan
@@ -260,17 +271,6 @@ def _volume_of(
         return np.ascontiguousarray(whole[0, ::-1]) if flipped else whole
 
     return volume
-
-
-def _counts(outcome: FitOutcome) -> dict[str, int]:
-    """What was skipped or held at a bound."""
-    gaussians = outcome.gaussians
-    return {
-        "gaussians": len(gaussians),
-        "gaussians_at_zero": int((gaussians.attenuation <= 0).sum()),
-        "gaussians_relocated": outcome.relocated,
-        "pairs_skipped_at_source": outcome.skipped_pairs,
-    }
 
 
 def _result(

@@ -51,6 +51,8 @@ class Settings:
     """Start attenuation, in soft references, above which a Gaussian starts as bone-like."""
     metal_level: float = 6.0
     """The same for metal."""
+    metal_rim: float = 0.0
+    """Level down to which what is connected to metal belongs to it; 0: ``metal_level`` itself."""
     soft_u: float = 0.0
     """Material number of soft matter; near dense matter a start, elsewhere it stays."""
     bone_u: float = 0.35

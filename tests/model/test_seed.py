@@ -176,3 +176,17 @@ def test_seeds_on_the_gpu_are_those_of_the_cpu():
     assert len(clouds[0]) == len(clouds[1]) and torch.equal(clouds[0].group, clouds[1].group.cpu())
     for name, expected in clouds[0].parameters().items():
         torch.testing.assert_close(clouds[1].parameters()[name].cpu(), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_metal_may_reach_down_to_its_rim_where_it_is_connected():
+    start = np.ones((1, 40, 40), np.float32)
+    start[0, 8:16, 8:16], start[0, 10:14, 10:14] = 3.0, 4.0
+    start[0, 28:32, 28:32] = 3.0
+    grid = grid_of(start.shape)
+    for rim, first, last in ((0.0, 10, 14), (2.5, 8, 16)):
+        settings = Settings(metal_level=3.5, metal_u=1.0, metal_rim=rim)
+        cloud = seeds(start, grid, 1.0, polychromatic=True, settings=settings)
+        place = cloud.position[:, :2] / 0.1 + 20
+        inside = ((place > first) & (place < last)).all(dim=1)
+        assert int(inside.sum()) >= (last - first) ** 2
+        assert len(cloud.shared_material) == 2 and torch.equal(cloud.group == 1, inside)

@@ -43,6 +43,15 @@ class FitOutcome:
     relocated: int = 0
     reason: str = ""
 
+    def counts(self) -> dict[str, int]:
+        """What was skipped or held at a bound."""
+        return {
+            "gaussians": len(self.gaussians),
+            "gaussians_at_zero": int((self.gaussians.attenuation <= 0).sum()),
+            "gaussians_relocated": self.relocated,
+            "pairs_skipped_at_source": self.skipped_pairs,
+        }
+
 
 class _Fitter:
     """One run: its steps, the order of the views, and the moves of Gaussians between passes."""
@@ -80,10 +89,16 @@ class _Fitter:
             made += 1
             if made == steps:
                 self.relocation_due = share < self.settings.relocate_until
-                yield self.step.read()
+                yield self._end_pass()
                 made = 0
         if made:
-            yield self.step.read()
+            yield self._end_pass()
+
+    @torch.no_grad()
+    def _end_pass(self) -> tuple[float, float, int]:
+        # Once a pass does: in its few steps a Gaussian does not get far beyond the volume.
+        self.scene.keep_within(self.gaussians)
+        return self.step.read()
 
     def snapshot(self, best: Gaussians | None, numbers: dict[str, Any]) -> Snapshot:
         """Where the fit stands between two passes; ``numbers`` of the run are kept with it."""

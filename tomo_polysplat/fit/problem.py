@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.checks import require_choice
+from tomo_polysplat.fit.inside import matter_is_inside
 from tomo_polysplat.fit.memory import projections_stay, require_room
 from tomo_polysplat.fit.noise import photons_per_ray
 from tomo_polysplat.fit.plan import Plan
@@ -154,6 +155,7 @@ class Problem:
         # One node of one curve: -log(I/I0) is in proportion to the areal density.
         straight = quadrature is not None and quadrature.attenuation.size == 1
         slope = float(quadrature.attenuation[0, 0]) if quadrature is not None and straight else 1.0
+        closed, plan.reasons["window"] = matter_is_inside(self.measured(device), self.geometry, self.grid)
         return FitScene(
             voxel_box(self.grid),
             None if straight else quadrature,
@@ -166,6 +168,7 @@ class Problem:
             settings.metal_tail,
             settings.blur > 0 or settings.learning_rate_blur > 0,
             plan.tv_box,
+            closed,
         )
 
     def _primary(self, device: torch.device) -> torch.Tensor:

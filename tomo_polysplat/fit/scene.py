@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
 from tomo_polysplat.kernels.views import DetectorViews
@@ -43,6 +44,8 @@ class FitScene:
         Whether rays are seen through the detector's blur; see ``physics.detector_blur``.
     tv_box : int
         Edge in voxels of the random box whose total variation a step takes.
+    closed : bool
+        Whether all matter lies within the voxels, so that no Gaussian may leave them; see ``fit.inside``.
     """
 
     box: VoxelBox
@@ -56,6 +59,7 @@ class FitScene:
     metal_tail: float
     blurring: bool
     tv_box: int
+    closed: bool = False
 
     def projections(self, gaussians: Gaussians, views: DetectorViews) -> tuple[torch.Tensor, int]:
         """(views, rows, columns) predicted -log(I/I0), and the pairs skipped at the source plane."""
@@ -64,6 +68,15 @@ class FitScene:
         areal = areal * self.areal_scale
         sharp = areal[0] if self.quadrature is None else polychromatic_projection(areal, self.quadrature)
         return (blurred(sharp, gaussians.blur) if self.blurring else sharp), skipped
+
+    def keep_within(self, gaussians: Gaussians) -> None:
+        """Move Gaussians that have left a closed volume back to its faces."""
+        if not self.closed:
+            return
+        lower = self.box.first - 0.5 * self.box.spacing
+        upper = lower + np.array(self.box.shape[::-1]) * self.box.spacing
+        ends = (gaussians.position.new_tensor(end) for end in (lower, upper))
+        gaussians.position.clamp_(*ends)
 
     def attenuation(self, gaussians: Gaussians, box: VoxelBox) -> torch.Tensor:
         """(nz, ny, nx) attenuation at the effective energy in soft references, at voxel centres."""

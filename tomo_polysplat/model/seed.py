@@ -51,7 +51,7 @@ def seed_gaussians(
     """
     dims = 2 if planar else 3
     values = start if isinstance(start, torch.Tensor) else torch.tensor(start)
-    start = _sharpened(values.to(device), settings.metal_level)
+    start = _sharpened(values.to(device), settings)
     points, size, cell, value = _lattices(start, grid, spacing, dims, settings, finer)
     reach = settings.free_radius * float(grid.voxel_size[:dims].min())
     own, shared, group = _materials(start, points, value, grid, reach, settings, polychromatic)
@@ -82,14 +82,27 @@ def _pieces(mask: torch.Tensor) -> tuple[tuple[slice, ...], np.ndarray, int]:
     return tuple(box), pieces, number
 
 
-def _sharpened(start: torch.Tensor, level: float) -> torch.Tensor:
+def _metal(start: torch.Tensor, settings: Settings) -> torch.Tensor:
+    """Voxels of metal, and those down to the level of its rim that are connected to some."""
+    core = start > settings.metal_level
+    if not settings.metal_rim:
+        return core
+    box, pieces, _ = _pieces(core | (start > settings.metal_rim))
+    labels = torch.from_numpy(pieces.astype(np.int64)).to(start.device)
+    touched = labels[core[box]].unique()
+    metal = torch.zeros_like(core)
+    metal[box] = torch.isin(labels, touched[touched > 0])
+    return metal
+
+
+def _sharpened(start: torch.Tensor, settings: Settings) -> torch.Tensor:
     """The start with every piece of metal cut at half its height, its mass kept and its rim made soft matter.
 
     Filtered backprojection blurs; the blurred rim of metal is many times as bright as what really lies there.
     """
     from scipy import ndimage
 
-    box, pieces, _ = _pieces(start > level)
+    box, pieces, _ = _pieces(_metal(start, settings))
     old_part = start[box].cpu().numpy()
     new_part = old_part.copy()
     for label, where in enumerate(ndimage.find_objects(pieces), 1):
@@ -246,7 +259,7 @@ def _materials(
         return own, value.new_tensor([settings.soft_u]), group
     group[_reaches(start, points, grid, settings.bone_level, reach)] = -1
     own[value > settings.bone_level] = settings.bone_u
-    box, pieces, number = _pieces(start > settings.metal_level)
+    box, pieces, number = _pieces(_metal(start, settings))
     labels = torch.zeros(start.shape, dtype=torch.int64, device=start.device)
     labels[box] = torch.from_numpy(pieces.astype(np.int64)).to(start.device)
     piece = labels[_voxel_of(points, grid)]

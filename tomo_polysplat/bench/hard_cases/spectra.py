@@ -31,20 +31,18 @@ _MORE = 0.01
 
 
 def _wrong(kvp: float, device: str) -> Findings:
-    """Water is as wrong as its own curve says; with iron in it, artefacts are no worse than SIRT's."""
+    """The spectrum makes water as wrong as its curve says; with iron in it, artefacts are no worse than SIRT's."""
     soft, wrong = soft_slice(), tube(kvp)
     assert soft.truth is not None
     water = np.abs(soft.truth / float(mass_attenuation("water", tube().effective_energy)) - 1) < 1e-3
-    result = fit(soft, device, spectrum=wrong)
+    result, right = fit(soft, device, spectrum=wrong), fit(soft, device)
     typical = np.array([np.median(soft.projections[soft.projections > 0.1])])
     expected = float(water_equivalent(typical, wrong)[0] / water_equivalent(typical, tube())[0]) - 1
     # What the wrong spectrum calls its effective energy is another one: the true one is asked for.
-    found = (
-        float(np.median(result.attenuation(tube().effective_energy)[water]) / np.median(soft.truth[water]))
-        - 1
-    )
+    shown = result.attenuation(tube().effective_energy)
+    found = float(np.median(shown[water]) / np.median(right.volume[water])) - 1
     findings = sound(result)
-    findings.at_most("error of water", abs(found), abs(expected) + _MORE)
+    findings.at_most("change of water", abs(found), abs(expected) + _MORE)
     scan = scan_of(*orbit(), metal_pin())
     volume = fit(scan, device, spectrum=wrong).attenuation(tube().effective_energy)
     classical = sirt_psnr(scan, spectrum=wrong) - SPREAD_OF_A_SLICE
@@ -75,13 +73,16 @@ def _ten_kev(device: str) -> Findings:
     spectrum = Spectrum([10.0], [1.0])
     scan = scan_of(*orbit(half=HALF * scale), spectrum=spectrum, scale=scale)
     assert scan.truth is not None
-    result = fit(scan, device)
+    result, *others = (fit(scan, device, seed=seed) for seed in range(3))
     findings = sound(result, rays_marked_invalid=scan.notes["starved_rays"])
     findings.equal("energy, keV", result.energy_kev, 10.0)
     findings.at_least("PSNR, dB", psnr_of(result.volume, scan), sirt_psnr(scan) - SPREAD_OF_A_SLICE)
     water = np.abs(scan.truth / float(mass_attenuation("water", 10.0)) - 1) < 1e-3
-    found = float(np.median(result.volume[water]) / np.median(scan.truth[water]))
-    findings.at_most("error of water", abs(found - 1), 0.01)
+    # Five passes leave a deviation of 0.5 % from seed to seed in it.
+    found = np.mean([np.median(each.volume[water]) for each in (result, *others)]) / np.median(
+        scan.truth[water]
+    )
+    findings.at_most("error of water, mean of three seeds", abs(float(found) - 1), 0.01)
     return findings
 
 
@@ -95,7 +96,7 @@ def _all_but_one(device: str) -> Findings:
     return findings
 
 
-_WRONG = "water as wrong as its curve says, and 1 %; beside iron SIRT with the same wrong spectrum"
+_WRONG = "water changes as its curve says, and 1 %; beside iron SIRT with the same wrong spectrum"
 CASES = (
     Case("wrong-kvp-81", f"81 kV for 90: {_WRONG}", _low_voltage),
     Case("wrong-kvp-99", f"99 kV for 90: {_WRONG}", _high_voltage),

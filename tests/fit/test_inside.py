@@ -1,0 +1,72 @@
+"""Whether matter lies beside a volume, told by the rays that pass beside it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tomo_polysplat.fit.inside import _crosses, matter_is_inside
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.kernels.voxelise.box import VoxelBox
+from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+
+GRID = VolumeGrid((5, 7, 9), [-0.9, -0.7, -0.5], [0.9, 0.7, 0.5])
+
+
+def scanner(beam, views=11, rows=13, columns=17):
+    angle = 2 * np.pi * np.arange(views) / views
+    across = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
+    out = np.stack([np.sin(angle), -np.cos(angle), 0 * angle], 1)
+    u, v = 0.3 * across, 0.2 * np.tile([0.0, 0.0, 1.0], (views, 1))
+    corner = -2.0 * out - 0.5 * (columns - 1) * u - 0.5 * (rows - 1) * v
+    return Geometry(beam, 4.0 * out if beam == "cone" else -out, corner, u, v, rows, columns)
+
+
+@pytest.mark.parametrize("beam", ["cone", "parallel"])
+def test_rays_that_cross_are_those_with_a_point_inside(beam):
+    geometry = scanner(beam)
+    crossed = _crosses(geometry, GRID)
+    row, column = np.mgrid[: geometry.rows, : geometry.columns][..., None]
+    for view in range(geometry.views):
+        pixel = geometry.corner[view] + row * geometry.v[view] + column * geometry.u[view]
+        origin = geometry.origin[view] if beam == "cone" else pixel - 6 * geometry.origin[view]
+        points = origin + np.linspace(0, 1, 2001)[:, None, None, None] * (pixel - origin)
+        within = ((points > GRID.lower) & (points < GRID.upper)).all(axis=-1).any(axis=0)
+        # Sampled points miss a ray that cuts a corner only.
+        assert not (within & ~crossed[view]).any() and (crossed[view] & ~within).mean() < 0.02
+    assert 0.05 < crossed.mean() < 0.95
+
+
+@pytest.mark.parametrize("beside, inside", [(0.0, True), (0.02, True), (1.0, False), (np.nan, False)])
+def test_the_rays_beside_the_volume_decide(beside, inside):
+    geometry = scanner("cone")
+    values = np.where(_crosses(geometry, GRID), 1.0, beside).astype(np.float32)
+    assert matter_is_inside(torch.from_numpy(values), geometry, GRID)[0] == inside
+
+
+def test_a_holder_on_few_rays_is_matter_beside():
+    geometry = scanner("cone")
+    values = np.where(_crosses(geometry, GRID), 1.0, 0.0).astype(np.float32)
+    values[:, :, 0] = 0.5
+    assert not matter_is_inside(torch.from_numpy(values), geometry, GRID)[0]
+
+
+def test_a_detector_that_sees_no_more_than_the_volume_tells_nothing():
+    values = torch.zeros(11, 1, 3)
+    assert not matter_is_inside(values, scanner("cone", rows=1, columns=3), GRID)[0]
+
+
+def test_what_has_left_a_closed_volume_comes_back_to_its_faces():
+    box = VoxelBox(np.array([-0.8, -0.6, -0.4]), np.array([0.2, 0.2, 0.2]), (5, 7, 9))
+    scene = FitScene(box, None, 1.0, None, None, 0.0, "reference", 3.0, 0.1, False, 8, closed=True)
+
+    class Cloud:
+        position = torch.tensor([[1.5, 0.1, -0.9], [0.85, -0.65, 0.45]])
+
+    scene.keep_within(Cloud)
+    expected = torch.tensor([[0.9, 0.1, -0.5], [0.85, -0.65, 0.45]])
+    torch.testing.assert_close(Cloud.position, expected)
+    Cloud.position = torch.tensor([[1.5, 0.1, -0.9]])
+    replace(scene, closed=False).keep_within(Cloud)
+    assert float(Cloud.position[0, 0]) == 1.5

@@ -1,0 +1,95 @@
+"""Which pieces of a start volume are a contrast agent that was named as the dense material.
+
+The curve of iodine or barium has an edge that those of bone and of the other metals lack. A mixture of the curves
+that holds some of it looks like none of them, and a material number that starts in between does not find its way
+to either end: between them the rays fit worse. Nor does the level tell, as a solution is as dense as one likes. So
+pieces start as the agent itself or as soft matter, those above a level and those below it, and short fits say
+which level fits the rays.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from scipy import ndimage
+
+from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.fit.short_fit import short_fit
+from tomo_polysplat.physics.edges import edge_inside
+from tomo_polysplat.physics.materials import Materials
+from tomo_polysplat.settings import Settings
+
+__all__ = ["levels_between", "settings_for_agent"]
+
+logger = logging.getLogger(__name__)
+
+# Between that many levels of the start, those farthest apart, the pieces are divided in turn.
+_DIVISIONS = 2
+# Of the seconds that a reconstruction may take, the share for each short fit.
+_SHARE_OF_BUDGET = 0.1
+
+
+def settings_for_agent(
+    start: torch.Tensor,
+    problem: Problem,
+    settings: Settings,
+    device: torch.device,
+    options: Mapping[str, Any],
+) -> tuple[Settings, dict[str, str]]:
+    """The settings from which seeds of a start volume fit the rays best, and the reason for the plan.
+
+    Parameters
+    ----------
+    start : (nz, ny, nx) tensor
+        First reconstruction in soft references.
+    problem : Problem
+    settings : Settings
+        They stay as they are unless a dense material was named that has an edge inside the spectrum.
+    device : torch.device
+    options : mapping
+        ``seed`` and ``time_budget`` of the reconstruction.
+    """
+    # The defaults are not named for an agent: iron has its edge at 7 keV, which only a very soft beam holds.
+    if problem.spectrum is None or problem.materials in (None, Materials()):
+        return settings, {}
+    assert problem.materials is not None
+    edge = edge_inside(problem.materials.dense, problem.spectrum)
+    levels = [] if edge is None else levels_between(start.cpu().numpy(), settings.bone_level)
+    if edge is None or not levels:
+        return settings, {}
+    choices = [settings] + [
+        replace(settings, bone_u=0.0, metal_u=1.0, metal_level=level, metal_rim=settings.bone_level)
+        for level in levels
+    ]
+    budget = options["time_budget"] and _SHARE_OF_BUDGET * options["time_budget"]
+    # Judged by the fitted rays: few are held out, and what is compared has as many parameters each time.
+    misfits = [
+        short_fit(problem, {}, replace(choice, held_out=0.0), device, options["seed"], budget).held_out
+        for choice in choices
+    ]
+    best = choices[int(np.argmin(misfits))]
+    words = ["as without an edge", *(f"the agent above {level:.3g} soft references" for level in levels)]
+    tried = ", ".join(f"{misfit:.4g} {word}" for misfit, word in zip(misfits, words))
+    reason = f"the dense material has an edge at {edge:.1f} keV; misfit of short fits: {tried}"
+    logger.info("Contrast agent: %s", reason)
+    return best, {"agent": reason}
+
+
+def levels_between(start: np.ndarray, bone_level: float) -> list[float]:
+    """Levels of a start volume, in soft references, above which its pieces may be the agent.
+
+    They lie in the widest gaps between the pieces: the middle material was named, too, and is taken to be there
+    and to be less dense. Bone would be fitted by an agent at all levels better than by soft matter, as it is
+    neither. A piece alone is the agent from ``bone_level`` on.
+    """
+    labels, number = ndimage.label(start > bone_level)
+    if number < 2:
+        return [bone_level] * number
+    tops = np.sort([np.quantile(start[labels == k + 1], 0.9) for k in range(number)])
+    widest = np.argsort(np.diff(tops))[::-1][:_DIVISIONS]
+    return [float(0.5 * (tops[k] + tops[k + 1])) for k in sorted(widest)]

@@ -1,0 +1,52 @@
+"""Whether all matter of a scan lies within its volume."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+
+__all__ = ["matter_is_inside"]
+
+_VIEWS = 24
+# Fewer rays beside the volume than this share of all say nothing.
+_FEWEST = 0.01
+# Rays beside the volume see nothing when all but this share of them stay below this part of a typical ray.
+_SHARE, _NOTHING = 0.01, 0.1
+
+
+def matter_is_inside(projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid) -> tuple[bool, str]:
+    """Whether rays pass beside the volume and see nothing there, and words that say so.
+
+    Parameters
+    ----------
+    projections : (views, rows, columns) tensor
+        -log(I/I0); NaN where a ray is not to be used.
+    geometry, grid : Geometry, VolumeGrid
+    """
+    some = np.unique(np.linspace(0, geometry.views - 1, min(_VIEWS, geometry.views)).astype(int))
+    values = np.stack([projections[int(view)].cpu().numpy() for view in some])
+    beside = ~_crosses(geometry.select(some), grid) & np.isfinite(values)
+    through = values[~beside & np.isfinite(values)]
+    if beside.sum() < max(_FEWEST * values.size, 1) or not len(through):
+        return False, "not kept within the volume: too few rays pass beside it to say what lies there"
+    typical = float(np.median(through[through >= 0.1 * through.max()])) if through.max() > 0 else 0.0
+    if float(np.quantile(values[beside], 1 - _SHARE)) > _NOTHING * typical:
+        return False, "not kept within the volume: rays beside it see matter"
+    return True, "kept within the volume: rays beside it see nothing"
+
+
+def _crosses(geometry: Geometry, grid: VolumeGrid) -> np.ndarray:
+    """(views, rows, columns) bool: rays that meet the window (its slabs: Kay and Kajiya 1986, SIGGRAPH)."""
+    row, column = np.arange(geometry.rows)[:, None, None], np.arange(geometry.columns)[None, :, None]
+    crossed = np.empty(geometry.shape, bool)
+    for view in range(geometry.views):
+        pixel = geometry.corner[view] + row * geometry.v[view] + column * geometry.u[view]
+        ray = geometry.origin[view] if geometry.beam == "parallel" else pixel - geometry.origin[view]
+        # A direction of 0 along an axis never reaches that slab's faces; a tiny one does, far away.
+        ray = np.where(np.abs(ray) < 1e-30, 1e-30, ray)
+        first, last = (grid.lower - pixel) / ray, (grid.upper - pixel) / ray
+        enters, leaves = np.minimum(first, last).max(axis=-1), np.maximum(first, last).min(axis=-1)
+        crossed[view] = enters < leaves
+    return crossed
