@@ -23,10 +23,14 @@ def scanner(beam, views=11, rows=13, columns=17):
     return Geometry(beam, 4.0 * out if beam == "cone" else -out, corner, u, v, rows, columns)
 
 
+def lines(geometry):
+    return np.arange(geometry.rows), np.arange(geometry.columns)
+
+
 @pytest.mark.parametrize("beam", ["cone", "parallel"])
 def test_rays_that_cross_are_those_with_a_point_inside(beam):
     geometry = scanner(beam)
-    crossed = _crosses(geometry, GRID)
+    crossed = _crosses(geometry, GRID, *lines(geometry))
     row, column = np.mgrid[: geometry.rows, : geometry.columns][..., None]
     for view in range(geometry.views):
         pixel = geometry.corner[view] + row * geometry.v[view] + column * geometry.u[view]
@@ -41,13 +45,13 @@ def test_rays_that_cross_are_those_with_a_point_inside(beam):
 @pytest.mark.parametrize("beside, inside", [(0.0, True), (0.02, True), (1.0, False), (np.nan, False)])
 def test_the_rays_beside_the_volume_decide(beside, inside):
     geometry = scanner("cone")
-    values = np.where(_crosses(geometry, GRID), 1.0, beside).astype(np.float32)
+    values = np.where(_crosses(geometry, GRID, *lines(geometry)), 1.0, beside).astype(np.float32)
     assert matter_is_inside(torch.from_numpy(values), geometry, GRID)[0] == inside
 
 
 def test_a_holder_on_few_rays_is_matter_beside():
     geometry = scanner("cone")
-    values = np.where(_crosses(geometry, GRID), 1.0, 0.0).astype(np.float32)
+    values = np.where(_crosses(geometry, GRID, *lines(geometry)), 1.0, 0.0).astype(np.float32)
     values[:, :, 0] = 0.5
     assert not matter_is_inside(torch.from_numpy(values), geometry, GRID)[0]
 

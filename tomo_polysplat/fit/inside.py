@@ -9,7 +9,8 @@ from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 
 __all__ = ["matter_is_inside"]
 
-_VIEWS = 24
+# Views, and rows and columns of each, that are looked at.
+_VIEWS, _LINES = 24, 256
 # Fewer rays beside the volume than this share of all say nothing.
 _FEWEST = 0.01
 # Rays beside the volume see nothing when all but this share of them stay below this part of a typical ray.
@@ -26,8 +27,9 @@ def matter_is_inside(projections: torch.Tensor, geometry: Geometry, grid: Volume
     geometry, grid : Geometry, VolumeGrid
     """
     some = np.unique(np.linspace(0, geometry.views - 1, min(_VIEWS, geometry.views)).astype(int))
-    values = np.stack([projections[int(view)].cpu().numpy() for view in some])
-    beside = ~_crosses(geometry.select(some), grid) & np.isfinite(values)
+    rows, columns = (np.arange(0, count, -(-count // _LINES)) for count in (geometry.rows, geometry.columns))
+    values = np.stack([projections[int(view)].cpu().numpy()[np.ix_(rows, columns)] for view in some])
+    beside = ~_crosses(geometry.select(some), grid, rows, columns) & np.isfinite(values)
     through = values[~beside & np.isfinite(values)]
     if beside.sum() < max(_FEWEST * values.size, 1) or not len(through):
         return False, "not kept within the volume: too few rays pass beside it to say what lies there"
@@ -37,10 +39,10 @@ def matter_is_inside(projections: torch.Tensor, geometry: Geometry, grid: Volume
     return True, "kept within the volume: rays beside it see nothing"
 
 
-def _crosses(geometry: Geometry, grid: VolumeGrid) -> np.ndarray:
+def _crosses(geometry: Geometry, grid: VolumeGrid, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """(views, rows, columns) bool: rays that meet the window (its slabs: Kay and Kajiya 1986, SIGGRAPH)."""
-    row, column = np.arange(geometry.rows)[:, None, None], np.arange(geometry.columns)[None, :, None]
-    crossed = np.empty(geometry.shape, bool)
+    row, column = rows[:, None, None], columns[None, :, None]
+    crossed = np.empty((geometry.views, len(rows), len(columns)), bool)
     for view in range(geometry.views):
         pixel = geometry.corner[view] + row * geometry.v[view] + column * geometry.u[view]
         ray = geometry.origin[view] if geometry.beam == "parallel" else pixel - geometry.origin[view]
