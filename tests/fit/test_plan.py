@@ -98,6 +98,18 @@ def test_a_monochromatic_reference_is_the_object_itself():
         assert plan(of, ball(of, WATER / factor)).reference == pytest.approx(WATER / factor, rel=1e-6)
 
 
+def test_a_monochromatic_reference_is_that_of_walls_too_thin_to_show_it_and_not_of_metal():
+    of = problem()
+    start = ball(of, WATER)
+    thin, metal = start.copy(), start.copy()
+    thin[::2] *= 0.5
+    metal[6, 6, :] = 30 * WATER * of.depth
+    share = metal[6, 6].sum() / metal.sum()
+    assert 0.3 < share < 0.5
+    for volume in (thin, metal):
+        assert plan(of, volume).reference == pytest.approx(WATER, rel=1e-6)
+
+
 @pytest.mark.parametrize("factor", [10.0, 1e-3, 1 / 3, 1e4])
 def test_the_solver_sees_the_same_scan_in_any_unit(factor):
     one, other = problem(), problem(factor=factor)
