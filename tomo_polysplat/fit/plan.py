@@ -114,7 +114,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
 
 
 def mass_level(volume: np.ndarray | torch.Tensor, share: float = 0.5) -> float:
-    """The value below which a share of the mass of a volume lies; half: its main matter, whatever noise and metal do."""
+    """The value below which a share of a volume's mass lies; half: its main matter, whatever noise and metal do."""
     values = torch.as_tensor(volume)
     values = values[values > 0].double().sort().values
     if not len(values):
