@@ -37,7 +37,7 @@ _TV_BOX, _TV_BOX_PLANAR = {"cpu": 48, "cuda": 128}, 256
 # Gaussians that a laptop and a GPU fit in a time people wait for.
 _MOST_GAUSSIANS = {"cpu": 60_000, "cuda": 400_000}
 # Of the mass that is no denser than so many times the level of half of it, the share below the main matter's
-# attenuation. Too low a reference smooths too much: thin walls lost 5 dB with the level of half the mass.
+# attenuation. Too low a reference smooths too much (walls of a voxel, one energy: 20.8 dB with half the mass, 21.6).
 _NOT_METAL, _MAIN_SHARE = 3.0, 0.7
 
 
