@@ -164,8 +164,9 @@ def reconstruct(
         )
         with postponed_interrupts("the volume") as interruption:
             report(1.0, "volume")
-            fitted = chosen.learning_rate_blur > 0
-            plan.reasons["detector_blur"] = describe_blur(outcome.gaussians.blur, fitted=fitted)
+            if plan.blurred:
+                fitted = chosen.learning_rate_blur > 0
+                plan.reasons["detector_blur"] = describe_blur(float(outcome.gaussians.blur), fitted=fitted)
             about = {
                 "unit": unit,
                 "spectrum": problem.spectrum or spectrum,

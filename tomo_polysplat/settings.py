@@ -38,7 +38,7 @@ class Settings:
     seed_spacing: float = 0.0
     """Distance of the seeds in voxels; 0 leaves it to the plan."""
     finer_seeds: float = 0.5
-    """Where there are fewer Gaussians than the detector could tell apart, the share of them that lies twice as close."""
+    """Where Gaussians are fewer than the detector could tell apart, the share of them that lies twice as close."""
     seed_width: float = 0.6
     """Standard deviation of a seed in units of the spacing."""
     support_level: float = 0.1
@@ -69,9 +69,9 @@ class Settings:
     learning_rate_shared: float = 5e-3
     """Of each piece of metal's one number."""
     blur: float = 0.1
-    """Variance of the detector's blur along rows and along columns, in squared pixels, that the fit starts from."""
+    """Variance of the detector's blur along rows and along columns, in squared pixels, that a fit of it starts from."""
     learning_rate_blur: float = 1e-2
-    """0 holds the blur; with ``blur`` 0, rays are infinitely thin."""
+    """The blur is fitted where there is metal; 0 holds it, and with ``blur`` 0 rays are infinitely thin."""
     material_from: float = 0.4
     """Share of the run after which the metals' numbers are fitted: before, they would explain blur."""
     final_rate: float = 0.1

@@ -48,8 +48,8 @@ def a_step_without_smoothing_held_out_rays_or_blur(device):
 
 
 @case
-def the_slope_by_the_blur_beside_opaque_rays(device):
-    """Without a blur it is large, and yet a sum of whole numbers."""
+def the_slope_by_the_blur_behind_much_matter(device):
+    """As large as the projections, and yet a sum of whole numbers."""
     slopes = []
     for where, kernel, form in ((device, "triton", _fused), ("cpu", "numba", lambda *p: EagerStep(*p[:-2]))):
         problem = fit_problem("cone", True, where, kernel, held_out=0.0, loss="l1")
@@ -58,7 +58,7 @@ def the_slope_by_the_blur_beside_opaque_rays(device):
         step = form(*problem[:-1], BATCH, problem[-1])
         step(np.array([0, 3]), problem[-1], 0.0)
         slopes.append(10 * float(step.moments["blur"][0]))
-    assert abs(slopes[0] / slopes[1] - 1) < 1e-3 and abs(slopes[1]) > 100, slopes
+    assert abs(slopes[0] / slopes[1] - 1) < 1e-3 and abs(slopes[1]) > 0.1, slopes
 
 
 @case

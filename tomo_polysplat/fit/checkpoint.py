@@ -211,7 +211,8 @@ def _plan(parts: dict[str, Any]) -> Plan:
     plan = Plan(**parts)
     above_zero = min(plan.reference, plan.spacing, plan.views_per_step, plan.tv_box) > 0
     whole = isinstance(plan.views_per_step, int) and isinstance(plan.tv_box, int)
-    if not (above_zero and whole and plan.curves in (1, 3) and isinstance(plan.reasons, dict)):
+    choices = plan.curves in (1, 3) and isinstance(plan.blurred, bool)
+    if not (above_zero and whole and choices and isinstance(plan.reasons, dict)):
         raise TypeError(f"a plan, got {parts}")
     return plan
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from tomo_polysplat.physics.detector_blur import describe_blur
 from tomo_polysplat.settings import Settings
 
 if TYPE_CHECKING:
@@ -58,6 +59,8 @@ class Plan:
         Edge in voxels of the random box whose total variation a step takes.
     curves : int
         Material curves of the model: three, or the first alone, as for a monochromatic one.
+    blurred : bool
+        Whether rays are seen through the detector's blur; see ``physics.detector_blur``.
     reasons : dict
         Decision by decision, what was chosen and why; it becomes ``Result.plan``.
     """
@@ -68,6 +71,7 @@ class Plan:
     views_per_step: int
     tv_box: int
     curves: int
+    blurred: bool
     reasons: dict[str, Any] = field(default_factory=dict)
 
 
@@ -90,8 +94,10 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     most = _MOST_VIEWS_PLANAR if problem.planar else _MOST_VIEWS[device]
     views, reason = _views_per_step(problem.geometry.views, settings, most)
     box = settings.tv_box or (_TV_BOX_PLANAR if problem.planar else _TV_BOX[device])
-    curves, needed = _curves(start, reference * problem.depth, problem.polychromatic, settings)
-    plan = Plan(reference, spacing, finer, views, box, curves)
+    soft = reference * problem.depth
+    curves, needed = _curves(start, soft, problem.polychromatic, settings)
+    blurred, told = _blurred(start, soft, settings)
+    plan = Plan(reference, spacing, finer, views, box, curves, blurred)
     unit = "g/cm3" if problem.polychromatic else "per unit of length"
     plan.reasons = {
         "model": "polychromatic: a spectrum was given"
@@ -107,6 +113,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
         "seed_spacing_voxels": f"{spacing:.2f}: {because}",
         "views_per_step": f"{views} of {problem.geometry.views}: {reason}",
         "smoothed_box": _smoothed(box, start, settings),
+        "detector_blur": told,
         "passes": f"{settings.passes:g} over the views at most, fewer where {settings.held_out:.1%} of the rays, held"
         f" out of the fit, have not improved for {settings.patience}",
     }
@@ -164,6 +171,15 @@ def _curves(
     return 1, (
         f"the densest voxel of the start has {largest:.2g} soft references, so that no material number would be free"
     )
+
+
+def _blurred(start: np.ndarray | torch.Tensor, soft: float, settings: Settings) -> tuple[bool, str]:
+    """Whether the detector's blur is modelled: where it is to be fitted, metal must show that edges are sharp."""
+    if not settings.learning_rate_blur:
+        return settings.blur > 0, describe_blur(settings.blur, fitted=False)
+    if bool((start > settings.metal_level * soft).any()):
+        return True, "fitted"
+    return False, "none: without metal, a smooth object and a detector that blurs look alike"
 
 
 def _seed_spacing(

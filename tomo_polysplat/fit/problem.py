@@ -166,7 +166,7 @@ class Problem:
             kernel,
             settings.cutoff,
             settings.metal_tail,
-            settings.blur > 0 or settings.learning_rate_blur > 0,
+            plan.blurred,
             plan.tv_box,
             closed,
         )

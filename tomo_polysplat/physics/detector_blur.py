@@ -1,12 +1,16 @@
-r"""What a detector does to an image: light that belongs to a pixel is counted in its neighbours.
+r"""How much wider than a ray through its centre a pixel sees.
 
-A pixel averages over its own area, and focal spot and scintillator spread light further. All of it acts on
-intensities, before the logarithm:
+A pixel averages over its own area, focal spot and scintillator spread light further, and simulated scans blur by how
+they interpolate. The model takes all of it together, as a blur of the projections:
 
-.. math:: P'_k = -\log \sum_j A_{kj} e^{-P_j}
+.. math:: P'_k = \sum_j A_{kj} P_j
 
 with A the blur of three taps (v/2, 1-v, v/2) along rows and along columns, whose variance is v squared pixels; the
 image is continued by its border. Averaging over a pixel's own area alone has v = 1/12.
+
+Light is spread before the logarithm, and -log of mixed light is less than this. But what mixed light hides at the edges
+of opaque metal could be any amount of metal: a model that mixes light has metal to spare wherever that mends another
+error of its edges (docs/accuracy.md), and this one does not.
 """
 
 from __future__ import annotations
@@ -20,7 +24,7 @@ LARGEST_BLUR = 0.6
 
 
 def blurred(projections: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
-    """Projections as a blurring detector sees them.
+    """Projections as pixels of some extent see them.
 
     Parameters
     ----------
@@ -35,23 +39,18 @@ def blurred(projections: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
         Differentiable by both. An axis of one pixel is not blurred.
     """
     beside, same = 0.5 * variance, 1 - variance
-    weights = torch.stack([beside, same, beside])[..., None, None]
     for axis in (1, 2):
         count = projections.shape[axis]
         if count > 1:
             first, last = projections.narrow(axis, 0, 1), projections.narrow(axis, count - 1, 1)
             wide = torch.cat([first, projections, last], dim=axis)
-            taps = torch.stack([wide.narrow(axis, k, count) for k in range(3)])
-            # The brightest ray is taken out of the sum: that of opaque ones would be zero.
-            brightest = taps.detach().amin(dim=0)
-            passed = (weights * torch.exp(brightest - taps)).sum(dim=0)
-            projections = brightest - torch.log(passed.clamp(min=torch.finfo(passed.dtype).tiny))
+            before, after = (wide.narrow(axis, k, count) for k in (0, 2))
+            projections = same * projections + beside * (before + after)
     return projections
 
 
-def describe_blur(variance: torch.Tensor, *, fitted: bool) -> str:
-    """What a reconstruction took for the blur, in words; the ``variance``, (1,), in squared pixels."""
-    value = float(variance)
-    if not (fitted or value):
-        return "none: rays are infinitely thin"
-    return f"variance of {value:.3f} squared pixels, {'fitted' if fitted else 'held as asked for'}"
+def describe_blur(variance: float, *, fitted: bool) -> str:
+    """What a reconstruction took for the blur, in words; the ``variance`` in squared pixels."""
+    if not (fitted or variance):
+        return "none, as asked for: rays are infinitely thin"
+    return f"variance of {variance:.3f} squared pixels, {'fitted' if fitted else 'held as asked for'}"

@@ -22,7 +22,7 @@ FIRST_DECAY, SECOND_DECAY = 0.9, 0.999
 _KEEP_FIRST, _KEEP_SECOND = tl.constexpr(FIRST_DECAY), tl.constexpr(SECOND_DECAY)
 # Gradients of what many share are added up in whole numbers of 1 / WHOLE, in any order to the same bits.
 WHOLE = tl.constexpr(2.0**50)
-# The blur's can be millions of times as steep.
+# The blur's can be thousands of times as steep, as far as projections reach.
 WHOLE_OF_BLUR = tl.constexpr(2.0**40)
 _BLOCK = 128
 
