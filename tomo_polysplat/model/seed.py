@@ -1,7 +1,8 @@
 """Gaussians to start from: a regular grid over the support of a first reconstruction.
 
 The grid is twice as fine at metal, whose edges are where an error of position costs most. Where there are fewer
-Gaussians than the detector could tell apart, it is coarser, and twice as fine also where the start varies.
+Gaussians than the detector could tell apart, it is coarser, but twice as fine where the start varies and three times
+as fine at metal.
 """
 
 from __future__ import annotations
@@ -122,11 +123,14 @@ def _lattices(
     """Points (n, 3) on the support; spacing, volume of the cell and the start's mean over it, (n,) each."""
     spacing = spacing / (1 - finer) ** (1 / dims)
     coarse, step = _lattice(grid, spacing, dims, start.device)
-    fine = _reaches(start, coarse, grid, settings.metal_level, spacing)
+    metal = _reaches(start, coarse, grid, settings.metal_level, spacing)
+    parted = {1: ~metal, 2: metal}
     if finer:
-        fine |= _varied(start, coarse, grid, step, settings, finer)
+        varied = _varied(start, coarse, grid, step, settings, finer) & ~metal
+        parted = {1: ~(metal | varied), 2: varied, 3: metal}
     parts = []
-    for points, share in ((coarse[~fine], 1.0), (_split(coarse[fine], step), 0.5)):
+    for times, chosen in parted.items():
+        points, share = _split(coarse[chosen], step, times), 1 / times
         value, nearby = _sample(start, points, grid, share * step)
         keep = nearby > settings.support_level
         points, value = points[keep], value[keep].clamp(min=_LEAST)
@@ -205,10 +209,11 @@ def _box_mean(volume: torch.Tensor, cells: np.ndarray) -> torch.Tensor:
     return torch.nn.functional.avg_pool3d(padded, cells.tolist(), stride=1)[0, 0]
 
 
-def _split(points: torch.Tensor, step: np.ndarray) -> torch.Tensor:
-    """Every lattice point replaced by the 2^dims points of a lattice of half the steps in its cell."""
+def _split(points: torch.Tensor, step: np.ndarray, times: int) -> torch.Tensor:
+    """Every lattice point replaced by those of a lattice so many ``times`` as fine in its cell."""
     dims = len(step)
-    corners = np.stack(np.meshgrid(*[[-0.25, 0.25]] * dims, indexing="ij"), -1).reshape(-1, dims)
+    along = (np.arange(times) + 0.5) / times - 0.5
+    corners = np.stack(np.meshgrid(*[along] * dims, indexing="ij"), -1).reshape(-1, dims)
     offsets = np.zeros((len(corners), 3))
     offsets[:, :dims] = corners * step
     return (points[:, None] + torch.from_numpy(offsets).to(points.device)).reshape(-1, 3)
