@@ -65,6 +65,7 @@ def short_fit(
     device: torch.device,
     seed: int,
     budget: float | None,
+    fewest_steps: int = _FEWEST_STEPS,
 ) -> ShortFit:
     """Two passes over the views, or more where they are few.
 
@@ -77,6 +78,8 @@ def short_fit(
     seed : int
     budget : float or None
         Seconds it may take.
+    fewest_steps : int
+        Steps of the optimiser at least.
 
     Raises
     ------
@@ -86,7 +89,7 @@ def short_fit(
     start, _ = problem.start_volume(device)
     # What is calibrated is judged by the areal densities of all three curves.
     plan = make_plan(start, problem, replace(settings, curves=3), device.type)
-    passes = max(_PASSES, _FEWEST_STEPS * plan.views_per_step / problem.geometry.views)
+    passes = max(_PASSES, fewest_steps * plan.views_per_step / problem.geometry.views)
     short = replace(settings, passes=min(passes, settings.passes))
     scene, rays = problem.scene(plan, short, device), problem.rays(plan, short, device)
     started = time.perf_counter()
