@@ -72,7 +72,7 @@ def settings_for_agent(
     budget = options["time_budget"] and _SHARE_OF_BUDGET * options["time_budget"]
     # Judged by the fitted rays, as few are held out, with as many parameters each time: the level of metal, which
     # differs, would otherwise decide on the blur as well.
-    alike = {"held_out": 0.0, "blur": 0.0, "learning_rate_blur": 0.0}
+    alike: dict[str, Any] = {"held_out": 0.0, "blur": 0.0, "learning_rate_blur": 0.0}
     misfits = [
         short_fit(problem, {}, replace(choice, **alike), device, options["seed"], budget, _STEPS).held_out
         for choice in choices
