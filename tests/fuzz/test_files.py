@@ -59,6 +59,21 @@ def test_datasets_that_hold_no_numbers(tmp_path, trick):
         load_scan(file)
 
 
+@pytest.mark.parametrize("kind", [h5py.vlen_dtype(np.dtype("f4")), h5py.ref_dtype, np.dtype([("a", "f4")])])
+def test_attributes_that_are_no_numbers_or_texts(tmp_path, kind):
+    """Of a damaged one h5py reads what is not there, and the process ends."""
+    path = exchange(tmp_path / "scan.h5")
+    with h5py.File(path, "a") as file:
+        attributes = file["polysplat/geometry"].attrs
+        del attributes["astra_type"]
+        h5py.h5a.create(
+            file["polysplat/geometry"].id, b"astra_type", h5py.h5t.py_create(kind, logical=True),
+            h5py.h5s.create(h5py.h5s.SCALAR),
+        )  # fmt: skip
+    with pytest.raises(ValueError, match="astra_type.*a number or a text"):
+        load_scan(path)
+
+
 def test_soft_links_within_the_file_are_followed(tmp_path):
     file = exchange(tmp_path / "scan.h5")
     with h5py.File(file, "r+") as handle:

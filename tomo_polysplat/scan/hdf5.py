@@ -194,11 +194,16 @@ def read_attribute(item: h5py.HLObject, name: str) -> Any:
     ValueError
         If it is of a type that NumPy does not have, or large.
     """
+    import h5py
+
     if name not in item.attrs:
         return None
     try:
         about = item.attrs.get_id(name)
         size = math.prod(about.shape or ()) * about.dtype.itemsize
+        # Of what else there is, lists of a length of their own that are damaged end the process.
+        if about.dtype.kind not in "fiubS" and h5py.check_string_dtype(about.dtype) is None:
+            raise TypeError(f"values of type {about.dtype}")
         value = item.attrs[name] if size <= _LARGEST_ATTRIBUTE else None
     except (TypeError, ValueError) as error:
         raise fail(f"attribute '{name}' of {item.name}", "a number or a text", str(error)) from error
