@@ -34,7 +34,7 @@ class Settings:
     views_per_step: int = 0
     """Views whose gradients make one step of the optimiser; 0 leaves it to the plan."""
     max_gaussians: int = 0
-    """About how many Gaussians at most, not counting that metal is seeded twice as finely; 0 leaves it to the plan."""
+    """About how many Gaussians at most, not counting that metal is seeded more finely; 0 leaves it to the plan."""
     seed_spacing: float = 0.0
     """Distance of the seeds in voxels; 0 leaves it to the plan."""
     finer_seeds: float = 0.5
