@@ -132,9 +132,9 @@ def run(arguments: argparse.Namespace) -> int:
         "accuracy": _accuracy,
         "ablation": _ablation,
         "hard": _hard,
-        "spectrum": partial(bench_physics.spectrum, write=_write),
-        "materials": partial(bench_physics.materials, write=_write),
-        "plan": partial(bench_plan.plan, write=_write, write_text=_write_text),
+        "spectrum": partial(bench_physics.spectrum, write=_write, say=_say),
+        "materials": partial(bench_physics.materials, write=_write, say=_say),
+        "plan": partial(bench_plan.plan, write=_write, write_text=_write_text, say=_say),
     }
     return commands[arguments.what](arguments)
 

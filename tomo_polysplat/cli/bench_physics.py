@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -40,28 +39,28 @@ def _materials_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", type=int, default=32, help="voxels of the pins; 0: none (default: 32)")
 
 
-def spectrum(arguments: argparse.Namespace, write: Callable[..., None]) -> int:
-    """``bench spectrum``; ``write`` keeps a record."""
+def spectrum(arguments: argparse.Namespace, write: Callable[..., None], say: Callable[[str], None]) -> int:
+    """``bench spectrum``; ``write`` keeps a record, ``say`` tells what comes next."""
     from tomo_polysplat.bench.spectrum import SpectrumBench, as_markdown, run_spectrum_bench, write_figure
 
     names = ("scenes", "size", "views", "quality", "device", "seed")
     record = run_spectrum_bench(
         SpectrumBench(**{name: getattr(arguments, name) for name in names}),
-        progress=lambda words: print(words, file=sys.stderr, flush=True),
+        progress=say,
         update=lambda so_far: write(arguments, "spectrum.json", so_far, quiet=True),
     )
     write(arguments, "spectrum.json", record)
     return _tell(arguments, "spectrum", record, as_markdown(record), write_figure)
 
 
-def materials(arguments: argparse.Namespace, write: Callable[..., None]) -> int:
-    """``bench materials``; ``write`` keeps a record."""
+def materials(arguments: argparse.Namespace, write: Callable[..., None], say: Callable[[str], None]) -> int:
+    """``bench materials``; ``write`` keeps a record, ``say`` tells what comes next."""
     from tomo_polysplat.bench.materials import MaterialsBench, as_markdown, run_materials_bench, write_figure
 
     names = ("kvp", "aluminium_cm", "largest", "size", "device")
     record = run_materials_bench(
         MaterialsBench(**{name: getattr(arguments, name) for name in names}),
-        progress=lambda words: print(words, file=sys.stderr, flush=True),
+        progress=say,
     )
     write(arguments, "materials.json", record)
     return _tell(arguments, "materials", record, as_markdown(record), write_figure)

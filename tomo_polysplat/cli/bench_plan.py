@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,8 +21,13 @@ def add_parser(what: Any) -> argparse.ArgumentParser:
     return parser
 
 
-def plan(arguments: argparse.Namespace, write: Callable[..., None], write_text: Callable[..., None]) -> int:
-    """``bench plan``; ``write`` and ``write_text`` keep a record."""
+def plan(
+    arguments: argparse.Namespace,
+    write: Callable[..., None],
+    write_text: Callable[..., None],
+    say: Callable[[str], None],
+) -> int:
+    """``bench plan``; ``write`` and ``write_text`` keep a record, ``say`` tells what comes next."""
     from tomo_polysplat.bench.plan import PlanBench, run_plan_bench
     from tomo_polysplat.bench.plan_report import as_markdown, write_figure
 
@@ -32,7 +36,7 @@ def plan(arguments: argparse.Namespace, write: Callable[..., None], write_text: 
         chosen["scans"] = tuple(arguments.scans)
     record = run_plan_bench(
         PlanBench(**chosen),
-        progress=lambda words: print(words, file=sys.stderr, flush=True),
+        progress=say,
         update=lambda so_far: write(arguments, "plan.json", so_far, quiet=True),
     )
     table = as_markdown(record)
