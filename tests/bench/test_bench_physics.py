@@ -28,6 +28,15 @@ def test_one_case_of_the_spectrum(tmp_path):
     json.dumps(record)
 
 
+def test_a_scanner_corrects_for_water_what_the_benchmark_undoes(tmp_path):
+    cases = ("right", "water-corrected, told", "water-corrected, not told")
+    bench = spectrum.SpectrumBench(scenes=("lung-control",), cases=cases, size=12, views=24)
+    record = spectrum.run_spectrum_bench(bench, cache=tmp_path)
+    right, told, not_told = (run["psnr_all"] for run in record["runs"] if not run["calibrated"])
+    assert told == pytest.approx(right, abs=0.2)
+    assert not_told < right - 0.5
+
+
 @pytest.mark.parametrize("wrong", [{"scenes": ("kidney",)}, {"cases": ("kVp x 3",)}, {"quality": "good"}])
 def test_unknown_names_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):

@@ -1,9 +1,9 @@
-"""What wrong physics costs: tube voltage, filters, detector and scatter, with and without calibration."""
+"""What wrong physics costs: tube, filters, detector, scatter, water correction, with and without calibration."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from tomo_polysplat.fit.short_fit import main_density
 from tomo_polysplat.physics.detector import Detector
 from tomo_polysplat.physics.materials import Materials, mass_attenuation
 from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.physics.water import water_linearised
 from tomo_polysplat.reconstruction import reconstruct
 from tomo_polysplat.report.style import ACCENT, QUIET
 from tomo_polysplat.result.metrics import compare
@@ -30,16 +31,32 @@ __all__ = ["CASES", "SpectrumBench", "as_markdown", "run_spectrum_bench", "write
 Record = dict[str, Any]
 
 _KVP, _FILTER = 90.0, 0.1
+# A scene's name with this ending is the scene without its metal.
+_WITHOUT = "-control"
+# Degree of the polynomial that a scanner is given as its water correction, as scanners have it.
+_DEGREE = 3
 
 
 @dataclass(frozen=True)
 class Case:
-    """What is assumed, as factors of what is true, and the scatter that nobody told of."""
+    """What is assumed, as factors of what is true, and what was done to the rays.
+
+    Attributes
+    ----------
+    kvp, filtration : float
+    detector : Detector or None
+        What is assumed instead of photon counting.
+    scatter : float
+        Nobody told of it.
+    water_correction : {"none", "told", "not told"}
+        Whether the scanner has corrected its rays for water, and has said so.
+    """
 
     kvp: float = 1.0
     filtration: float = 1.0
     detector: Detector | None = None
     scatter: float = 0.0
+    water_correction: str = "none"
 
     def spectrum(self) -> Spectrum:
         """The spectrum that the reconstruction is given."""
@@ -57,6 +74,8 @@ CASES = {
     "scatter 2 %": Case(scatter=0.02),
     "scatter 5 %": Case(scatter=0.05),
     "scatter 10 %": Case(scatter=0.1),
+    "water-corrected, told": Case(water_correction="told"),
+    "water-corrected, not told": Case(water_correction="not told"),
 }
 
 
@@ -67,8 +86,8 @@ class SpectrumBench:
     Attributes
     ----------
     scenes : sequence of str
-        Names of ``simulate.SCENES``; ``"lung"`` is scanned without its metal. In pins, PMMA is named as the
-        soft material.
+        Names of ``simulate.SCENES``, with ``"-control"`` after them for the scene without its metal. In pins, PMMA
+        is named as the soft material.
     cases : sequence of str
         Names of ``CASES``.
     size, views : int
@@ -77,7 +96,7 @@ class SpectrumBench:
     seed : int
     """
 
-    scenes: Sequence[str] = ("pins", "teeth", "lung")
+    scenes: Sequence[str] = ("pins", "teeth", "lung-control")
     cases: Sequence[str] = tuple(CASES)
     size: int = 48
     views: int = 120
@@ -87,7 +106,7 @@ class SpectrumBench:
 
     def __post_init__(self) -> None:
         for name in self.scenes:
-            require_choice("scenes", name, SCENES)
+            require_choice("scenes", name.removesuffix(_WITHOUT), SCENES)
         for name in self.cases:
             require_choice("cases", name, CASES)
         require_choice("quality", self.quality, PRESETS)
@@ -132,13 +151,27 @@ def run_spectrum_bench(
 
 def _scan(bench: SpectrumBench, scene: str, case: Case, cache: Path | None) -> Scan:
     physics = {"kvp": _KVP, "filters": {"Al": _FILTER}, "scatter": case.scatter}
-    options = {"photons": 1e5, "seed": bench.seed, "metal": scene != "lung"}
-    return cached_scan(scene, bench.size, bench.views, folder=cache, **physics, **options)
+    options = {"photons": 1e5, "seed": bench.seed, "metal": not scene.endswith(_WITHOUT)}
+    name = scene.removesuffix(_WITHOUT)
+    scan = cached_scan(name, bench.size, bench.views, folder=cache, **physics, **options)
+    return scan if case.water_correction == "none" else _water_corrected(scan)
+
+
+def _water_corrected(scan: Scan) -> Scan:
+    """What a scanner hands out that puts every ray through a polynomial, as if the object were water."""
+    assert scan.spectrum is not None
+    largest = float(scan.projections.max())
+    values = np.linspace(0.0, largest, 257)[1:]
+    powers = values[:, None] ** np.arange(1, _DEGREE + 1)
+    fitted = np.linalg.lstsq(powers, water_linearised(values, scan.spectrum), rcond=None)[0]
+    polynomial = np.polynomial.Polynomial([0.0, *fitted])
+    corrected = polynomial(scan.projections.astype(np.float64)).astype(np.float32)
+    return replace(scan, projections=corrected, water_correction=tuple(map(float, polynomial.coef)))
 
 
 def _run(bench: SpectrumBench, scene: str, scan: Scan, case: Case, calibrated: bool) -> Record:
     assert scan.truth is not None and scan.truth_energy_kev is not None
-    materials = Materials("pmma") if scene == "pins" else Materials()
+    materials = Materials("pmma") if scene.removesuffix(_WITHOUT) == "pins" else Materials()
     per_gram = float(mass_attenuation(materials.soft, scan.truth_energy_kev)) * cm_per(scan.unit)
     asked = {"calibrate": True, "soft_density": main_density(scan.truth / per_gram)} if calibrated else {}
     result = reconstruct(
@@ -149,6 +182,7 @@ def _run(bench: SpectrumBench, scene: str, scan: Scan, case: Case, calibrated: b
         materials=materials,
         unit=scan.unit,
         valid=scan.valid,
+        water_correction=scan.water_correction if case.water_correction == "told" else None,
         quality=bench.quality,
         seed=bench.seed,
         device=bench.device,

@@ -24,8 +24,10 @@ def add_parsers(what: Any) -> tuple[argparse.ArgumentParser, argparse.ArgumentPa
 
 def _spectrum_arguments(parser: argparse.ArgumentParser) -> None:
     add_solver_options(parser)
-    scenes = ["pins", "teeth", "lung"]
-    parser.add_argument("--scenes", nargs="+", default=scenes, help="default: pins teeth lung")
+    scenes = ["pins", "teeth", "lung-control"]
+    words = "default: pins teeth lung-control, which has no metal"
+    parser.add_argument("--scenes", nargs="+", default=scenes, help=words)
+    parser.add_argument("--cases", nargs="+", metavar="CASE", help="such as 'kVp -10 %%' (default: all)")
     parser.add_argument("--size", type=int, default=48, help="voxels per edge (default: 48)")
     parser.add_argument("--views", type=int, default=120, help="projection images (default: 120)")
     parser.add_argument("--quality", default="fast", help="fast (default), balanced or best")
@@ -44,8 +46,11 @@ def spectrum(arguments: argparse.Namespace, write: Callable[..., None], say: Cal
     from tomo_polysplat.bench.spectrum import SpectrumBench, as_markdown, run_spectrum_bench, write_figure
 
     names = ("scenes", "size", "views", "quality", "device", "seed")
+    chosen = {name: getattr(arguments, name) for name in names}
+    if arguments.cases:
+        chosen["cases"] = arguments.cases
     record = run_spectrum_bench(
-        SpectrumBench(**{name: getattr(arguments, name) for name in names}),
+        SpectrumBench(**chosen),
         progress=say,
         update=lambda so_far: write(arguments, "spectrum.json", so_far, quiet=True),
     )
