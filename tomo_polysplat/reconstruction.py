@@ -67,8 +67,8 @@ def reconstruct(
     Parameters
     ----------
     projections : array, shape (rows, views, columns), or (views, columns) for 2D geometries
-        -log(I/I0) in ASTRA's order. Values that are not finite, or that no logarithm takes, are not used, and
-        counted; nor are the masked ones of a masked array.
+        -log(I/I0) in ASTRA's order; in which order the views come changes nothing. Values that are not finite,
+        or that no logarithm takes, are not used, and counted; nor are the masked ones of a masked array.
     proj_geom, vol_geom : dict
         ASTRA geometries, lengths in ``unit``; vol_geom's window must be in the same unit.
     spectrum : Spectrum, optional

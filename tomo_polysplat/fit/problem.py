@@ -34,6 +34,7 @@ from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.water import transmitted_energy, water_equivalent
 from tomo_polysplat.render.renderer import detector_views, voxel_box
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.scan.view_order import view_order
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.initial import initial_volume_on
 from tomo_polysplat.units import LENGTH_UNITS, cm_per
@@ -95,7 +96,7 @@ class Problem:
         spectrum: Spectrum | None,
         materials: Materials | Sequence[Any] | None,
     ) -> Problem:
-        """The problem of a scan in the caller's unit; a spectrum of one energy makes it monochromatic."""
+        """The problem of a scan in the caller's unit, its views sorted; one energy makes it monochromatic."""
         require_choice("unit", unit, LENGTH_UNITS)
         if spectrum is not None and spectrum.is_monochromatic:
             spectrum = None
@@ -107,6 +108,9 @@ class Problem:
         depth = length if spectrum is None else length * cm_per(unit)
         inside = _snapped_grid(grid.normalised(grid.centre, length))
         outside = _snapped_geometry(geometry.normalised(grid.centre, length))
+        order = view_order(outside, projections)
+        if (np.diff(order) != 1).any():
+            projections, outside = projections[order], outside.select(order)
         return cls(projections, outside, inside, grid.centre, length, depth, planar, spectrum, curves)
 
     @property

@@ -1,0 +1,38 @@
+"""An order of the views that does not depend on the one in which they come."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tomo_polysplat.scan.view_geometry import Geometry
+
+__all__ = ["view_order"]
+
+
+def view_order(geometry: Geometry, projections: np.ndarray) -> np.ndarray:
+    """Indices (views,) that sort the views by angle, or along the axis where the scanner moves along it.
+
+    A fit draws views at random, holds back rays by the number of their view, and adds up in floats. Sorted, the
+    views of one scan give one volume in whatever order they come.
+
+    Parameters
+    ----------
+    geometry : Geometry
+        Angles are taken about z through the origin, from ASTRA's angle of zero.
+    projections : (views, rows, columns) array
+        Their sums tell views of the same geometry apart, as those at 0 and 360 degrees.
+    """
+    vectors = np.hstack([geometry.origin, geometry.corner, geometry.u, geometry.v])
+    angle = np.mod(np.arctan2(geometry.origin[:, 0], -geometry.origin[:, 1]), 2 * np.pi)
+    height = geometry.centre[:, 2]
+    # Turns of a helix stay apart: of neighbours each half-way round the next one, subsets would see one turn only.
+    moves = np.ptp(height) > geometry.rows * np.median(np.linalg.norm(geometry.v, axis=1))
+    keys = [*vectors.T[::-1], angle, height if moves else np.zeros_like(height)]
+    order = np.lexsort(keys)
+    same = (vectors[order[1:]] == vectors[order[:-1]]).all(axis=1)
+    if not same.any():
+        return order
+    sums = np.zeros(geometry.views)
+    for view in order[np.append(same, False) | np.insert(same, 0, False)]:
+        sums[view] = np.nansum(projections[view], dtype=np.float64)
+    return np.lexsort([sums, *keys])
