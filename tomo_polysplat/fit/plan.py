@@ -40,6 +40,9 @@ _MOST_GAUSSIANS = {"cpu": 60_000, "cuda": 400_000}
 # Of the mass that is no denser than so many times the level of half of it, the share below the main matter's
 # attenuation. Too low a reference smooths too much (walls of a voxel, one energy: 20.8 dB with half the mass, 21.6).
 _NOT_METAL, _MAIN_SHARE = 3.0, 0.7
+# Objects of solid metal are so many times as dense as water at most (rods of silver: 180, of gold: 280): only beyond
+# is the unit of length in doubt.
+_DENSEST = 600.0
 
 
 @dataclass
@@ -141,8 +144,8 @@ def _reference(level: float, polychromatic: bool) -> tuple[float, str]:
     if not polychromatic:
         return level or 1.0, f"{_MAIN_SHARE:.0%} of the start's mass lies below it, metal not counted"
     factor = 1000.0 ** round(math.log10(level) / 3) if level > 0 else 1.0
-    if factor == 1:
-        return 1.0, "water, which the object is about as dense as"
+    if factor == 1 or 1 < level <= _DENSEST:
+        return 1.0, f"water: half of the object's mass is at most {level:.3g} times as dense"
     logger.warning(
         "The object is as dense as %.3g g/cm3 of water: the unit of length looks wrong by a factor of %g.",
         level,
@@ -178,7 +181,7 @@ def _blurred(start: np.ndarray | torch.Tensor, soft: float, settings: Settings) 
     if not settings.learning_rate_blur:
         return settings.blur > 0, describe_blur(settings.blur, fitted=False)
     if bool((start > settings.metal_level * soft).any()):
-        return True, "fitted"
+        return True, f"fitted, from a variance of {settings.blur:g} squared pixels on: metal has edges that hold it"
     return False, "none: without metal, a smooth object and a detector that blurs look alike"
 
 
