@@ -10,7 +10,7 @@ from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 __all__ = ["matter_is_inside"]
 
 # Views, and rows and columns of each, that are looked at.
-_VIEWS, _LINES = 24, 256
+_VIEWS, _LINES = 24, 64
 # Fewer rays beside the volume than this share of all say nothing.
 _FEWEST = 0.01
 # Rays beside the volume see nothing when all but this share of them stay below this part of a typical ray.
