@@ -4,8 +4,9 @@ import json
 
 import pytest
 
-from tomo_polysplat.bench import materials, spectrum
+from tomo_polysplat.bench import material_rods, materials, spectrum
 from tomo_polysplat.cli.main import main
+from tomo_polysplat.physics.materials import mass_attenuation
 
 
 def test_materials_without_scans(tmp_path):
@@ -15,6 +16,25 @@ def test_materials_without_scans(tmp_path):
     assert abs(errors["titanium"]) < 0.01 < 0.1 < abs(errors["iodine"])
     table = (tmp_path / "materials.md").read_text()
     assert all(f"| {name} |" in table for name in errors) and (tmp_path / "materials.png").stat().st_size > 0
+
+
+def test_rods_let_light_through_and_hold_what_they_are_made_of():
+    beam = materials.MaterialsBench().spectrum
+    for name in ("silver", "iodine, 3 % in water"):
+        scan = material_rods.rod_scan(name, beam, 20, 8)
+        material, grams, _ = material_rods.RODS[name]
+        inside = grams * float(mass_attenuation(material, scan.truth_energy_kev))
+        assert scan.truth.max() == pytest.approx(inside, rel=1e-5)
+        assert scan.valid is None and 1.0 < scan.projections.max() < 7.5
+
+
+def test_rods_of_one_material():
+    record = materials.run_materials_bench(materials.MaterialsBench(size=12, views=16, rods=("iron",)))
+    rods = record["rods"][0]
+    assert rods["own"] is None and rods["named"] == []
+    assert abs(rods["default"]["metal_mass"]) < 25
+    assert "| iron | 0.86 |" in materials.as_markdown(record)
+    json.dumps(record)
 
 
 def test_one_case_of_the_spectrum(tmp_path):
@@ -43,7 +63,7 @@ def test_unknown_names_are_refused(wrong):
         spectrum.SpectrumBench(**wrong)
 
 
-@pytest.mark.parametrize("wrong", [{"largest": -1.0}, {"size": -1}, {"kvp": 5.0}, {"aluminium_cm": -0.1}])
+@pytest.mark.parametrize("wrong", [{"largest": -1.0}, {"size": -1}, {"kvp": 5.0}, {"rods": ("tin",)}])
 def test_numbers_out_of_range_are_refused(wrong):
     with pytest.raises(ValueError):
         materials.MaterialsBench(**wrong)

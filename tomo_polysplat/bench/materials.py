@@ -8,16 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from tomo_polysplat.bench.environment import environment
-from tomo_polysplat.bench.scenes import cached_scan
-from tomo_polysplat.checks import require_number
+from tomo_polysplat.bench.material_rods import RODS, rod_errors, rod_scan
+from tomo_polysplat.checks import require_choice, require_number
 from tomo_polysplat.files import replacing
 from tomo_polysplat.physics.material_range import LEAST_U
 from tomo_polysplat.physics.materials import MaterialLike, Materials
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.stand_in import StandIn, best_stand_in
-from tomo_polysplat.reconstruction import reconstruct
 from tomo_polysplat.report.style import ACCENT, QUIET
-from tomo_polysplat.result.metrics import compare
 
 __all__ = ["MATERIALS", "MaterialsBench", "as_markdown", "run_materials_bench", "write_figure"]
 
@@ -56,8 +54,6 @@ MATERIALS: tuple[tuple[str, MaterialLike, bool, tuple[MaterialLike, ...]], ...] 
     ("gold", "gold", False, ("water", "aluminium", "gold")),
     ("lead", "lead", False, ("water", "aluminium", "lead")),
 )
-# Pins of these metals are also reconstructed, with the default curves and with their own.
-_METALS = ("titanium", "silver", "gold")
 
 
 @dataclass(frozen=True)
@@ -71,20 +67,25 @@ class MaterialsBench:
     largest : float
         Largest P of the rays.
     size, views : int
-        Of the scans of pins that are reconstructed; a size of 0 reconstructs none.
+        Of the scans of rods that are reconstructed; a size of 0 reconstructs none.
+    rods : sequence of str
+        Names of ``bench.material_rods.RODS``.
     device : str
     """
 
     kvp: float = 90.0
     aluminium_cm: float = 0.1
     largest: float = 5.0
-    size: int = 32
+    size: int = 40
     views: int = 90
+    rods: Sequence[str] = tuple(RODS)
     device: str = "cpu"
 
     def __post_init__(self) -> None:
         require_number("largest", self.largest, above=0.0)
         require_number("size", self.size, at_least=0)
+        for name in self.rods:
+            require_choice("rods", name, RODS)
         _ = self.spectrum  # checks its numbers
 
     @property
@@ -94,27 +95,36 @@ class MaterialsBench:
 
 
 def run_materials_bench(
-    bench: MaterialsBench, *, cache: Path | None = None, progress: Callable[[str], Any] = lambda _: None
+    bench: MaterialsBench,
+    *,
+    progress: Callable[[str], Any] = lambda _: None,
+    update: Callable[[Record], Any] = lambda _: None,
 ) -> Record:
-    """Measure every material, and pins of some metals.
+    """Measure every material, and reconstruct rods of some.
+
+    Parameters
+    ----------
+    bench : MaterialsBench
+    progress, update : callable
+        Told in words what comes next; given the record after every rod.
 
     Returns
     -------
     dict
         JSON-able: ``bench``, ``environment``; ``materials`` with ``name``, ``soft``, ``named`` (the three curves) and
         the stand-ins ``free``, ``held`` (u = 0; soft matter only) and ``own`` as
-        :class:`~tomo_polysplat.physics.stand_in.StandIn`; ``scans`` with ``metal``, ``materials`` and the errors of
-        :func:`~tomo_polysplat.result.metrics.compare`.
+        :class:`~tomo_polysplat.physics.stand_in.StandIn`; ``rods`` with ``name``, ``named``, ``half_width`` of the
+        volume in cm, and the errors of :func:`~tomo_polysplat.bench.material_rods.rod_errors` with the ``default``
+        curves and its ``own`` (None where it has none).
     """
-    record: Record = {"bench": asdict(bench), "environment": environment(), "materials": [], "scans": []}
+    record: Record = {"bench": asdict(bench), "environment": environment(), "materials": [], "rods": []}
     for name, material, soft, named in MATERIALS:
         progress(name)
         record["materials"].append({"name": name, "soft": soft, "named": [_label(m) for m in named]})
         record["materials"][-1] |= _stand_ins(material, soft, Materials(*named) if named else None, bench)
-    for metal in _METALS if bench.size else ():
-        for dense in ("iron", metal):
-            progress(f"pins of {metal}, {dense} as the dense curve")
-            record["scans"].append(_scan(bench, metal, dense, cache))
+    for name in bench.rods if bench.size else ():
+        record["rods"].append(_rods(name, bench, progress))
+        update(record)
     return record
 
 
@@ -127,25 +137,15 @@ def _stand_ins(material: MaterialLike, soft: bool, own: Materials | None, bench:
     return {"free": asdict(found(Materials(), (LEAST_U, 1.0))), "held": held, "own": named}
 
 
-def _scan(bench: MaterialsBench, metal: str, dense: str, cache: Path | None) -> Record:
-    physics = {"kvp": bench.kvp, "filters": {"Al": bench.aluminium_cm}, "metal": metal}
-    scan = cached_scan("pins", bench.size, bench.views, folder=cache, **physics)
-    assert scan.truth is not None
-    result = reconstruct(
-        scan.projections,
-        scan.proj_geom,
-        scan.vol_geom,
-        spectrum=scan.spectrum,
-        materials=("pmma", "aluminium", dense),
-        unit=scan.unit,
-        valid=scan.valid,
-        device=bench.device,
-        progress=False,
-    )
-    inside = scan.truth > 0.5 * scan.truth.max()
-    amount = float(result.volume[inside].sum() / scan.truth[inside].sum() - 1.0)
-    errors = compare(result.volume, scan.truth, scan.metal_mask)
-    return {"metal": metal, "materials": ["pmma", "aluminium", dense], "metal_error": amount, **errors}
+def _rods(name: str, bench: MaterialsBench, progress: Callable[[str], Any]) -> Record:
+    named = RODS[name][2]
+    scan = rod_scan(name, bench.spectrum, bench.size, bench.views)
+    found: Record = {"name": name, "named": [_label(m) for m in named]}
+    found["half_width"] = float(scan.vol_geom["option"]["WindowMaxX"])
+    for key, materials in (("default", ()), ("own", named)):
+        progress(f"rods of {name}, {key} curves")
+        found[key] = rod_errors(scan, materials, bench.device) if materials or key == "default" else None
+    return found
 
 
 def _label(material: MaterialLike) -> str:
@@ -155,7 +155,7 @@ def _label(material: MaterialLike) -> str:
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
-    """The materials, then the scans."""
+    """The materials, then the rods."""
     lines = [
         "| material | default, u held at 0 | default, u free | u | rms error of P | named curves | error then |"
     ]
@@ -166,16 +166,21 @@ def as_markdown(record: Mapping[str, Any]) -> str:
         cells += [f"{free['projection_error']:.1e}", ", ".join(entry["named"]) or "-"]
         cells.append("-" if entry["own"] is None else _per_cent(entry["own"]))
         lines.append(f"| {entry['name']} | {' | '.join(cells)} |")
-    if record["scans"]:
-        lines += [
-            "",
-            "| pins of | dense curve | PSNR without metal | PSNR everywhere | metal's attenuation |",
-        ]
-        lines += ["|---|---|---|---|---|"]
-    for scan in record["scans"]:
-        numbers = f"{scan['psnr']:.1f} | {scan['psnr_all']:.1f} | {100 * scan['metal_error']:+.1f} %"
-        lines.append(f"| {scan['metal']} | {scan['materials'][2]} | {numbers} |")
+    if record["rods"]:
+        lines += ["", "| rods of | volume, cm | inside, % | mass, % | water, % | PSNR without rods, dB |"]
+        lines += ["|---|---|---|---|---|---|"]
+        lines += [_rod_row(rod) for rod in record["rods"]]
     return "\n".join(lines) + "\n"
+
+
+def _rod_row(rod: Mapping[str, Any]) -> str:
+    """The errors with the default curves, and with the rods' own."""
+    cells = [rod["name"], f"{2 * rod['half_width']:.2g}"]
+    columns = (("metal_bias", "+.1f"), ("metal_mass", "+.1f"), ("soft_bias", "+.2f"), ("psnr", ".1f"))
+    for key, layout in columns:
+        pair = [found[key] for found in (rod["default"], rod["own"]) if found is not None]
+        cells.append(" -> ".join("-" if value is None else format(value, layout) for value in pair))
+    return f"| {' | '.join(cells)} |"
 
 
 def _per_cent(stand_in: Mapping[str, float]) -> str:

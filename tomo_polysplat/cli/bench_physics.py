@@ -38,7 +38,8 @@ def _materials_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--kvp", type=float, default=90.0, help="tube voltage (default: 90)")
     parser.add_argument("--aluminium-cm", type=float, default=0.1, help="its filter in cm (default: 0.1)")
     parser.add_argument("--largest", type=float, default=5.0, help="largest P of the rays (default: 5)")
-    parser.add_argument("--size", type=int, default=32, help="voxels of the pins; 0: none (default: 32)")
+    parser.add_argument("--size", type=int, default=40, help="voxels of the rods; 0: none (default: 40)")
+    parser.add_argument("--rods", nargs="+", metavar="MATERIAL", help="these alone (default: all)")
 
 
 def spectrum(arguments: argparse.Namespace, write: Callable[..., None], say: Callable[[str], None]) -> int:
@@ -63,9 +64,13 @@ def materials(arguments: argparse.Namespace, write: Callable[..., None], say: Ca
     from tomo_polysplat.bench.materials import MaterialsBench, as_markdown, run_materials_bench, write_figure
 
     names = ("kvp", "aluminium_cm", "largest", "size", "device")
+    chosen = {name: getattr(arguments, name) for name in names}
+    if arguments.rods:
+        chosen["rods"] = arguments.rods
     record = run_materials_bench(
-        MaterialsBench(**{name: getattr(arguments, name) for name in names}),
+        MaterialsBench(**chosen),
         progress=say,
+        update=lambda so_far: write(arguments, "materials.json", so_far, quiet=True),
     )
     write(arguments, "materials.json", record)
     return _tell(arguments, "materials", record, as_markdown(record), write_figure)
