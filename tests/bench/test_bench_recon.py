@@ -46,6 +46,13 @@ def test_a_scan_is_simulated_once(folder, monkeypatch):
             cached_scan("pins", 16, 44, folder=folder, **other)
 
 
+def test_a_control_is_the_scene_without_its_metal(folder):
+    metal, control = (cached_scan(name, 16, 44, folder=folder) for name in ("pins", "pins-control"))
+    assert control.name == "pins-control" and not control.metal_mask.any()
+    np.testing.assert_allclose(control.truth[~metal.metal_mask], metal.truth[~metal.metal_mask], rtol=1e-6)
+    assert control.truth.max() < 0.1 * metal.truth.max()
+
+
 def test_the_cache_is_private(tmp_path, monkeypatch):
     monkeypatch.setattr(scenes.tempfile, "gettempdir", lambda: str(tmp_path))
     made = cache_folder()

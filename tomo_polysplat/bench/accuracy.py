@@ -34,7 +34,7 @@ class AccuracyBench:
     Attributes
     ----------
     scenes, methods : sequence of str
-        Names of ``simulate.SCENES`` and of ``bench.methods.METHODS``.
+        Names for `bench.scenes.require_scene` and of ``bench.methods.METHODS``.
     sizes, views : sequence of int
     kvp, photons : sequence of float
         Tube voltages behind 1 mm of aluminium, and counts of an unattenuated ray.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from tomo_polysplat.baselines.mono_splat import mono_splat
 from tomo_polysplat.baselines.nmar import nmar
 from tomo_polysplat.baselines.sirt import sirt
 from tomo_polysplat.baselines.voxel_poly import voxel_poly
-from tomo_polysplat.baselines.water_bhc import water_bhc
+from tomo_polysplat.baselines.water_bhc import water_bhc, water_corrected
 from tomo_polysplat.bench import peers
 from tomo_polysplat.fit.optimise import FitState
 from tomo_polysplat.physics.spectrum import Spectrum
@@ -134,6 +134,11 @@ def _mono(task: Task, options: Options) -> Outcome:
     return _told(mono_splat(*data, progress=False, **_fit_options(task, options)))
 
 
+def _mono_water(task: Task, options: Options) -> Outcome:
+    corrected = water_corrected(task.projections, task.spectrum)
+    return _mono(replace(task, projections=corrected), options)
+
+
 def _polysplat(task: Task, options: Options) -> Outcome:
     scan = task.scan
     return _told(
@@ -150,7 +155,7 @@ def _polysplat(task: Task, options: Options) -> Outcome:
 
 
 def _told(result: Result) -> Outcome:
-    about = {key: result.plan.get(key) for key in ("kernel", "stop")}
+    about = {key: result.plan.get(key) for key in ("kernel", "stop", "curves")}
     return result.volume, {"gaussians": result.counts.get("gaussians"), **about}
 
 
@@ -166,5 +171,6 @@ METHODS = {
     "mbir-metal": Method("mbirtorch, plastic and metal", peers.mbirtorch_plastic_metal),
     "voxel-poly": Method("polychromatic voxels", _voxel_poly, improves=True),
     "mono": Method("Gaussians, one energy", _mono, improves=True),
+    "mono-water": Method("Gaussians, one energy, after water correction", _mono_water, improves=True),
     "polysplat": Method("tomo-polysplat", _polysplat, improves=True),
 }

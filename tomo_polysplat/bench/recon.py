@@ -13,10 +13,9 @@ import torch
 from tomo_polysplat.bench.environment import environment
 from tomo_polysplat.bench.methods import METHODS, Task
 from tomo_polysplat.bench.runs import Record, curves, timed_runs, warm_up, with_errors
-from tomo_polysplat.bench.scenes import cached_scan
+from tomo_polysplat.bench.scenes import cached_scan, require_scene
 from tomo_polysplat.checks import fail, require_choice
 from tomo_polysplat.scan.scan import Scan
-from tomo_polysplat.simulate.scenes import SCENES
 
 __all__ = ["ReconBench", "run_recon_bench"]
 
@@ -28,7 +27,7 @@ class ReconBench:
     Attributes
     ----------
     scenes, methods : sequence of str
-        Names of ``simulate.SCENES`` and of ``bench.methods.METHODS``.
+        Names for `bench.scenes.require_scene` and of ``bench.methods.METHODS``.
     sizes : sequence of int
         Voxels per edge; the detector has half as many pixels again along either side.
     views : int
@@ -61,7 +60,7 @@ class ReconBench:
 
     def __post_init__(self) -> None:
         for name in self.scenes:
-            require_choice("scenes", name, SCENES)
+            require_scene(name)
         for name in self.methods:
             require_choice("methods", name, METHODS)
         if min(self.budgets, default=1.0) <= 0:

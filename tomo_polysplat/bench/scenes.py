@@ -11,11 +11,26 @@ from typing import Any
 import numpy as np
 
 import tomo_polysplat
+from tomo_polysplat.checks import require_choice
 from tomo_polysplat.scan.io import load_scan, save_scan
 from tomo_polysplat.scan.scan import Scan
-from tomo_polysplat.simulate.scenes import simulate_scan
+from tomo_polysplat.simulate.scenes import SCENES, simulate_scan
 
-__all__ = ["cache_folder", "cached_scan", "fewer_views"]
+__all__ = ["cache_folder", "cached_scan", "fewer_views", "object_of", "require_scene"]
+
+# A scene's name with this ending is the scene without its metal.
+_CONTROL = "-control"
+
+
+def require_scene(name: str) -> str:
+    """The name of a scene, checked: one of ``simulate.SCENES``, with ``-control`` after it for none of its metal."""
+    require_choice("scenes", object_of(name), SCENES)
+    return name
+
+
+def object_of(name: str) -> str:
+    """The scene that a name stands for, with its metal or without."""
+    return name.removesuffix(_CONTROL)
 
 
 def cache_folder() -> Path:
@@ -33,16 +48,20 @@ def cached_scan(scene: str, size: int, views: int, *, folder: Path | None = None
 
     Parameters
     ----------
-    scene, size, views, options
+    scene : str
+        See `require_scene`.
+    size, views, options
         Of :func:`~tomo_polysplat.simulate.scenes.simulate_scan`.
     folder : path, optional
         Where scans are kept; None for `cache_folder`.
     """
+    if scene.endswith(_CONTROL):
+        options["metal"] = False
     asked = repr((scene, size, views, sorted(options.items()), _sources()))
     name = f"{scene}-{size}-{views}-{hashlib.sha256(asked.encode()).hexdigest()[:16]}.npz"
     path = (cache_folder() if folder is None else folder) / name
     if not path.exists():
-        save_scan(simulate_scan(scene, size, views, **options), path, overwrite=True)
+        save_scan(simulate_scan(object_of(scene), size, views, **options), path, overwrite=True)
     scan = load_scan(path)
     scan.name = scene
     return scan

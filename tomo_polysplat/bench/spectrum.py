@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from tomo_polysplat.bench.environment import environment
-from tomo_polysplat.bench.scenes import cached_scan
+from tomo_polysplat.bench.scenes import cached_scan, object_of, require_scene
 from tomo_polysplat.checks import require_choice
 from tomo_polysplat.files import replacing
 from tomo_polysplat.fit.short_fit import main_density
@@ -23,7 +23,6 @@ from tomo_polysplat.report.style import ACCENT, QUIET
 from tomo_polysplat.result.metrics import compare
 from tomo_polysplat.scan.scan import Scan
 from tomo_polysplat.settings import PRESETS
-from tomo_polysplat.simulate.scenes import SCENES
 from tomo_polysplat.units import cm_per
 
 __all__ = ["CASES", "SpectrumBench", "as_markdown", "run_spectrum_bench", "write_figure"]
@@ -31,8 +30,6 @@ __all__ = ["CASES", "SpectrumBench", "as_markdown", "run_spectrum_bench", "write
 Record = dict[str, Any]
 
 _KVP, _FILTER = 90.0, 0.1
-# A scene's name with this ending is the scene without its metal.
-_WITHOUT = "-control"
 # Degree of the polynomial that a scanner is given as its water correction, as scanners have it.
 _DEGREE = 3
 
@@ -86,8 +83,7 @@ class SpectrumBench:
     Attributes
     ----------
     scenes : sequence of str
-        Names of ``simulate.SCENES``, with ``"-control"`` after them for the scene without its metal. In pins, PMMA
-        is named as the soft material.
+        Names for `bench.scenes.require_scene`. In pins, PMMA is named as the soft material.
     cases : sequence of str
         Names of ``CASES``.
     size, views : int
@@ -106,7 +102,7 @@ class SpectrumBench:
 
     def __post_init__(self) -> None:
         for name in self.scenes:
-            require_choice("scenes", name.removesuffix(_WITHOUT), SCENES)
+            require_scene(name)
         for name in self.cases:
             require_choice("cases", name, CASES)
         require_choice("quality", self.quality, PRESETS)
@@ -151,9 +147,8 @@ def run_spectrum_bench(
 
 def _scan(bench: SpectrumBench, scene: str, case: Case, cache: Path | None) -> Scan:
     physics = {"kvp": _KVP, "filters": {"Al": _FILTER}, "scatter": case.scatter}
-    options = {"photons": 1e5, "seed": bench.seed, "metal": not scene.endswith(_WITHOUT)}
-    name = scene.removesuffix(_WITHOUT)
-    scan = cached_scan(name, bench.size, bench.views, folder=cache, **physics, **options)
+    options = {"photons": 1e5, "seed": bench.seed}
+    scan = cached_scan(scene, bench.size, bench.views, folder=cache, **physics, **options)
     return scan if case.water_correction == "none" else _water_corrected(scan)
 
 
@@ -171,7 +166,7 @@ def _water_corrected(scan: Scan) -> Scan:
 
 def _run(bench: SpectrumBench, scene: str, scan: Scan, case: Case, calibrated: bool) -> Record:
     assert scan.truth is not None and scan.truth_energy_kev is not None
-    materials = Materials("pmma") if scene.removesuffix(_WITHOUT) == "pins" else Materials()
+    materials = Materials("pmma") if object_of(scene) == "pins" else Materials()
     per_gram = float(mass_attenuation(materials.soft, scan.truth_energy_kev)) * cm_per(scan.unit)
     asked = {"calibrate": True, "soft_density": main_density(scan.truth / per_gram)} if calibrated else {}
     result = reconstruct(

@@ -98,14 +98,15 @@ def _add_settings_argument(parser: argparse.ArgumentParser) -> None:
 
 def _add_comparison_arguments(parser: argparse.ArgumentParser) -> None:
     """What benchmarks that compare methods share."""
-    parser.add_argument("--scenes", nargs="+", default=["pins", "teeth"], help="default: pins teeth")
+    words = "default: pins teeth; NAME-control is a scene without its metal"
+    parser.add_argument("--scenes", nargs="+", default=["pins", "teeth"], help=words)
     parser.add_argument("--sizes", nargs="+", type=int, default=[64], help="voxels per edge (default: 64)")
     parser.add_argument(
         "--methods",
         nargs="+",
         metavar="METHOD",
         default=_METHODS,
-        help=f"among {' '.join(_METHODS)} (the default), sirt-200, and mbir mbir-mar mbir-metal (mbirtorch)",
+        help=f"among {' '.join(_METHODS)} (the default), sirt-200, mono-water, mbir mbir-mar mbir-metal (mbirtorch)",
     )
     parser.add_argument(
         "--budgets",
