@@ -12,17 +12,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from tomo_polysplat.checks import fail, require_number
-from tomo_polysplat.fit.agent import settings_for_agent
-from tomo_polysplat.fit.calibration import Calibration, calibrated, with_fitted
+from tomo_polysplat.checks import fail
+from tomo_polysplat.fit.beginning import Begun, Wishes, begin, physics
+from tomo_polysplat.fit.calibration import Calibration
 from tomo_polysplat.fit.checkpoint import Checkpoint
 from tomo_polysplat.fit.optimise import FitOutcome, FitState, fit
-from tomo_polysplat.fit.plan import Plan, make_plan
+from tomo_polysplat.fit.plan import Plan
 from tomo_polysplat.fit.problem import Problem
-from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.interrupts import postponed_interrupts
-from tomo_polysplat.kernels.device import one_torch_thread, pick_device, usual_modes
+from tomo_polysplat.kernels.device import one_torch_thread, usual_modes
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.detector_blur import describe_blur
 from tomo_polysplat.physics.materials import Materials
@@ -32,7 +31,7 @@ from tomo_polysplat.progress import progress_reports
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import VolumeGrid, from_astra, is_planar_geometry
 from tomo_polysplat.scan.usable import uncorrected, usable_rays
-from tomo_polysplat.settings import Settings, make_settings
+from tomo_polysplat.settings import Settings
 
 __all__ = ["reconstruct"]
 
@@ -127,55 +126,38 @@ def reconstruct(
         After Ctrl-C before the fit has begun, or a second one after it.
     """
     started = time.perf_counter()
-    chosen = make_settings(quality, settings)
-    if time_budget is not None:
-        time_budget = require_number("time_budget", time_budget, above=0)
-    rng, target, callbacks = _generator(seed), pick_device(device), _functions(callbacks)
+    wishes = Wishes.of(quality, settings, time_budget, seed, device, callbacks)
     geometry, grid = from_astra(proj_geom, vol_geom)
     values, counts = usable_rays(projections, proj_geom, valid)
     values = uncorrected(values, water_correction, spectrum)
     problem = Problem.of(values, geometry, grid, unit, spectrum, materials)
+    # Sorted, they may be a copy: these would stay in memory beside it.
+    del values
     wanted = Calibration.of(calibrate, soft_density, problem.spectrum)
     flipped = is_planar_geometry(proj_geom)
-    options = chosen.to_dict() | {"seed": int(seed), "time_budget": time_budget}
-    options |= {"calibration": None if wanted is None else asdict(wanted)}
+    options = wishes.options() | {"calibration": None if wanted is None else asdict(wanted)}
     saved = _checkpoint(checkpoint, resume, problem, options)
     started -= 0.0 if saved is None else saved.seconds
-    with one_torch_thread(target), progress_reports(progress) as report:
+    with one_torch_thread(wishes.device), progress_reports(progress) as report:
         report(0.0, "start volume")
-        problem, calibration = _calibration(problem, wanted, chosen, target, saved, options)
-        plan, gaussians, scene, rays = _begin(problem, chosen, target, saved, options)
-        plan.reasons |= calibration
-        if water_correction is not None:
-            plan.reasons["water_correction"] = f"undone: {describe_polynomial(water_correction)}"
-        outcome = fit(
-            gaussians,
-            plan.spacing * problem.voxel,
-            rays,
-            scene,
-            chosen,
-            views_per_step=plan.views_per_step,
-            rng=rng,
-            started=started,
-            deadline=None if time_budget is None else started + time_budget,
-            volume=_volume_of(scene, plan, problem, flipped),
-            callbacks=[lambda state: report(state.share, state.describe()), *callbacks],
-            checkpoint=saved,
-        )
+        problem, known = physics(problem, wanted, wishes, saved)
+        begun = begin(problem, wishes, saved)
+        begun.plan.reasons |= known | _undone(water_correction)
+        outcome = _fitted(begun, problem, wishes, saved, started, flipped, report)
         with postponed_interrupts("the volume") as interruption:
             report(1.0, "volume")
-            if plan.blurred:
-                fitted = chosen.learning_rate_blur > 0
-                plan.reasons["detector_blur"] = describe_blur(float(outcome.gaussians.blur), fitted=fitted)
-            about = {
-                "unit": unit,
-                "spectrum": problem.spectrum or spectrum,
-                "flipped_2d": flipped,
-                "counts": counts | outcome.counts(),
-                "settings": chosen.to_dict() | {"seed": seed, "quality": quality},
-            }
-            result = _result(outcome, scene, grid, problem, plan, **about)
-    plan.reasons["stop"] = outcome.reason + (", then interrupted" if interruption.asked else "")
+            result = _result(
+                outcome,
+                begun,
+                problem,
+                grid,
+                unit=unit,
+                spectrum=problem.spectrum or spectrum,
+                flipped_2d=flipped,
+                counts=counts | outcome.counts(),
+                settings=wishes.settings.to_dict() | {"seed": seed, "quality": quality},
+            )
+    result.plan["stop"] = outcome.reason + (", then interrupted" if interruption.asked else "")
     result.seconds = time.perf_counter() - started
     logger.info("Reconstructed in %.1f s: %s; %s", result.seconds, outcome.reason, result.counts)
     return result
@@ -191,73 +173,38 @@ def _checkpoint(
     return Checkpoint(path, problem, options, resume=resume)
 
 
-def _calibration(
+def _undone(water_correction: Sequence[float] | None) -> dict[str, str]:
+    """What the plan tells of a scanner's water correction."""
+    if water_correction is None:
+        return {}
+    return {"water_correction": f"undone: {describe_polynomial(water_correction)}"}
+
+
+def _fitted(
+    begun: Begun,
     problem: Problem,
-    wanted: Calibration | None,
-    settings: Settings,
-    device: torch.device,
+    wishes: Wishes,
     saved: Checkpoint | None,
-    options: Mapping[str, Any],
-) -> tuple[Problem, dict[str, Any]]:
-    """The problem under the physics that short fits, or those before a checkpoint, have found, and its record."""
-    if wanted is None:
-        return problem, {}
-    if saved is not None and saved.plan is not None:
-        found = saved.plan.reasons["calibration"]
-    else:
-        found = calibrated(problem, wanted, settings, device, options["seed"], options["time_budget"])
-    return with_fitted(problem, found["fitted"]), {"calibration": found}
-
-
-def _begin(
-    problem: Problem,
-    settings: Settings,
-    device: torch.device,
-    saved: Checkpoint | None,
-    options: Mapping[str, Any],
-) -> tuple[Plan, Gaussians, FitScene, Rays]:
-    """All that a fit starts from."""
-    try:
-        plan, gaussians = _first_state(problem, settings, device, saved, options)
-        return plan, gaussians, problem.scene(plan, settings, device), problem.rays(plan, settings, device)
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt("interrupted before the fit had begun: there is no result yet") from None
-
-
-def _first_state(
-    problem: Problem,
-    settings: Settings,
-    device: torch.device,
-    saved: Checkpoint | None,
-    options: Mapping[str, Any],
-) -> tuple[Plan, Gaussians]:
-    """The plan and Gaussians to go on with: those of a checkpoint, or seeds of a start volume."""
-    if saved is not None and saved.snapshot is not None and saved.plan is not None:
-        return saved.plan, saved.snapshot.gaussians.to(device)
-    start, why = problem.start_volume(device)
-    plan = make_plan(start, problem, settings, device.type)
-    relative = start / (problem.depth * plan.reference)
-    settings, agent = settings_for_agent(relative, problem, settings, device, options)
-    plan.reasons |= {"start": why, **agent}
-    gaussians = problem.seeds(start, plan, settings, device)
-    if saved is not None:
-        saved.plan = plan
-    return plan, gaussians
-
-
-def _generator(seed: Any) -> np.random.Generator:
-    number = require_number("seed", seed, at_least=0)
-    if number != int(number):
-        raise fail("seed", "a whole number", repr(seed))
-    return np.random.default_rng(int(seed))
-
-
-def _functions(callbacks: Any) -> list[Callable[[FitState], Any]]:
-    functions = [callbacks] if callable(callbacks) else list(callbacks)
-    for function in functions:
-        if not callable(function):
-            raise fail("callbacks", "functions of a FitState", repr(function), error=TypeError)
-    return functions
+    started: float,
+    flipped: bool,
+    report: Callable[[float, str], Any],
+) -> FitOutcome:
+    """The fit; ``started`` is when the reconstruction began."""
+    plan, scene, budget = begun.plan, begun.scene, wishes.time_budget
+    return fit(
+        begun.gaussians,
+        plan.spacing * problem.voxel,
+        begun.rays,
+        scene,
+        wishes.settings,
+        views_per_step=plan.views_per_step,
+        rng=np.random.default_rng(wishes.seed),
+        started=started,
+        deadline=None if budget is None else started + budget,
+        volume=_volume_of(scene, plan, problem, flipped),
+        callbacks=[lambda state: report(state.share, state.describe()), *wishes.callbacks],
+        checkpoint=saved,
+    )
 
 
 def _volume_of(
@@ -274,11 +221,12 @@ def _volume_of(
     return volume
 
 
-def _result(
-    outcome: FitOutcome, scene: FitScene, grid: VolumeGrid, problem: Problem, plan: Plan, **about: Any
-) -> Result:
+def _result(outcome: FitOutcome, begun: Begun, problem: Problem, grid: VolumeGrid, **about: Any) -> Result:
     """Volumes and Gaussians in the caller's coordinates."""
-    gaussians, length = outcome.gaussians, problem.length
+    plan, scene, gaussians, length = begun.plan, begun.scene, outcome.gaussians, problem.length
+    if plan.blurred:
+        fitted = about["settings"]["learning_rate_blur"] > 0
+        plan.reasons["detector_blur"] = describe_blur(float(gaussians.blur), fitted=fitted)
     with torch.no_grad():
         own = scene.basis(gaussians).cpu().numpy() * np.float32(plan.reference)
         heights = gaussians.weights(scene.reference_curve).sum(dim=0)

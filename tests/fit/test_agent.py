@@ -1,11 +1,17 @@
 """Contrast agents: edges inside a spectrum, and the levels that may tell agent from bone."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import torch
+from small_scans import fan, geometries
 
-from tomo_polysplat.fit.agent import levels_between
+from tomo_polysplat.fit.agent import levels_between, settings_for_agent
+from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.physics.edges import edge_inside
 from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.settings import make_settings
 
 
 @pytest.mark.parametrize("material, edge", [("I", 33.17), ("BaSO4", 37.44), ("gadolinium", 50.24)])
@@ -32,3 +38,28 @@ def test_levels_lie_between_pieces_the_widest_gaps_first():
     assert levels_between(start, 2.2) == pytest.approx([4.0])
     start[0, 20:25, 12:15], start[0, 20:25, 20:25] = 5.2, 9.2
     assert levels_between(start, 2.2) == pytest.approx([4.0, 7.2])
+
+
+@pytest.mark.parametrize("dense", ["I", "iron"])
+def test_short_fits_begin_with_the_start_there_is_and_the_best_is_taken(dense, monkeypatch):
+    """Without an edge in the spectrum none is made."""
+    scan, device, seen = fan(), torch.device("cpu"), []
+
+    def fit(problem, start, fitted, settings, *rest):
+        seen.append((start, settings))
+        return SimpleNamespace(held_out=1.0 / len(seen))
+
+    monkeypatch.setattr("tomo_polysplat.fit.agent.short_fit", fit)
+    named = ("water", "bone", dense)
+    problem = Problem.of(scan.projections.swapaxes(0, 1), *geometries(scan), "cm", scan.spectrum, named)
+    start, _ = problem.start_volume(device)
+    settings = make_settings()
+    options = {"seed": 0, "time_budget": None}
+    best, told = settings_for_agent(start, 1.0, problem, settings, device, options)
+    if dense == "iron":
+        assert not seen and best is settings and not told
+    else:
+        assert len(seen) > 1 and all(one is start for one, _ in seen)
+        assert (
+            best.metal_level == seen[-1][1].metal_level != settings.metal_level and "agent" in told["agent"]
+        )

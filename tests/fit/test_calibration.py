@@ -9,8 +9,10 @@ from small_scans import geometries, reconstruct
 
 import tomo_polysplat as tps
 from tomo_polysplat.fit.calibration import Calibration, _judge, with_fitted
+from tomo_polysplat.fit.plan import make_plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.short_fit import ShortFit, main_density
+from tomo_polysplat.settings import make_settings
 
 # Enough steps for the density of the main matter to settle.
 STEADY = {"passes": 4.0, "views_per_step": 4}
@@ -131,6 +133,22 @@ def test_other_physics_are_those_of_the_same_measurements():
     assert problem.scatter == 0 and problem.spectrum is SPECTRUM
     # On a GPU they would be copied there once for every short fit.
     assert other.measured(device) is problem.measured(device)
+
+
+def test_whether_matter_is_inside_is_looked_up_once_whatever_the_physics(monkeypatch):
+    seen = []
+
+    def look(*scan):
+        seen.append(scan)
+        return True, "inside"
+
+    monkeypatch.setattr("tomo_polysplat.fit.problem.matter_is_inside", look)
+    problem, device, settings = problem_of(fan(0.0), SPECTRUM), torch.device("cpu"), make_settings()
+    start, _ = problem.start_volume(device)
+    for of in (problem, with_fitted(problem, {"scatter": 0.01})):
+        plan = make_plan(start, of, settings, "cpu")
+        assert of.scene(plan, settings, device).closed and plan.reasons["window"] == "inside"
+    assert len(seen) == 1
 
 
 def test_the_main_matter_is_where_voxels_crowd():

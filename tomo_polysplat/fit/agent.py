@@ -39,6 +39,7 @@ _SHARE_OF_BUDGET = 0.1
 
 def settings_for_agent(
     start: torch.Tensor,
+    reference: float,
     problem: Problem,
     settings: Settings,
     device: torch.device,
@@ -49,7 +50,9 @@ def settings_for_agent(
     Parameters
     ----------
     start : (nz, ny, nx) tensor
-        First reconstruction in soft references.
+        First reconstruction in the solver's units (``Problem.start_volume``).
+    reference : float
+        Soft reference in g/cm3.
     problem : Problem
     settings : Settings
         They stay as they are unless a dense material was named that has an edge inside the spectrum.
@@ -62,8 +65,10 @@ def settings_for_agent(
         return settings, {}
     assert problem.materials is not None
     edge = edge_inside(problem.materials.dense, problem.spectrum)
-    levels = [] if edge is None else levels_between(start.cpu().numpy(), settings.bone_level)
-    if edge is None or not levels:
+    if edge is None:
+        return settings, {}
+    levels = levels_between((start / (problem.depth * reference)).cpu().numpy(), settings.bone_level)
+    if not levels:
         return settings, {}
     choices = [settings] + [
         replace(settings, bone_u=0.0, metal_u=1.0, metal_level=level, metal_rim=settings.bone_level)
@@ -74,7 +79,9 @@ def settings_for_agent(
     # differs, would otherwise decide on the blur as well.
     alike: dict[str, Any] = {"held_out": 0.0, "blur": 0.0, "learning_rate_blur": 0.0}
     misfits = [
-        short_fit(problem, {}, replace(choice, **alike), device, options["seed"], budget, _STEPS).held_out
+        short_fit(
+            problem, start, {}, replace(choice, **alike), device, options["seed"], budget, _STEPS
+        ).held_out
         for choice in choices
     ]
     best = choices[int(np.argmin(misfits))]

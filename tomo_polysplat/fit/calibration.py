@@ -138,7 +138,9 @@ def calibrated(
 
     def trial(fitted: Mapping[str, float]) -> ShortFit:
         budget = None if time_budget is None else _SHARE_OF_BUDGET * time_budget
-        return short_fit(with_fitted(problem, fitted), dict(fitted), settings, device, seed, budget)
+        physics = with_fitted(problem, fitted)
+        start, _ = physics.start_volume(device)
+        return short_fit(physics, start, dict(fitted), settings, device, seed, budget)
 
     first = best = trial({})
     trials, accepted, why = [first], {}, []

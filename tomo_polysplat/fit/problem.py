@@ -34,6 +34,7 @@ from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.water import transmitted_energy, water_equivalent
 from tomo_polysplat.render.renderer import detector_views, voxel_box
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.scan.snapped import snapped_geometry, snapped_grid
 from tomo_polysplat.scan.view_order import view_order
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.initial import initial_volume_on
@@ -47,6 +48,14 @@ logger = logging.getLogger(__name__)
 _LARGEST_PROJECTION = 15.0
 # And to this at least: a scan of nothing has no range.
 _LEAST_PROJECTION = 1e-3
+
+
+@dataclass
+class _Known:
+    """What is made once for a scan, whatever the physics that it is fitted under."""
+
+    copies: dict[torch.device, torch.Tensor] = field(default_factory=dict)
+    closed: tuple[bool, str] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +93,7 @@ class Problem:
     spectrum: Spectrum | None = None
     materials: Materials | None = None
     scatter: float = 0.0
-    _copies: dict[torch.device, torch.Tensor] = field(default_factory=dict, init=False, repr=False)
+    _known: _Known = field(default_factory=_Known, init=False, repr=False)
 
     @classmethod
     def of(
@@ -106,8 +115,8 @@ class Problem:
         planar = planar and bool(grid.lower[2] <= geometry.corner[0, 2] <= grid.upper[2])
         length = 0.5 * float(grid.extent[: 2 if planar else 3].max())
         depth = length if spectrum is None else length * cm_per(unit)
-        inside = _snapped_grid(grid.normalised(grid.centre, length))
-        outside = _snapped_geometry(geometry.normalised(grid.centre, length))
+        inside = snapped_grid(grid.normalised(grid.centre, length))
+        outside = snapped_geometry(geometry.normalised(grid.centre, length))
         order = view_order(outside, projections)
         if (np.diff(order) != 1).any():
             projections, outside = projections[order], outside.select(order)
@@ -126,7 +135,7 @@ class Problem:
     def under(self, spectrum: Spectrum, scatter: float) -> Problem:
         """The same measurements under other physics; copies of them on devices serve both."""
         other = replace(self, spectrum=spectrum, scatter=scatter)
-        object.__setattr__(other, "_copies", self._copies)
+        object.__setattr__(other, "_known", self._known)
         return other
 
     def soft_attenuation(self) -> float:
@@ -146,10 +155,17 @@ class Problem:
 
     def measured(self, device: torch.device) -> torch.Tensor:
         """The projections on a device, copied there once; on the host where they do not fit there."""
-        if device not in self._copies:
+        copies = self._known.copies
+        if device not in copies:
             stay = projections_stay(self.projections.nbytes, device)
-            self._copies[device] = torch.from_numpy(self.projections).to(device if stay else "cpu")
-        return self._copies[device]
+            copies[device] = torch.from_numpy(self.projections).to(device if stay else "cpu")
+        return copies[device]
+
+    def _closed(self, device: torch.device) -> tuple[bool, str]:
+        """Whether no matter lies beside the volume, and words that say so."""
+        if self._known.closed is None:
+            self._known.closed = matter_is_inside(self.measured(device), self.geometry, self.grid)
+        return self._known.closed
 
     def scene(self, plan: Plan, settings: Settings, device: torch.device) -> FitScene:
         """The forward model."""
@@ -159,7 +175,7 @@ class Problem:
         # One node of one curve: -log(I/I0) is in proportion to the areal density.
         straight = quadrature is not None and quadrature.attenuation.size == 1
         slope = float(quadrature.attenuation[0, 0]) if quadrature is not None and straight else 1.0
-        closed, plan.reasons["window"] = matter_is_inside(self.measured(device), self.geometry, self.grid)
+        closed, plan.reasons["window"] = self._closed(device)
         return FitScene(
             voxel_box(self.grid),
             None if straight else quadrature,
@@ -258,30 +274,6 @@ class Problem:
         values = self.measured(device)
         target = None if values.device.type == device.type else device
         return Rays(values, views, photons, settings.model_error, settings.held_out, target)
-
-
-def _snapped_grid(grid: VolumeGrid) -> VolumeGrid:
-    return VolumeGrid(grid.shape, *_snapped(np.stack([grid.lower, grid.upper])))
-
-
-def _snapped_geometry(geometry: Geometry) -> Geometry:
-    origin = geometry.origin
-    if geometry.beam == "parallel":
-        origin = origin / np.linalg.norm(origin, axis=1, keepdims=True)
-    origin, corner, u, v = map(_snapped, (origin, geometry.corner, geometry.u, geometry.v))
-    return replace(geometry, origin=origin, corner=corner, u=u, v=v)
-
-
-def _snapped(vectors: np.ndarray) -> np.ndarray:
-    """Vectors (n, 3) rounded to 32 bits of their longest coordinate, a millionth of a pixel.
-
-    The coordinates of one scan in two units differ in the last bit. A fit of many steps would make a
-    difference of a thousandth of it; rounded, they are the same.
-    """
-    longest = np.abs(vectors).max(axis=1, keepdims=True)
-    # A little above each power of two, so that a length of 1 and of 1 - 1e-16 are rounded alike.
-    exponent = np.floor(np.log2(longest, where=longest > 0, out=np.zeros_like(longest)) + 1e-6).astype(int)
-    return np.ldexp(np.rint(np.ldexp(vectors, 32 - exponent)), exponent - 32)
 
 
 def _relative(materials: Materials, energy: float, device: torch.device) -> torch.Tensor:

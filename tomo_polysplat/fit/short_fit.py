@@ -60,6 +60,7 @@ class ShortFit:
 
 def short_fit(
     problem: Problem,
+    start: torch.Tensor,
     fitted: dict[str, float],
     settings: Settings,
     device: torch.device,
@@ -73,6 +74,8 @@ def short_fit(
     ----------
     problem : Problem
         Under the physics that ``fitted`` states.
+    start : (nz, ny, nx) tensor
+        Its start volume on the device.
     settings : Settings
         Of the fit to come.
     seed : int
@@ -86,7 +89,6 @@ def short_fit(
     KeyboardInterrupt
         After Ctrl-C: what a calibration has so far is no result.
     """
-    start, _ = problem.start_volume(device)
     # What is calibrated is judged by the areal densities of all three curves.
     plan = make_plan(start, problem, replace(settings, curves=3), device.type)
     passes = max(_PASSES, fewest_steps * plan.views_per_step / problem.geometry.views)

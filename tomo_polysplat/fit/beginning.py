@@ -1,0 +1,129 @@
+"""What a fit begins with: a caller's wishes, the physics, the plan, and the first Gaussians."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from tomo_polysplat.checks import fail, require_number
+from tomo_polysplat.fit.agent import settings_for_agent
+from tomo_polysplat.fit.calibration import Calibration, calibrated, with_fitted
+from tomo_polysplat.fit.checkpoint import Checkpoint
+from tomo_polysplat.fit.plan import Plan, make_plan
+from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.stopping import FitState
+from tomo_polysplat.kernels.device import pick_device
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.settings import Settings, make_settings
+
+__all__ = ["Begun", "Wishes", "begin", "physics"]
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """How a caller wants a scan fitted, checked.
+
+    Attributes
+    ----------
+    settings : Settings
+    time_budget : float or None
+        Seconds.
+    seed : int
+    device : torch.device
+    callbacks : list of callables
+    """
+
+    settings: Settings
+    time_budget: float | None
+    seed: int
+    device: torch.device
+    callbacks: list[Callable[[FitState], Any]]
+
+    @classmethod
+    def of(
+        cls, quality: str, settings: Any, time_budget: Any, seed: Any, device: str, callbacks: Any
+    ) -> Wishes:
+        """Those of `reconstruct`'s arguments."""
+        chosen = make_settings(quality, settings)
+        if time_budget is not None:
+            time_budget = require_number("time_budget", time_budget, above=0)
+        return cls(chosen, time_budget, _whole(seed), pick_device(device), _functions(callbacks))
+
+    def options(self) -> dict[str, Any]:
+        """All that the result depends on, for a checkpoint."""
+        return self.settings.to_dict() | {"seed": self.seed, "time_budget": self.time_budget}
+
+
+@dataclass(frozen=True)
+class Begun:
+    """All that a fit starts from."""
+
+    plan: Plan
+    gaussians: Gaussians
+    scene: FitScene
+    rays: Rays
+
+
+def physics(
+    problem: Problem, wanted: Calibration | None, wishes: Wishes, saved: Checkpoint | None
+) -> tuple[Problem, dict[str, Any]]:
+    """The problem under the physics that short fits, or those before a checkpoint, have found, and its record."""
+    if wanted is None:
+        return problem, {}
+    if saved is not None and saved.plan is not None:
+        found = saved.plan.reasons["calibration"]
+    else:
+        found = calibrated(problem, wanted, wishes.settings, wishes.device, wishes.seed, wishes.time_budget)
+    return with_fitted(problem, found["fitted"]), {"calibration": found}
+
+
+def begin(problem: Problem, wishes: Wishes, saved: Checkpoint | None) -> Begun:
+    """Plan, seed and set up, or go on from where a checkpoint was.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        After Ctrl-C: there is no result yet.
+    """
+    settings, device = wishes.settings, wishes.device
+    try:
+        plan, gaussians = _first_state(problem, wishes, saved)
+        scene, rays = problem.scene(plan, settings, device), problem.rays(plan, settings, device)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("interrupted before the fit had begun: there is no result yet") from None
+    return Begun(plan, gaussians, scene, rays)
+
+
+def _first_state(problem: Problem, wishes: Wishes, saved: Checkpoint | None) -> tuple[Plan, Gaussians]:
+    """The plan and Gaussians to go on with: those of a checkpoint, or seeds of a start volume."""
+    settings, device = wishes.settings, wishes.device
+    if saved is not None and saved.snapshot is not None and saved.plan is not None:
+        return saved.plan, saved.snapshot.gaussians.to(device)
+    start, why = problem.start_volume(device)
+    plan = make_plan(start, problem, settings, device.type)
+    settings, agent = settings_for_agent(start, plan.reference, problem, settings, device, wishes.options())
+    plan.reasons |= {"start": why, **agent}
+    gaussians = problem.seeds(start, plan, settings, device)
+    if saved is not None:
+        saved.plan = plan
+    return plan, gaussians
+
+
+def _whole(seed: Any) -> int:
+    number = require_number("seed", seed, at_least=0)
+    if number != int(number):
+        raise fail("seed", "a whole number", repr(seed))
+    return int(seed)
+
+
+def _functions(callbacks: Any) -> list[Callable[[FitState], Any]]:
+    functions = [callbacks] if callable(callbacks) else list(callbacks)
+    for function in functions:
+        if not callable(function):
+            raise fail("callbacks", "functions of a FitState", repr(function), error=TypeError)
+    return functions
