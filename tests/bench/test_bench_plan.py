@@ -18,9 +18,10 @@ def test_variants_change_the_settings_each_in_its_own_way(name):
     assert changed[0] == (False, make_settings())
     assert all(one != other for k, one in enumerate(changed) for other in changed[:k])
     assert len({v.label for v in variants(SCANS[name])}) == len(changed)
-    # The last one takes every decision otherwise that is about the model.
-    everything = variants(SCANS[name])[-1].settings
-    assert {"curves", "spectral_nodes", "support_level", "free_radius"} <= everything.keys()
+    # The last two take every decision otherwise that is about the model.
+    model = {"curves", "spectral_nodes", "support_level", "free_radius"}
+    everything, finer = (variant.settings for variant in variants(SCANS[name])[-2:])
+    assert model <= everything.keys() and finer == everything | {"seed_spacing": 1.0}
 
 
 def test_scans_are_what_their_names_say():

@@ -110,6 +110,9 @@ def variants(scan: PlanScan) -> list[Variant]:
     free |= {} if scan.metal else {"bone_level": 0.1, "bone_u": 0.0}
     every = {"spectral_nodes": _EVERY_ENERGY}
     empty = {"support_level": 0.0}
+    # A blur is held rather than fitted: without metal nothing would hold it.
+    blur = {"learning_rate_blur": 0.0} | ({"blur": 0.0} if scan.metal else {})
+    whole = {**free, **every, **empty, **({} if scan.metal else blur)}
     curves = 1 if scan.metal else 3
     return [
         DEFAULT,
@@ -118,13 +121,15 @@ def variants(scan: PlanScan) -> list[Variant]:
         Variant("every energy a node", every),
         Variant("u free everywhere", free),
         Variant("empty space seeded", empty),
+        Variant("no blur" if scan.metal else "a blur", blur),
         Variant("1 view a step", {"views_per_step": 1}),
         Variant("8 views a step", {"views_per_step": 8}),
         Variant("seeds 1 voxel apart", {"seed_spacing": 1.0}),
         Variant("seeds 1.7 voxels apart", {"seed_spacing": 1.7}),
         Variant("5 passes", {"passes": 5.0}),
         Variant("20 passes", {"passes": 20.0}),
-        Variant("everything modelled", {**free, **every, **empty}),
+        Variant("everything modelled", whole),
+        Variant("everything, and seeds 1 voxel apart", {**whole, "seed_spacing": 1.0}),
     ]
 
 
