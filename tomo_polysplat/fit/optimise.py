@@ -190,6 +190,30 @@ class _Run:
         self.outcome.skipped_pairs = numbers["skipped_pairs"]
         self.outcome.relocated = self.fitter.relocated
 
+    def follow(
+        self, volume: Callable[[Gaussians], np.ndarray], callbacks: Sequence[Callable[[FitState], Any]]
+    ) -> None:
+        """Pass by pass until something ends the run, which the outcome's reason then says."""
+        outcome = self.outcome
+        for loss, held_out, skipped in self.fitter.passes(self.clock):
+            outcome.skipped_pairs += skipped
+            outcome.relocated = self.fitter.relocated
+            state = self._state(loss, held_out, volume)
+            outcome.history.append(state.record())
+            outcome.reason = self.watch.judge(state, self.fitter.gaussians)
+            self.keep(now=bool(outcome.reason) or self.clock.share() >= 1)
+            if any([_is_true(callback(state)) for callback in callbacks]):
+                self.keep(now=True)
+                outcome.reason = "a callback ended it"
+            if outcome.reason:
+                return
+
+    def _state(self, loss: float, held_out: float, volume: Callable[[Gaussians], np.ndarray]) -> FitState:
+        gaussians, clock = self.fitter.gaussians, self.clock
+        seconds = time.perf_counter() - self.started
+        numbers = (seconds, clock.done, len(gaussians), loss, held_out, clock.share())
+        return FitState(*numbers, lambda: volume(gaussians))
+
 
 def fit(
     gaussians: Gaussians,
@@ -223,26 +247,8 @@ def fit(
     run = _Run(fitter, outcome, watch, clock, started, checkpoint)
     run.restore()
     try:
-        for loss, held_out, skipped in () if outcome.reason else fitter.passes(clock):
-            outcome.skipped_pairs += skipped
-            outcome.relocated = fitter.relocated
-            state = FitState(
-                time.perf_counter() - started,
-                clock.done,
-                len(gaussians),
-                loss,
-                held_out,
-                clock.share(),
-                lambda: volume(gaussians),
-            )
-            outcome.history.append(state.record())
-            outcome.reason = watch.judge(state, gaussians)
-            run.keep(now=bool(outcome.reason) or clock.share() >= 1)
-            if any([_is_true(callback(state)) for callback in callbacks]):
-                run.keep(now=True)
-                outcome.reason = "a callback ended it"
-            if outcome.reason:
-                break
+        if not outcome.reason:
+            run.follow(volume, callbacks)
     except KeyboardInterrupt:
         logger.warning("Interrupted after %d steps; the best state so far is returned.", clock.done)
         outcome.reason = "interrupted"
