@@ -153,6 +153,19 @@ def test_whether_matter_is_inside_is_looked_up_once_whatever_the_physics(monkeyp
 
 def test_the_main_matter_is_where_voxels_crowd():
     rng = np.random.default_rng(1)
-    density = np.concatenate([rng.normal(1.05, 0.02, 5001), rng.uniform(0, 1.5, 2001), np.full(33, 7.9)])
+    density = rng.normal(1.05, 0.02, (19, 21, 23))
+    density[:3], density[7, 8, :] = rng.uniform(0, 1.5, (3, 21, 23)), 7.9
     assert main_density(density) == pytest.approx(1.05, abs=0.01)
-    assert main_density(np.zeros(5)) == 0.0
+    assert main_density(density[9:10]) == pytest.approx(1.05, abs=0.01)
+    assert main_density(np.zeros((5, 1, 3))) == 0.0
+
+
+def test_walls_do_not_tell_their_density():
+    density = np.zeros((19, 21, 23))
+    density[::3] = 0.9  # one voxel thick, and lighter than they are
+    assert main_density(density) == 0.0
+    problem = problem_of(fan(0.0), SPECTRUM)
+    before = ShortFit({}, 1.0, main_density(density), np.zeros((3, 0)), np.zeros(0), np.zeros(0))
+    taken, why = _judge("kvp", before, [], problem)
+    assert not taken and "density" in why
+    assert _judge("scatter", before, [], problem) == (False, "nothing to change")

@@ -13,6 +13,7 @@ from tomo_polysplat.bench.environment import environment
 from tomo_polysplat.bench.scenes import cached_scan, object_of, require_scene
 from tomo_polysplat.checks import require_choice
 from tomo_polysplat.files import replacing
+from tomo_polysplat.fit.plan import mass_level
 from tomo_polysplat.fit.short_fit import main_density
 from tomo_polysplat.physics.detector import Detector
 from tomo_polysplat.physics.materials import Materials, mass_attenuation
@@ -168,7 +169,7 @@ def _run(bench: SpectrumBench, scene: str, scan: Scan, case: Case, calibrated: b
     assert scan.truth is not None and scan.truth_energy_kev is not None
     materials = Materials("pmma") if object_of(scene) == "pins" else Materials()
     per_gram = float(mass_attenuation(materials.soft, scan.truth_energy_kev)) * cm_per(scan.unit)
-    asked = {"calibrate": True, "soft_density": main_density(scan.truth / per_gram)} if calibrated else {}
+    asked = {"calibrate": True, "soft_density": _known_density(scan, per_gram)} if calibrated else {}
     result = reconstruct(
         scan.projections,
         scan.proj_geom,
@@ -196,6 +197,14 @@ def _run(bench: SpectrumBench, scene: str, scan: Scan, case: Case, calibrated: b
         "fitted": None if found is None else found["fitted"],
         "why": None if found is None else found["why"],
     }
+
+
+def _known_density(scan: Scan, per_gram: float) -> float:
+    """What somebody who knows the object would say that most of it has: the metal does not count."""
+    assert scan.truth is not None
+    metal = np.zeros(scan.truth.shape, bool) if scan.metal_mask is None else scan.metal_mask
+    density = np.where(metal, 0.0, scan.truth / per_gram)
+    return main_density(density) or mass_level(density)
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:

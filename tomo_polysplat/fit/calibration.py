@@ -218,6 +218,8 @@ def _last(name: str, stage: Sequence[ShortFit]) -> ShortFit:
 
 def _judge(name: str, before: ShortFit, stage: Sequence[ShortFit], problem: Problem) -> tuple[bool, str]:
     """Whether a stage's last fit is taken, and why."""
+    if not stage and name != "scatter" and before.soft_density == 0:
+        return False, "too little of the main matter lies inside of it to show its density"
     if not stage:
         return False, "nothing to change"
     after, change = _last(name, stage).held_out, f"{_last(name, stage).fitted[name]:.4g}"

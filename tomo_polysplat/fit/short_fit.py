@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy import ndimage
 
 from tomo_polysplat.fit.optimise import fit
 from tomo_polysplat.fit.plan import make_plan, mass_level
@@ -24,8 +25,11 @@ _PASSES = 2.0
 _FEWEST_STEPS = 120
 _RAYS = 60_000
 _VIEWS = 24
-# The main matter's voxels: this share of those near its level, the ones closest to each other.
+# The main matter's voxels: this share of those inside of it, the ones closest to each other.
 _CROWD = 0.3
+# As large a share of them has to lie inside. Walls a voxel or two thick look lighter than they are: those of a pepper
+# by up to 40 %, with shares of at most 0.19, while a chest wall with 0.22 is right to 2 %.
+_SOLID = 0.2
 
 
 @dataclass
@@ -39,7 +43,7 @@ class ShortFit:
     held_out : float
         Misfit of the held-out rays, or of the fitted ones where there are too few.
     soft_density : float
-        Density in g/cm3 of what most of the object is made of, were it the first material.
+        Density in g/cm3 of what most of the object is made of, were it the first material; 0 where that is too thin.
     areal : (3, rays) array
         Areal densities in g/cm2 of some of the rays.
     measured, weight : (rays,) arrays
@@ -117,14 +121,25 @@ def short_fit(
 
 
 def main_density(density: np.ndarray) -> float:
-    """Density of the matter that most of an object is made of: where its voxels crowd."""
+    """Density of the matter that most of an object is made of: where the voxels inside of it crowd.
+
+    Parameters
+    ----------
+    density : (nz, ny, nx) array
+
+    Returns
+    -------
+    float
+        0 where too little of that matter lies inside of it to show its density.
+    """
     level = mass_level(density)
-    near = np.sort(density[(density > 0.6 * level) & (density < 1.6 * level)].astype(np.float64))
-    if not len(near):
-        return level
-    width = max(1, int(_CROWD * len(near)))
-    first = int(np.argmin(near[width - 1 :] - near[: len(near) - width + 1]))
-    return float(near[first : first + width].mean())
+    near = (density > 0.6 * level) & (density < 1.6 * level)
+    inside = np.sort(density[ndimage.binary_erosion(near, border_value=1)].astype(np.float64))
+    if len(inside) < max(1.0, _SOLID * np.count_nonzero(near)):
+        return 0.0
+    width = max(1, int(_CROWD * len(inside)))
+    first = int(np.argmin(inside[width - 1 :] - inside[: len(inside) - width + 1]))
+    return float(inside[first : first + width].mean())
 
 
 def _sample(
