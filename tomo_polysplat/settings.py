@@ -84,10 +84,13 @@ class Settings:
     """Deviations beyond which a residual counts absolutely (95 % efficient for Gaussian noise: Huber 1964)."""
     ssim_weight: float = 0.0
     """Weight of 1 - SSIM of the projections (the paper uses 0.25)."""
-    tv_weight: float = 0.02
+    tv_weight: float = 0.04
     """Weight of the total variation per voxel, in soft references."""
     tv_clip: float = 2.5
     """Attenuation above this many soft references does not count as variation, which would erode metal."""
+    tv_corner: float = 0.1
+    """Difference of neighbouring voxels, in soft references, up to which it counts in full; larger ones count by
+    their logarithm, so that edges and texture stay. 0: all in full."""
     tv_box: int = 0
     """Edge in voxels of the random box whose total variation is taken; 0 leaves it to the plan."""
     relocated: float = 0.03

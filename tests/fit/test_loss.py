@@ -93,6 +93,29 @@ def test_total_variation_of_one_slice_leaves_the_missing_axis_out():
     assert float(total_variation(torch.full((1, 1, 1), 3.0), 10.0)) == 0
 
 
+def test_with_a_corner_noise_counts_in_full_and_an_edge_by_its_logarithm():
+    noise = 1e-6 * torch.rand((5, 7, 4), generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    full, with_corner = (float(total_variation(noise, 10.0, corner)) for corner in (0.0, 0.1))
+    assert with_corner == pytest.approx(full, rel=1e-5)
+    edge = torch.zeros((1, 1, 4), dtype=torch.float64)
+    edge[..., 2:] = 0.7
+    assert float(total_variation(edge, 10.0, 0.1)) == pytest.approx(0.1 * math.log(8.0) / 3)
+
+
+def test_the_pull_on_an_edge_falls_with_its_height():
+    """The derivative of c log(1 + d / c) by d: 1 at a vanishing difference, a half at the corner."""
+    heights = torch.tensor([1e-9, 0.1, 0.9], dtype=torch.float64)
+    pulls = []
+    for height in heights:
+        pair = torch.stack([torch.zeros_like(height), height])[None, None].requires_grad_()
+        total_variation(pair, 10.0, 0.1).backward()
+        pulls.append(pair.grad[0, 0].tolist())
+    expected = torch.tensor([1.0, 0.5, 0.1], dtype=torch.float64)
+    assert torch.tensor(pulls, dtype=torch.float64).numpy() == pytest.approx(
+        torch.stack([-expected, expected], 1).numpy()
+    )
+
+
 def test_brightness_above_the_ceiling_is_free():
     volume = torch.zeros((1, 8, 8), dtype=torch.float64)
     volume[0, 2:5, 2:5] = 3.0

@@ -177,7 +177,7 @@ class _Fit:
         areal = project_voxels(weights, self.pair, views) * self.cm
         predicted = polychromatic_projection(areal, self.quadrature)
         fitted = misfit(predicted, measured, weight, self.settings)
-        rough = total_variation(self._output(weights), self.settings.tv_clip)
+        rough = total_variation(self._output(weights), self.settings.tv_clip, self.settings.tv_corner)
         self.optimiser.zero_grad(set_to_none=True)
         (fitted + self.settings.tv_weight * rough).backward()
         self.optimiser.step()

@@ -201,6 +201,9 @@ class FusedStep:
         drawn, box = (position, scale, rotation, output), VoxelBox(np.zeros(3), np.ones(3), self._box)
         record = ellipsoids(*drawn, table, VOXEL_CUTOFF)
         volume = box_forward.splat(record, 1, box, VOXEL_CUTOFF, self._largest[1])
-        slope = variation_gradient(volume, self.settings.tv_clip, self.settings.tv_weight, self._largest[1])
+        chosen = self.settings
+        slope = variation_gradient(
+            volume, chosen.tv_clip, chosen.tv_corner, chosen.tv_weight, self._largest[1]
+        )
         moments = box_backward.sum_moments(record, slope, box, VOXEL_CUTOFF)
         return box_backward.pull_back(*drawn, table, moments)

@@ -55,11 +55,16 @@ def roughness(gaussians: Gaussians, scene: FitScene, settings: Settings, box: Vo
     with torch.no_grad():
         reach = VOXEL_CUTOFF * gaussians.log_scale.amax(dim=1, keepdim=True).exp()
         near = ((gaussians.position + reach >= lower) & (gaussians.position - reach <= upper)).all(dim=1)
-    return total_variation(scene.attenuation(gaussians.select(near.nonzero()[:, 0]), box), settings.tv_clip)
+    volume = scene.attenuation(gaussians.select(near.nonzero()[:, 0]), box)
+    return total_variation(volume, settings.tv_clip, settings.tv_corner)
 
 
-def total_variation(volume: torch.Tensor, ceiling: float) -> torch.Tensor:
+def total_variation(volume: torch.Tensor, ceiling: float, corner: float = 0.0) -> torch.Tensor:
     """Mean absolute difference of neighbouring voxels per axis, summed over the axes.
+
+    With a ``corner`` c each difference d counts as ``c log(1 + |d| / c)``: like |d| below c, hardly more with every
+    doubling above. So noise is smoothed as before, and edges and texture pay little for their height (the log-sum
+    penalty: Candes, Wakin and Boyd 2008, doi:10.1007/s00041-008-9045-x).
 
     Parameters
     ----------
@@ -67,10 +72,13 @@ def total_variation(volume: torch.Tensor, ceiling: float) -> torch.Tensor:
         Axes of length one contribute nothing.
     ceiling : float
         Values above it count as it: a piece of metal should not pay for its brightness, only for its surface.
+    corner : float
+        0 for the total variation itself.
     """
     clipped = volume.clamp(max=ceiling)
     total = volume.new_zeros(())
     for axis in range(volume.ndim):
         if volume.shape[axis] > 1:
-            total = total + clipped.diff(dim=axis).abs().mean()
+            height = clipped.diff(dim=axis).abs()
+            total = total + (corner * torch.log1p(height / corner) if corner else height).mean()
     return total

@@ -181,7 +181,10 @@ def _blurred(start: np.ndarray | torch.Tensor, soft: float, settings: Settings) 
     if not settings.learning_rate_blur:
         return settings.blur > 0, describe_blur(settings.blur, fitted=False)
     if bool((start > settings.metal_level * soft).any()):
-        return True, f"fitted, from a variance of {settings.blur:g} squared pixels on: metal has edges that hold it"
+        return (
+            True,
+            f"fitted, from a variance of {settings.blur:g} squared pixels on: metal has edges that hold it",
+        )
     return False, "none: without metal, a smooth object and a detector that blurs look alike"
 
 

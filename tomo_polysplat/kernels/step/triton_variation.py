@@ -14,22 +14,24 @@ _BLOCK = 256
 
 
 @triton.jit
-def _sign(a, b):
-    return tl.where(a > b, 1.0, 0.0) - tl.where(a < b, 1.0, 0.0)
+def _slope(a, b, by_corner):
+    """Derivative of the penalty of a - b by a: the sign, less where the difference is large."""
+    sign = tl.where(a > b, 1.0, 0.0) - tl.where(a < b, 1.0, 0.0)
+    return sign / (1.0 + tl.abs(a - b) * by_corner)
 
 
 @triton.jit
-def _along(volume, at, value, index, length, stride, live, ceiling):
-    """d/dvalue of the mean absolute difference of neighbours along an axis."""
+def _along(volume, at, value, index, length, stride, live, ceiling, by_corner):
+    """d/dvalue of the penalties of the differences from both neighbours along an axis."""
     before = tl.minimum(tl.load(volume + at - stride, mask=live & (index > 0), other=0.0), ceiling)
     after = tl.minimum(tl.load(volume + at + stride, mask=live & (index < length - 1), other=0.0), ceiling)
-    slope = tl.where(index > 0, _sign(value, before), 0.0)
-    slope -= tl.where(index < length - 1, _sign(after, value), 0.0)
+    slope = tl.where(index > 0, _slope(value, before, by_corner), 0.0)
+    slope -= tl.where(index < length - 1, _slope(after, value, by_corner), 0.0)
     return slope
 
 
 @triton.jit
-def _variation_kernel(volume, grad, largest, nz, ny, nx, ceiling, factor, BLOCK: tl.constexpr):
+def _variation_kernel(volume, grad, largest, nz, ny, nx, ceiling, by_corner, factor, BLOCK: tl.constexpr):
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     size = nz * ny * nx
     live = at < size
@@ -39,14 +41,16 @@ def _variation_kernel(volume, grad, largest, nz, ny, nx, ceiling, factor, BLOCK:
     value = tl.minimum(raw, ceiling)
     tl.atomic_max(largest, tl.max(raw, 0), sem="relaxed")
     # The mean over an axis has a term less a line than the volume has voxels.
-    slope = _along(volume, at, value, x, nx, 1, live, ceiling) / tl.maximum(size - ny * nz, 1)
-    slope += _along(volume, at, value, y, ny, nx, live, ceiling) / tl.maximum(size - nx * nz, 1)
-    slope += _along(volume, at, value, z, nz, nx * ny, live, ceiling) / tl.maximum(size - nx * ny, 1)
+    slope = _along(volume, at, value, x, nx, 1, live, ceiling, by_corner) / tl.maximum(size - ny * nz, 1)
+    slope += _along(volume, at, value, y, ny, nx, live, ceiling, by_corner) / tl.maximum(size - nx * nz, 1)
+    slope += _along(volume, at, value, z, nz, nx * ny, live, ceiling, by_corner) / tl.maximum(
+        size - nx * ny, 1
+    )
     tl.store(grad + at, tl.where(raw <= ceiling, slope * factor, 0.0), mask=live)
 
 
 def variation_gradient(
-    volume: torch.Tensor, ceiling: float, factor: float, largest: torch.Tensor
+    volume: torch.Tensor, ceiling: float, corner: float, factor: float, largest: torch.Tensor
 ) -> torch.Tensor:
     """``factor`` times the gradient of ``fit.loss.total_variation`` of a volume (1, nz, ny, nx), so shaped.
 
@@ -55,6 +59,7 @@ def variation_gradient(
     grad = torch.empty_like(volume)
     with on_device(volume):
         _variation_kernel[(triton.cdiv(volume.numel(), _BLOCK),)](
-            volume, grad, largest, *volume.shape[1:], ceiling, factor, BLOCK=_BLOCK, num_warps=4
-        )
+            volume, grad, largest, *volume.shape[1:], ceiling, 1 / corner if corner else 0.0, factor,
+            BLOCK=_BLOCK, num_warps=4,
+        )  # fmt: skip
     return grad
