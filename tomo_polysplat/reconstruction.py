@@ -20,6 +20,7 @@ from tomo_polysplat.fit.optimise import FitOutcome, FitState, fit
 from tomo_polysplat.fit.plan import Plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.soft_matter import describe_soft
 from tomo_polysplat.interrupts import postponed_interrupts
 from tomo_polysplat.kernels.device import one_torch_thread, usual_modes
 from tomo_polysplat.model.gaussians import Gaussians
@@ -227,6 +228,9 @@ def _result(outcome: FitOutcome, begun: Begun, problem: Problem, grid: VolumeGri
     if plan.blurred:
         fitted = about["settings"]["learning_rate_blur"] > 0
         plan.reasons["detector_blur"] = describe_blur(float(gaussians.blur), fitted=fitted)
+    if plan.curves > 1 and len(gaussians):
+        number, tunables = float(gaussians.shared_material[0]), about["settings"]
+        plan.reasons["soft_material"] = describe_soft(number, tunables["soft_u"], tunables["soft_gain"])
     with torch.no_grad():
         own = scene.basis(gaussians).cpu().numpy() * np.float32(plan.reference)
         heights = gaussians.weights(scene.reference_curve).sum(dim=0)

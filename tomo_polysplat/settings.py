@@ -54,7 +54,9 @@ class Settings:
     metal_rim: float = 0.0
     """Level down to which what is connected to metal belongs to it; 0: ``metal_level`` itself."""
     soft_u: float = 0.0
-    """Material number of soft matter; near dense matter a start, elsewhere it stays."""
+    """Material number of soft matter that the fit starts from; near dense matter it is free."""
+    soft_gain: float = 1.0
+    """Once a pass the soft matter's number moves by so much times the cupping, where it is one matter; 0 holds it."""
     bone_u: float = 0.35
     metal_u: float = 0.8
     free_radius: float = 6.0

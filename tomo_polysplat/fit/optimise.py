@@ -17,6 +17,7 @@ from tomo_polysplat.fit.choose_step import make_step
 from tomo_polysplat.fit.loss import random_box
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.soft_matter import flatten
 from tomo_polysplat.fit.stopping import Clock, FitState, Watch
 from tomo_polysplat.model.density_control import relocate
 from tomo_polysplat.model.gaussians import OF_ALL, Gaussians
@@ -89,15 +90,16 @@ class _Fitter:
             made += 1
             if made == steps:
                 self.relocation_due = share < self.settings.relocate_until
-                yield self._end_pass()
+                yield self._end_pass(share)
                 made = 0
         if made:
-            yield self._end_pass()
+            yield self._end_pass(1.0)
 
     @torch.no_grad()
-    def _end_pass(self) -> tuple[float, float, int]:
+    def _end_pass(self, share: float) -> tuple[float, float, int]:
         # Once a pass does: in its few steps a Gaussian does not get far beyond the volume.
         self.scene.keep_within(self.gaussians)
+        flatten(self.gaussians, self.scene, self.settings, share)
         return self.step.read()
 
     def snapshot(self, best: Gaussians | None, numbers: dict[str, Any]) -> Snapshot:

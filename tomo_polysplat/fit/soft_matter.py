@@ -1,0 +1,134 @@
+"""The soft matter's material number, from the flatness of what is homogeneous.
+
+A little cupping and a little hardening look alike to the rays, so a free number would drift (`fit.step`). But where
+most of an object is one matter, as in a phantom or a part made of plastic, there is no cupping: its attenuation does
+not depend on how deep it lies. A number too high makes the inside look denser than the rim, one too low lighter.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy import ndimage
+
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.kernels.voxelise.box import VoxelBox
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.settings import Settings
+
+__all__ = ["cupping", "describe_soft", "flatten"]
+
+# Points along an edge at which the volume is looked at.
+_POINTS = 40
+# Parts of a run in which the number moves: the first passes are not flat for other reasons, the last ones settle.
+_FROM, _UNTIL = 0.2, 0.8
+# In points: how far from air and from denser matter the soft one is taken to be itself.
+_RIM, _BESIDE = 1.5, 2.5
+# In soft references: below it there is air. In units of the soft matter: air lies below the first, denser matter above
+# the second.
+_LEAST = 0.3
+_AIR, _DENSE = 0.5, 1.6
+# Of the points of the object, the share that may be denser without being metal or beside it: bone hardens the beam as
+# well, and what is left of that looks like cupping.
+_OTHER = 0.005
+# Of the points inside, the share that must be this close to their median for the matter to be one, and how many there
+# must be, in how many layers of equal depth.
+_ONE, _CLOSE, _FEWEST, _LAYERS = 0.8, 0.1, 200, 6
+# Farthest from its start that the number goes: plastics and oil lie this far below water.
+_REACH = 0.1
+# Own numbers below this belong to soft matter.
+_SOFT = 0.2
+
+
+@torch.no_grad()
+def flatten(gaussians: Gaussians, scene: FitScene, settings: Settings, share: float) -> None:
+    """Move the soft matter's number, and those of soft Gaussians near metal, against the cupping there is.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        Changed in place.
+    scene : FitScene
+    settings : Settings
+        ``soft_gain`` times the cupping, and times the share that is left, is the change.
+    share : float
+        Of the run that is done.
+    """
+    if scene.reference_curve is None or not settings.soft_gain or not _FROM <= share <= _UNTIL:
+        return
+    volume = scene.attenuation(gaussians, _coarse(scene.box)).cpu().numpy()
+    found = cupping(volume, settings.bone_level, settings.metal_level)
+    number = gaussians.shared_material[0]
+    # Less and less, as of any estimate that is averaged over a noisy run (Robbins and Monro 1951).
+    gain = settings.soft_gain * (1 - share)
+    change = -gain * found if found is not None else settings.soft_u - float(number)
+    least, most = max(scene.least_u, settings.soft_u - _REACH), settings.soft_u + _REACH
+    moved = number.add(change).clamp(least, most)
+    own = gaussians.own_material
+    own.copy_(torch.where(own < _SOFT, own + (moved - number), own).clamp(min=scene.least_u))
+    number.copy_(moved)
+
+
+def cupping(attenuation: np.ndarray, bone_level: float, metal_level: float) -> float | None:
+    """By what share homogeneous matter is brighter at its deepest than at its rim.
+
+    Parameters
+    ----------
+    attenuation : (nz, ny, nx) array
+        In soft references.
+    bone_level, metal_level : float
+        Levels above which matter is not soft, and above which it is metal, whose surroundings say nothing.
+
+    Returns
+    -------
+    float or None
+        None where the object is not mostly one matter, or too small to tell.
+    """
+    volume = attenuation[0] if attenuation.shape[0] == 1 else attenuation
+    body = volume[(volume > _LEAST) & (volume < metal_level)]
+    level = float(np.median(body)) if len(body) >= _FEWEST else 0.0
+    if not 0 < level <= bone_level:
+        return None
+    dense, away = volume > _DENSE * level, np.full(volume.shape, np.inf)
+    if (volume >= metal_level).any():
+        away = ndimage.distance_transform_edt(volume < metal_level)
+    if np.count_nonzero(dense & (away > _BESIDE)) > _OTHER * len(body):
+        return None
+    depth = _depth(volume > _AIR * level)
+    inside = depth > _RIM
+    if dense.any():
+        inside &= ndimage.distance_transform_edt(~dense) > _BESIDE
+    if np.count_nonzero(inside) < _FEWEST or depth[inside].max() <= 2 * _RIM:
+        return None
+    values, depth = volume[inside] / np.median(volume[inside]), depth[inside]
+    close = np.abs(values - 1) < _CLOSE
+    return _slope(values[close], depth[close] / depth.max()) if close.mean() >= _ONE else None
+
+
+def _depth(matter: np.ndarray) -> np.ndarray:
+    """Distance from air in points; beyond the border the object goes on."""
+    wide = ndimage.distance_transform_edt(np.pad(matter, 1, mode="edge"))
+    return wide[(slice(1, -1),) * matter.ndim]
+
+
+def _slope(values: np.ndarray, depth: np.ndarray) -> float:
+    """Slope of the medians of layers of equal depth, which inclusions and what is left of streaks do not pull."""
+    layers = np.array_split(np.argsort(depth, kind="stable"), _LAYERS)
+    heights = [float(np.median(values[layer])) for layer in layers]
+    return float(np.polyfit([float(depth[layer].mean()) for layer in layers], heights, 1)[0])
+
+
+def describe_soft(number: float, begun_at: float, gain: float) -> str:
+    """What a reconstruction took for the soft matter's material number, in words."""
+    if not gain:
+        return f"{number:.3f}, held as asked for"
+    if abs(number - begun_at) < 1e-6:
+        return f"{number:.3f}, held: the object is not one homogeneous matter beside its metal"
+    return f"{number:.3f}, by which the object's one matter is as dense inside as at its rim"
+
+
+def _coarse(box: VoxelBox) -> VoxelBox:
+    """The volume at no more than so many points an axis, each a voxel's centre."""
+    step = [-(-n // _POINTS) for n in box.shape]
+    nz, ny, nx = (-(-n // k) for n, k in zip(box.shape, step))
+    return VoxelBox(box.first, box.spacing * np.array(step[::-1]), (nz, ny, nx))
