@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from tomo_polysplat.baselines.astra_pair import AstraPair
 from tomo_polysplat.baselines.sirt import sirt
-from tomo_polysplat.baselines.voxel_projector import project_voxels, projector_pair
 from tomo_polysplat.scan.geometry import from_astra, projections_from_astra
 from tomo_polysplat.simulate.scenes import simulate_scan
+from tomo_polysplat.start.astra_pair import AstraPair
+from tomo_polysplat.start.voxel_projector import project_voxels, projector_pair
 
 VIEWS = np.array([1, 4, 5])
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from tomo_polysplat.fit.plan import make_plan, mass_level
+from tomo_polysplat.fit.plan import make_plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.spectrum import Spectrum
@@ -55,26 +55,6 @@ def ball(of, density):
 
 def plan(of, start, device="cpu", **settings):
     return make_plan(start, of, Settings(**settings), device)
-
-
-@pytest.mark.parametrize("values", [[1.0, 1, 1, 1, 1], [1.0, 2, 3], [5.0, 1, 1, 1], [0.0, 0, 2, -3]])
-def test_mass_level_halves_the_mass(values):
-    volume = np.array(values, np.float32)
-    level = mass_level(volume)
-    positive = volume[volume > 0]
-    assert positive[positive <= level].sum() >= 0.5 * positive.sum()
-    assert positive[positive < level].sum() < 0.5 * positive.sum()
-
-
-def test_mass_level_of_nothing_is_zero():
-    assert mass_level(np.zeros((3, 3, 3))) == mass_level(-np.ones((3, 3, 3))) == 0
-
-
-def test_mass_level_is_not_moved_by_noise_and_little_metal():
-    rng = np.random.default_rng(0)
-    volume = np.where(rng.random(20000) < 0.4, 1.0, 0.0) + 0.05 * rng.standard_normal(20000)
-    volume[:10] = 100.0
-    assert mass_level(volume) == pytest.approx(1.0, abs=0.05)
 
 
 @pytest.mark.parametrize("density", [0.05, 0.3, 1.0, 2.0, 20.0, 280.0])

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from tomo_polysplat.baselines.voxel_projector import projector_pair
-from tomo_polysplat.fit.plan import mass_level
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.initial import initial_volume
+from tomo_polysplat.start.levels import mass_level
+from tomo_polysplat.start.voxel_projector import projector_pair
 
 __all__ = ["MetalTrace", "find_metal", "forward_project", "replace_trace"]
 

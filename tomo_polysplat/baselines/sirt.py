@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from tomo_polysplat.baselines.astra_pair import astra_has_gpu, gpu_index
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, to_astra
 from tomo_polysplat.start import sirt as start
+from tomo_polysplat.start.astra_pair import astra_has_gpu, gpu_index
 
 __all__ = ["sirt"]
 

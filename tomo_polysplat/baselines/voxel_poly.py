@@ -14,7 +14,6 @@ import numpy as np
 import torch
 
 from tomo_polysplat.baselines.voxel_model import VoxelModel, start_voxels
-from tomo_polysplat.baselines.voxel_projector import ProjectorPair, project_voxels, projector_pair
 from tomo_polysplat.fit.loss import misfit, total_variation
 from tomo_polysplat.fit.noise import photons_per_ray
 from tomo_polysplat.fit.optimise import FitState
@@ -28,6 +27,7 @@ from tomo_polysplat.render.renderer import detector_views
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.settings import Settings, make_settings
 from tomo_polysplat.start.initial import initial_volume
+from tomo_polysplat.start.voxel_projector import ProjectorPair, project_voxels, projector_pair
 from tomo_polysplat.units import cm_per
 
 __all__ = ["voxel_poly"]

@@ -13,7 +13,6 @@ from tomo_polysplat.bench.environment import environment
 from tomo_polysplat.bench.scenes import cached_scan, object_of, require_scene
 from tomo_polysplat.checks import require_choice
 from tomo_polysplat.files import replacing
-from tomo_polysplat.fit.plan import mass_level
 from tomo_polysplat.fit.short_fit import main_density
 from tomo_polysplat.physics.detector import Detector
 from tomo_polysplat.physics.materials import Materials, mass_attenuation
@@ -24,6 +23,7 @@ from tomo_polysplat.report.style import ACCENT, QUIET
 from tomo_polysplat.result.metrics import compare
 from tomo_polysplat.scan.scan import Scan
 from tomo_polysplat.settings import PRESETS
+from tomo_polysplat.start.levels import mass_level
 from tomo_polysplat.units import cm_per
 
 __all__ = ["CASES", "SpectrumBench", "as_markdown", "run_spectrum_bench", "write_figure"]

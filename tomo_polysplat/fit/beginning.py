@@ -104,7 +104,7 @@ def _first_state(problem: Problem, wishes: Wishes, saved: Checkpoint | None) -> 
     settings, device = wishes.settings, wishes.device
     if saved is not None and saved.snapshot is not None and saved.plan is not None:
         return saved.plan, saved.snapshot.gaussians.to(device)
-    start, why = problem.start_volume(device)
+    start, why = problem.start_volume(device, settings.metal_level)
     plan = make_plan(start, problem, settings, device.type)
     settings, agent = settings_for_agent(start, plan.reference, problem, settings, device, wishes.options())
     plan.reasons |= {"start": why, **agent}

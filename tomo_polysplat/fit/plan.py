@@ -17,11 +17,12 @@ import torch
 
 from tomo_polysplat.physics.detector_blur import describe_blur
 from tomo_polysplat.settings import Settings
+from tomo_polysplat.start.levels import MAIN_SHARE, main_level, mass_level
 
 if TYPE_CHECKING:
     from tomo_polysplat.fit.problem import Problem
 
-__all__ = ["Plan", "make_plan", "mass_level"]
+__all__ = ["Plan", "make_plan"]
 
 logger = logging.getLogger(__name__)
 
@@ -37,9 +38,6 @@ _STEPS, _MOST_VIEWS, _MOST_VIEWS_PLANAR = 300, {"cpu": 8, "cuda": 4}, 8
 _TV_BOX, _TV_BOX_PLANAR = {"cpu": 48, "cuda": 128}, 256
 # Gaussians that a laptop and a GPU fit in a time people wait for.
 _MOST_GAUSSIANS = {"cpu": 60_000, "cuda": 400_000}
-# Of the mass that is no denser than so many times the level of half of it, the share below the main matter's
-# attenuation. Too low a reference smooths too much (walls of a voxel, one energy: 20.8 dB with half the mass, 21.6).
-_NOT_METAL, _MAIN_SHARE = 3.0, 0.7
 # Objects of solid metal are so many times as dense as water at most (rods of silver: 180, of gold: 280): only beyond
 # is the unit of length in doubt.
 _DENSEST = 600.0
@@ -90,7 +88,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
         Zero stands for "decide", anything else is taken as it is.
     device : "cpu" or "cuda"
     """
-    level = mass_level(start) if problem.polychromatic else _main_level(start)
+    level = mass_level(start) if problem.polychromatic else main_level(start)
     reference, why = _reference(level / problem.depth, problem.polychromatic)
     support = int((start > settings.support_level * reference * problem.depth).sum())
     spacing, finer, because = _seed_spacing(support, problem, settings, device)
@@ -123,26 +121,10 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     return plan
 
 
-def mass_level(volume: np.ndarray | torch.Tensor, share: float = 0.5) -> float:
-    """The value below which a share of a volume's mass lies; half: its main matter, whatever noise and metal do."""
-    values = torch.as_tensor(volume)
-    values = values[values > 0].double().sort().values
-    if not len(values):
-        return 0.0
-    mass = values.cumsum(0)
-    return float(values[torch.searchsorted(mass, share * mass[-1])])
-
-
-def _main_level(start: np.ndarray | torch.Tensor) -> float:
-    """Attenuation of the main matter: above the level of half the mass where walls are too thin to show theirs."""
-    values = torch.as_tensor(start)
-    return mass_level(values[values <= _NOT_METAL * mass_level(values)], _MAIN_SHARE)
-
-
 def _reference(level: float, polychromatic: bool) -> tuple[float, str]:
     """Soft reference for a start with half its mass below ``level``."""
     if not polychromatic:
-        return level or 1.0, f"{_MAIN_SHARE:.0%} of the start's mass lies below it, metal not counted"
+        return level or 1.0, f"{MAIN_SHARE:.0%} of the start's mass lies below it, metal not counted"
     factor = 1000.0 ** round(math.log10(level) / 3) if level > 0 else 1.0
     if factor == 1 or 1 < level <= _DENSEST:
         return 1.0, f"water: half of the object's mass is at most {level:.3g} times as dense"

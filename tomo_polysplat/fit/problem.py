@@ -37,7 +37,9 @@ from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.scan.snapped import snapped_geometry, snapped_grid
 from tomo_polysplat.scan.view_order import view_order
 from tomo_polysplat.settings import Settings
+from tomo_polysplat.start.bridged import bridged_start
 from tomo_polysplat.start.initial import initial_volume_on
+from tomo_polysplat.start.levels import main_level
 from tomo_polysplat.units import LENGTH_UNITS, cm_per
 
 __all__ = ["Problem"]
@@ -145,13 +147,20 @@ class Problem:
         per_gram = self.materials.mass_attenuation([self.spectrum.effective_energy])[0, 0]
         return float(per_gram) * self.depth / self.length
 
-    def start_volume(self, device: torch.device) -> tuple[torch.Tensor, str]:
-        """First reconstruction, ``depth`` times g/cm3 of water or times an attenuation, and how it was made."""
+    def start_volume(
+        self, device: torch.device, metal_level: float = Settings.metal_level
+    ) -> tuple[torch.Tensor, str]:
+        """First reconstruction, ``depth`` times g/cm3 of water or times an attenuation, and how it was made.
+
+        What is above so many soft references is metal, whose rays are bridged where that helps.
+        """
         values = self._primary(device)
         if self.spectrum is not None:
             values = water_equivalent(values, self.spectrum)
         volume, done = initial_volume_on(values, self.geometry, self.grid)
-        return volume, f"{done['method'].upper()}: {done['reason']}"
+        metal = metal_level * (self.depth if self.polychromatic else main_level(volume))
+        volume, bridged = bridged_start(values, volume, done["method"], self.geometry, self.grid, metal=metal)
+        return volume, f"{done['method'].upper()}: {done['reason']}{bridged}"
 
     def measured(self, device: torch.device) -> torch.Tensor:
         """The projections on a device, copied there once; on the host where they do not fit there."""

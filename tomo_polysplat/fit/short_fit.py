@@ -10,13 +10,14 @@ import torch
 from scipy import ndimage
 
 from tomo_polysplat.fit.optimise import fit
-from tomo_polysplat.fit.plan import make_plan, mass_level
+from tomo_polysplat.fit.plan import make_plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.render.renderer import project_gaussians
 from tomo_polysplat.settings import Settings
+from tomo_polysplat.start.levels import mass_level
 
 __all__ = ["ShortFit", "main_density", "short_fit"]
 

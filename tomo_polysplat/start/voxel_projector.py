@@ -9,8 +9,8 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from tomo_polysplat.baselines.astra_pair import AstraPair, astra_has_gpu
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.start.astra_pair import AstraPair, astra_has_gpu
 from tomo_polysplat.start.joseph import JosephProjector
 
 __all__ = ["ProjectorPair", "project_voxels", "projector_pair"]

@@ -1,0 +1,150 @@
+"""A start that metal does not streak: its rays are bridged and the volume made once more.
+
+Where light hardly passes metal, filtered backprojection paints bands of nothing, or of twice too much, right across
+the object. A fit mends values, but what was seeded where there is nothing, and not seeded where there is matter, stays.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+
+import numpy as np
+import torch
+
+from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.start.astra_pair import astra_has_gpu
+from tomo_polysplat.start.initial import initial_volume_on
+from tomo_polysplat.start.levels import mass_level
+from tomo_polysplat.start.on_gpu import fill_rows
+from tomo_polysplat.start.voxel_projector import ProjectorPair, projector_pair
+
+__all__ = ["bridged_start"]
+
+_log = logging.getLogger(__name__)
+
+# Attenuation, in multiples of the main matter, between which a voxel of the prior is made all soft matter.
+_AIR, _BONE = 0.4, 1.5
+# Rays whose prior is below this share of the largest are not normalised: they would only amplify noise.
+_THIN = 0.02
+# A trace that covers more of the object's rays than this leaves too few to bridge it with.
+_MOST_OF_RAYS = 0.5
+# Views of which the rays beside metal say which volume is the better one.
+_JUDGES = 24
+# Steps along all rays beyond which the two more projections would take minutes on two CPU cores.
+_MOST_STEPS = 1e10
+
+
+def bridged_start(
+    values: torch.Tensor,
+    volume: torch.Tensor,
+    method: str,
+    geometry: Geometry,
+    grid: VolumeGrid,
+    *,
+    metal: float,
+) -> tuple[torch.Tensor, str]:
+    """The start volume, made anew without the rays through metal if that explains the other rays better.
+
+    Normalised metal artefact reduction (Meyer et al. 2010, doi:10.1118/1.3484090): the rays through metal are
+    interpolated between those beside it, once divided by the projections of a prior. It invents what lay in the
+    shadow of metal, and may do harm where metal is wide; so both volumes are projected, and the rays beside metal
+    choose.
+
+    Parameters
+    ----------
+    values : (views, rows, columns) tensor
+        -log(I/I0), water-corrected where the spectrum is known; NaN where a ray is not to be used.
+    volume : (nz, ny, nx) tensor
+        What `initial_volume_on` made of them, by ``method``.
+    geometry, grid : Geometry, VolumeGrid
+    metal : float
+        Attenuation above which a voxel holds metal.
+
+    Returns
+    -------
+    volume : (nz, ny, nx) tensor
+        With metal as the first volume has it.
+    why : str
+        What was done, for reports; empty without metal.
+    """
+    mask = volume > metal
+    if not bool(mask.any()):
+        return volume, ""
+    if method != "fdk":
+        return volume, "; metal not bridged: too few views, or not an orbit"
+    on_gpu = values.is_cuda and astra_has_gpu()
+    if not on_gpu and math.prod(geometry.shape) * max(grid.shape) > _MOST_STEPS:
+        return volume, "; metal not bridged: it would take a CPU minutes"
+    try:
+        with projector_pair(geometry, grid, volume.device) as pair:
+            return _better(values, volume, mask, geometry, grid, pair, metal)
+    except RuntimeError as problem:
+        if not on_gpu:
+            raise
+        # Torch's, or ASTRA's, whose projection needs as much memory again.
+        _log.warning("The start is not bridged at metal: %s", problem)
+        return volume, "; metal not bridged: the GPU has no room for it"
+
+
+def _better(
+    values: torch.Tensor,
+    volume: torch.Tensor,
+    mask: torch.Tensor,
+    geometry: Geometry,
+    grid: VolumeGrid,
+    pair: ProjectorPair,
+    metal: float,
+) -> tuple[torch.Tensor, str]:
+    """The volume or the bridged one, whichever explains the rays beside metal, and words that say so."""
+    # Half a voxel: less is the blur of the threshold's edge, and a wider trace loses more than it heals.
+    trace = pair.forward(mask.float(), np.arange(geometry.views)) > 0.5 * float(grid.voxel_size.min())
+    matter = values > _THIN * float(values.nan_to_num(nan=-math.inf).max())
+    covered = float((trace & matter).sum()) / max(float(matter.sum()), 1.0)
+    if covered > _MOST_OF_RAYS:
+        return volume, f"; metal not bridged: {covered:.0%} of the object's rays pass through it"
+    beside = values.masked_fill(trace, math.nan)
+    bridged = torch.where(mask, volume, _made_without(beside, mask, geometry, grid, pair, metal))
+    before, after = (_misfit(each, beside, pair) for each in (volume, bridged))
+    words = f"misses the rays beside it by {after:.2g}, a start with all rays by {before:.2g}"
+    if after < before:
+        return (
+            bridged,
+            f"; the {covered:.0%} of the object's rays that pass through metal bridged, which {words}",
+        )
+    return volume, f"; metal not bridged, which {words}"
+
+
+def _prior(volume: torch.Tensor, mask: torch.Tensor, soft: float, metal: float) -> torch.Tensor:
+    """Air and soft matter made uniform, bone kept, and soft matter in place of metal."""
+    prior = torch.where(volume > _BONE * soft, volume.clamp(max=metal), soft)
+    prior[volume < _AIR * soft] = 0
+    prior[mask] = soft
+    return prior
+
+
+def _made_without(
+    beside: torch.Tensor,
+    mask: torch.Tensor,
+    geometry: Geometry,
+    grid: VolumeGrid,
+    pair: ProjectorPair,
+    metal: float,
+) -> torch.Tensor:
+    """The volume of rays of which those through metal, NaN, are bridged."""
+    first, _ = initial_volume_on(beside, geometry, grid)
+    main = mass_level(first[~mask])
+    prior = pair.forward(_prior(first, mask, main, metal), np.arange(geometry.views))
+    thick = prior > _THIN * float(prior.max())
+    ratio = torch.where(thick, beside / prior.clamp(min=1e-12), 0.0)
+    bridged = torch.where(thick, fill_rows(ratio) * prior, fill_rows(beside))
+    second, _ = initial_volume_on(bridged, geometry, grid)
+    return second
+
+
+def _misfit(volume: torch.Tensor, beside: torch.Tensor, pair: ProjectorPair) -> float:
+    """Mean absolute misfit of some views, metal's rays left out."""
+    views = np.unique(np.linspace(0, len(beside) - 1, min(_JUDGES, len(beside))).astype(int))
+    wanted = beside[torch.from_numpy(views).to(beside.device)]
+    error = (pair.forward(volume.clamp(min=0), views) - wanted).abs()
+    return float(error[torch.isfinite(error)].mean())
