@@ -88,8 +88,9 @@ class Settings:
     """Weight of 1 - SSIM of the projections (the paper uses 0.25)."""
     tv_weight: float = 0.04
     """Weight of the total variation per voxel, in soft references."""
-    tv_clip: float = 2.5
-    """Attenuation above this many soft references does not count as variation, which would erode metal."""
+    tv_clip: float = 5.0
+    """Attenuation above this many soft references does not count as variation, which would erode metal; what is lighter
+    than metal, castings of aluminium too, is smoothed."""
     tv_corner: float = 0.1
     """Difference of neighbouring voxels, in soft references, up to which it counts in full; larger ones count by
     their logarithm, so that edges and texture stay. 0: all in full."""
