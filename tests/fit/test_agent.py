@@ -63,3 +63,19 @@ def test_short_fits_begin_with_the_start_there_is_and_the_best_is_taken(dense, m
         assert (
             best.metal_level == seen[-1][1].metal_level != settings.metal_level and "agent" in told["agent"]
         )
+
+
+def test_metal_that_was_named_starts_as_itself():
+    scan, device, options = fan(), torch.device("cpu"), {"seed": 0, "time_budget": None}
+
+    def start_of(dense, settings):
+        named = ("water", "aluminium", dense)
+        problem = Problem.of(scan.projections.swapaxes(0, 1), *geometries(scan), "cm", scan.spectrum, named)
+        start, _ = problem.start_volume(device)
+        return settings_for_agent(start, 1.0, problem, settings, device, options)
+
+    settings, told = start_of("titanium", make_settings())
+    assert settings.metal_u == 1.0 and "named" in told["metal"]
+    for dense, wanted in (("titanium", {"metal_u": 0.6}), ("Fe", {})):
+        asked = make_settings(changes=wanted)
+        assert start_of(dense, asked) == (asked, {})

@@ -1,4 +1,4 @@
-"""Which pieces of a start volume are a contrast agent that was named as the dense material.
+"""What starts as the dense material where one was named: metal, or the pieces that are a contrast agent.
 
 The curve of iodine or barium has an edge that those of bone and of the other metals lack. A mixture of the curves
 that holds some of it looks like none of them, and a material number that starts in between does not find its way
@@ -21,7 +21,7 @@ from scipy import ndimage
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.short_fit import short_fit
 from tomo_polysplat.physics.edges import edge_inside
-from tomo_polysplat.physics.materials import Materials
+from tomo_polysplat.physics.materials import Materials, composition
 from tomo_polysplat.settings import Settings
 
 __all__ = ["levels_between", "settings_for_agent"]
@@ -55,7 +55,7 @@ def settings_for_agent(
         Soft reference in g/cm3.
     problem : Problem
     settings : Settings
-        They stay as they are unless a dense material was named that has an edge inside the spectrum.
+        They stay as they are unless a dense material other than the default one was named.
     device : torch.device
     options : mapping
         ``seed`` and ``time_budget`` of the reconstruction.
@@ -66,7 +66,7 @@ def settings_for_agent(
     assert problem.materials is not None
     edge = edge_inside(problem.materials.dense, problem.spectrum)
     if edge is None:
-        return settings, {}
+        return _metal_as_named(settings, problem.materials)
     levels = levels_between((start / (problem.depth * reference)).cpu().numpy(), settings.bone_level)
     if not levels:
         return settings, {}
@@ -90,6 +90,14 @@ def settings_for_agent(
     reason = f"the dense material has an edge at {edge:.1f} keV; misfit of short fits: {tried}"
     logger.info("Contrast agent: %s", reason)
     return best, {"agent": reason}
+
+
+def _metal_as_named(settings: Settings, materials: Materials) -> tuple[Settings, dict[str, str]]:
+    """Metal that was named starts as itself, since its number stays near its start (titanium: 0.87 from 0.8)."""
+    default = Materials().dense
+    if composition(materials.dense) == composition(default) or settings.metal_u != Settings().metal_u:
+        return settings, {}
+    return replace(settings, metal_u=1.0), {"metal": "starts as the dense material, which was named"}
 
 
 def levels_between(start: np.ndarray, bone_level: float) -> list[float]:
