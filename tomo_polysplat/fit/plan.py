@@ -22,7 +22,7 @@ from tomo_polysplat.start.levels import MAIN_SHARE, main_level, mass_level
 if TYPE_CHECKING:
     from tomo_polysplat.fit.problem import Problem
 
-__all__ = ["Plan", "make_plan"]
+__all__ = ["Plan", "make_plan", "soft_reference"]
 
 logger = logging.getLogger(__name__)
 
@@ -88,8 +88,8 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
         Zero stands for "decide", anything else is taken as it is.
     device : "cpu" or "cuda"
     """
-    level = mass_level(start) if problem.polychromatic else main_level(start)
-    reference, why = _reference(level / problem.depth, problem.polychromatic)
+    reference, level = soft_reference(start, problem)
+    why = _why_reference(reference, level, problem.polychromatic)
     support = int((start > settings.support_level * reference * problem.depth).sum())
     spacing, finer, because = _seed_spacing(support, problem, settings, device)
     most = _MOST_VIEWS_PLANAR if problem.planar else _MOST_VIEWS[device]
@@ -121,21 +121,28 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     return plan
 
 
-def _reference(level: float, polychromatic: bool) -> tuple[float, str]:
-    """Soft reference for a start with half its mass below ``level``."""
-    if not polychromatic:
-        return level or 1.0, f"{MAIN_SHARE:.0%} of the start's mass lies below it, metal not counted"
+def soft_reference(start: np.ndarray | torch.Tensor, problem: Problem) -> tuple[float, float]:
+    """Soft reference in g/cm3, or per unit of length for one energy, and the level of the object's main matter."""
+    if not problem.polychromatic:
+        level = main_level(start) / problem.depth
+        return level or 1.0, level
+    level = mass_level(start) / problem.depth
     factor = 1000.0 ** round(math.log10(level) / 3) if level > 0 else 1.0
-    if factor == 1 or 1 < level <= _DENSEST:
-        return 1.0, f"water: half of the object's mass is at most {level:.3g} times as dense"
+    return (1.0 if 1 < level <= _DENSEST else factor), level
+
+
+def _why_reference(reference: float, level: float, polychromatic: bool) -> str:
+    if not polychromatic:
+        return f"{MAIN_SHARE:.0%} of the start's mass lies below it, metal not counted"
+    if reference == 1:
+        return f"water: half of the object's mass is at most {level:.3g} times as dense"
     logger.warning(
         "The object is as dense as %.3g g/cm3 of water: the unit of length looks wrong by a factor of %g.",
         level,
-        factor,
+        reference,
     )
     return (
-        factor,
-        f"water, with lengths off by a factor of {factor:g}: the object looks {level:.3g} times as dense",
+        f"water, with lengths off by a factor of {reference:g}: the object looks {level:.3g} times as dense"
     )
 
 

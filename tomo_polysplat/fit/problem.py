@@ -19,7 +19,7 @@ from tomo_polysplat.checks import require_choice
 from tomo_polysplat.fit.inside import matter_is_inside
 from tomo_polysplat.fit.memory import projections_stay, require_room
 from tomo_polysplat.fit.noise import photons_per_ray
-from tomo_polysplat.fit.plan import Plan
+from tomo_polysplat.fit.plan import Plan, soft_reference
 from tomo_polysplat.fit.plan_costs import alternatives, work
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
@@ -39,7 +39,6 @@ from tomo_polysplat.scan.view_order import view_order
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.bridged import bridged_start
 from tomo_polysplat.start.initial import initial_volume_on
-from tomo_polysplat.start.levels import main_level
 from tomo_polysplat.units import LENGTH_UNITS, cm_per
 
 __all__ = ["Problem"]
@@ -158,7 +157,7 @@ class Problem:
         if self.spectrum is not None:
             values = water_equivalent(values, self.spectrum)
         volume, done = initial_volume_on(values, self.geometry, self.grid)
-        metal = metal_level * (self.depth if self.polychromatic else main_level(volume))
+        metal = metal_level * self.depth * soft_reference(volume, self)[0]
         volume, bridged = bridged_start(values, volume, done["method"], self.geometry, self.grid, metal=metal)
         return volume, f"{done['method'].upper()}: {done['reason']}{bridged}"
 
