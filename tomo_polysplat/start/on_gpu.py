@@ -54,5 +54,6 @@ def _filled(values: torch.Tensor) -> torch.Tensor:
     right = torch.where(after == count, before, after).clamp(min=0)
     usable = torch.where(good, values, 0.0)
     low, high = usable.gather(2, left), usable.gather(2, right)
-    share = (column - left) / (right - left).clamp(min=1)
+    # In the type of the values, whatever the caller's default for quotients of whole numbers.
+    share = (column - left).to(values.dtype) / (right - left).clamp(min=1)
     return torch.where(good, values, torch.where(some, low + share * (high - low), 0.0))
