@@ -30,9 +30,11 @@ def test_a_time_budget_is_kept():
     assert result.history and result.history[-1]["seconds"] < 1.5
 
 
-def test_a_budget_too_small_for_anything_still_returns_the_start():
-    result = reconstruct(fan(), time_budget=1e-6)
-    assert result.volume.max() > 0.1 and "time budget" in result.plan["stop"]
+def test_a_budget_too_small_for_anything_still_returns_the_start_and_says_so(caplog):
+    with caplog.at_level("WARNING"):
+        result = reconstruct(fan(), time_budget=1e-6)
+    assert result.volume.max() > 0.1 and "time budget was used before the first step" in result.plan["stop"]
+    assert "no better than its start" in caplog.text
 
 
 def test_callbacks_see_every_pass():

@@ -243,8 +243,10 @@ def fit(
         logger.warning("The start volume is empty: no Gaussians, a volume of zeros.")
         return FitOutcome(gaussians, reason="nothing to fit: the start volume is empty")
     batch = min(views_per_step, len(rays.views))
-    clock = Clock(max(1, math.ceil(settings.passes * _views_of_a_pass(rays) / batch)), deadline)
-    fitter = _Fitter(gaussians, spacing, rays, scene, _hurried(settings, clock.steps), batch, rng)
+    steps = max(1, math.ceil(settings.passes * _views_of_a_pass(rays) / batch))
+    fitter = _Fitter(gaussians, spacing, rays, scene, _hurried(settings, steps), batch, rng)
+    # From now on: what compiling or recording the step took is no part of the run that the learning rates follow.
+    clock = Clock(steps, deadline)
     outcome, watch = FitOutcome(gaussians), Watch(settings)
     run = _Run(fitter, outcome, watch, clock, started, checkpoint)
     run.restore()
@@ -254,12 +256,19 @@ def fit(
     except KeyboardInterrupt:
         logger.warning("Interrupted after %d steps; the best state so far is returned.", clock.done)
         outcome.reason = "interrupted"
-    used_up = (
-        "the time budget was used" if clock.late else f"{settings.passes:g} passes over the views were made"
-    )
-    outcome.reason = outcome.reason or used_up
+    outcome.reason = outcome.reason or _used_up(clock, settings)
     outcome.gaussians = watch.best or gaussians.copy()
     return outcome
+
+
+def _used_up(clock: Clock, settings: Settings) -> str:
+    """Why a run ended that nothing else had ended before."""
+    if not clock.late:
+        return f"{settings.passes:g} passes over the views were made"
+    if clock.done:
+        return "the time budget was used"
+    logger.warning("The time budget ended before the first step: the result is no better than its start.")
+    return "the time budget was used before the first step"
 
 
 def _views_of_a_pass(rays: Rays) -> int:
