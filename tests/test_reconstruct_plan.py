@@ -15,8 +15,8 @@ def control():
 def test_a_scan_without_dense_matter_is_modelled_by_one_curve(control):
     """It is the same model: the weights of the other two curves are zero."""
     assert control.plan["curves"].startswith("1:")
-    # Two energies are as many nodes, the same for one curve and for three. The object is one matter, whose number is held:
-    # the energies are not the scan's.
+    # Two energies are as many nodes, the same for one curve and for three. They are not the scan's, so that the
+    # number of the one matter there is would move, were it not held.
     pair = {"spectrum": Spectrum(np.array([35.0, 70.0]), np.array([0.5, 0.5]))}
     one, three = (reconstruct(cone(), **pair, settings=QUICK | {"curves": n, "soft_gain": 0}) for n in (0, 3))
     assert one.plan["curves"] != three.plan["curves"] and "2 spectral nodes" in three.plan["spectrum"]
