@@ -143,7 +143,7 @@ def calibrated(
     def trial(fitted: Mapping[str, float]) -> ShortFit:
         budget = None if time_budget is None else _SHARE_OF_BUDGET * time_budget
         physics = with_fitted(problem, fitted)
-        start, _ = physics.start_volume(device)
+        start, _ = physics.start_volume(device, settings.metal_level)
         return short_fit(physics, start, dict(fitted), settings, device, seed, budget, **steps)
 
     first = best = trial({})

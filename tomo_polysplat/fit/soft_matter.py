@@ -22,7 +22,7 @@ __all__ = ["cupping", "describe_soft", "flatten"]
 _POINTS = 40
 # Parts of a run in which the number moves: the first passes are not flat for other reasons, the last ones settle.
 _FROM, _UNTIL = 0.2, 0.8
-# In points: how far from air and from denser matter the soft one is taken to be itself.
+# In distances of the points: how far from air and from denser matter the soft one is taken to be itself.
 _RIM, _BESIDE = 1.5, 2.5
 # In soft references: below it there is air. In units of the soft matter: air lies below the first, denser matter above
 # the second.
@@ -44,6 +44,8 @@ _SOFT = 0.2
 def flatten(gaussians: Gaussians, scene: FitScene, settings: Settings, share: float) -> None:
     """Move the soft matter's number, and those of soft Gaussians near metal, against the cupping there is.
 
+    Where there is none to be told, they move back to where they began.
+
     Parameters
     ----------
     gaussians : Gaussians
@@ -56,12 +58,14 @@ def flatten(gaussians: Gaussians, scene: FitScene, settings: Settings, share: fl
     """
     if scene.reference_curve is None or not settings.soft_gain or not _FROM <= share <= _UNTIL:
         return
-    volume = scene.attenuation(gaussians, _coarse(scene.box)).cpu().numpy()
-    found = cupping(volume, settings.bone_level, settings.metal_level)
+    box = _coarse(scene.box)
+    sampling = box.spacing[::-1] / box.spacing.max()
+    volume = scene.attenuation(gaussians, box).cpu().numpy()
+    found = cupping(volume, settings.bone_level, settings.metal_level, sampling)
     number = gaussians.shared_material[0]
     # Less and less, as of any estimate that is averaged over a noisy run (Robbins and Monro 1951).
     gain = settings.soft_gain * (1 - share)
-    change = -gain * found if found is not None else settings.soft_u - float(number)
+    change = gain * (settings.soft_u - float(number) if found is None else -found)
     least, most = max(scene.least_u, settings.soft_u - _REACH), settings.soft_u + _REACH
     moved = number.add(change).clamp(least, most)
     own = gaussians.own_material
@@ -69,7 +73,9 @@ def flatten(gaussians: Gaussians, scene: FitScene, settings: Settings, share: fl
     number.copy_(moved)
 
 
-def cupping(attenuation: np.ndarray, bone_level: float, metal_level: float) -> float | None:
+def cupping(
+    attenuation: np.ndarray, bone_level: float, metal_level: float, sampling: np.ndarray | None = None
+) -> float | None:
     """By what share homogeneous matter is brighter at its deepest than at its rim.
 
     Parameters
@@ -78,26 +84,32 @@ def cupping(attenuation: np.ndarray, bone_level: float, metal_level: float) -> f
         In soft references.
     bone_level, metal_level : float
         Levels above which matter is not soft, and above which it is metal, whose surroundings say nothing.
+    sampling : (3,) array, optional
+        Distances of the points along z, y and x, in units of the longest; 1 by default.
 
     Returns
     -------
     float or None
-        None where the object is not mostly one matter, or too small to tell.
+        None where the object is not mostly one matter, is too small to tell, or nowhere ends in air.
     """
     volume = attenuation[0] if attenuation.shape[0] == 1 else attenuation
+    apart = (np.ones(3) if sampling is None else sampling)[-volume.ndim :]
     body = volume[(volume > _LEAST) & (volume < metal_level)]
     level = float(np.median(body)) if len(body) >= _FEWEST else 0.0
     if not 0 < level <= bone_level:
         return None
     dense, away = volume > _DENSE * level, np.full(volume.shape, np.inf)
     if (volume >= metal_level).any():
-        away = ndimage.distance_transform_edt(volume < metal_level)
+        away = ndimage.distance_transform_edt(volume < metal_level, sampling=apart)
     if np.count_nonzero(dense & (away > _BESIDE)) > _OTHER * len(body):
         return None
-    depth = _depth(volume > _AIR * level)
+    matter = volume > _AIR * level
+    if matter.all():
+        return None
+    depth = _depth(matter, apart)
     inside = depth > _RIM
     if dense.any():
-        inside &= ndimage.distance_transform_edt(~dense) > _BESIDE
+        inside &= ndimage.distance_transform_edt(~dense, sampling=apart) > _BESIDE
     if np.count_nonzero(inside) < _FEWEST or depth[inside].max() <= 2 * _RIM:
         return None
     values, depth = volume[inside] / np.median(volume[inside]), depth[inside]
@@ -105,9 +117,9 @@ def cupping(attenuation: np.ndarray, bone_level: float, metal_level: float) -> f
     return _slope(values[close], depth[close] / depth.max()) if close.mean() >= _ONE else None
 
 
-def _depth(matter: np.ndarray) -> np.ndarray:
-    """Distance from air in points; beyond the border the object goes on."""
-    wide = ndimage.distance_transform_edt(np.pad(matter, 1, mode="edge"))
+def _depth(matter: np.ndarray, sampling: np.ndarray) -> np.ndarray:
+    """Distance from air; beyond the border the object goes on."""
+    wide = ndimage.distance_transform_edt(np.pad(matter, 1, mode="edge"), sampling=sampling)
     return wide[(slice(1, -1),) * matter.ndim]
 
 
@@ -123,7 +135,8 @@ def describe_soft(number: float, begun_at: float, gain: float) -> str:
     if not gain:
         return f"{number:.3f}, held as asked for"
     if abs(number - begun_at) < 1e-6:
-        return f"{number:.3f}, held: the object is not one homogeneous matter beside its metal"
+        why = "the object is not one homogeneous matter beside its metal, or the run was too short to tell"
+        return f"{number:.3f}, held: {why}"
     return f"{number:.3f}, by which the object's one matter is as dense inside as at its rim"
 
 

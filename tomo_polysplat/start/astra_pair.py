@@ -71,14 +71,18 @@ class AstraPair:
         return self._written(volume, "backprojection")
 
     def _projector(self, views: np.ndarray) -> int:
-        """ASTRA's projector of some views, made once."""
+        """ASTRA's projector of some views, made once; RuntimeError where it refuses them."""
         import astra
+        from astra.log import AstraError
 
         key = np.asarray(views, np.int64).tobytes()
         if key not in self._projectors:
             proj_geom, vol_geom = to_astra(self.geometry.select(views), self.grid)
             options = {"GPUIndex": self.index}
-            self._projectors[key] = astra.create_projector("cuda3d", proj_geom, vol_geom, options)
+            try:
+                self._projectors[key] = astra.create_projector("cuda3d", proj_geom, vol_geom, options)
+            except AstraError as problem:
+                raise RuntimeError(f"ASTRA refuses the geometry: {problem}") from problem
         return self._projectors[key]
 
     def _unwritten(self, shape: tuple[int, ...], like: torch.Tensor) -> torch.Tensor:
