@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 
 from tomo_polysplat.baselines.fdk import fdk
 from tomo_polysplat.baselines.metal_trace import MetalTrace, find_metal, forward_project, replace_trace
@@ -10,15 +11,11 @@ from tomo_polysplat.baselines.water_bhc import water_corrected
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.settings import Settings
+from tomo_polysplat.start.bridged import THIN, normalising_volume
 from tomo_polysplat.start.initial import fill_invalid
 from tomo_polysplat.start.levels import mass_level
 
 __all__ = ["nmar"]
-
-# Attenuation, in multiples of the main matter, between which a voxel of the prior is made all soft matter.
-_AIR, _BONE = 0.4, 1.5
-# Rays whose prior is below this share of the largest are not normalised: they would only amplify noise.
-_THIN = 0.02
 
 
 def nmar(
@@ -45,7 +42,7 @@ def nmar(
         grid,
         device=device,
     )
-    thick = prior > _THIN * prior.max(initial=0.0)
+    thick = prior > THIN * prior.max(initial=0.0)
     divisor = np.where(thick, prior, 1)
     normalised = fill_invalid(np.where(thick, corrected / divisor, 0).astype(np.float32), kept | ~thick)
     bridged = np.where(kept | ~thick, bridged, normalised * divisor)
@@ -53,10 +50,6 @@ def nmar(
 
 
 def _prior(volume: np.ndarray, metal: MetalTrace) -> np.ndarray:
-    """Air, soft matter and bone; metal stands for soft matter, so that the trace is bridged as if it were."""
     soft = mass_level(np.where(metal.mask, 0, volume))
-    bone = np.minimum(volume, Settings().metal_level * soft)
-    prior = np.where(volume > _BONE * soft, bone, soft)
-    prior[volume < _AIR * soft] = 0
-    prior[metal.mask] = soft
-    return prior.astype(np.float32)
+    most = Settings().metal_level * soft
+    return normalising_volume(torch.from_numpy(volume), torch.from_numpy(metal.mask), soft, most).numpy()

@@ -42,7 +42,7 @@ def sample_voxels(corners, size, closed, counts, parts, values, marks, mean, mar
     counts : (3,) int array
         Sample points along x, y and z.
     parts : (round_axes, centre, to_local, half_extent) arrays
-        Solids in order of precedence, the last first asked for.
+        Solids; where several hold a point, the last of them counts.
     values, marks : (parts + 1,) arrays
         By label: 0 is empty space, n part n - 1.
     mean, marked : (n,) arrays

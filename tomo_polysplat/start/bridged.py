@@ -19,14 +19,14 @@ from tomo_polysplat.start.levels import mass_level
 from tomo_polysplat.start.on_gpu import fill_rows
 from tomo_polysplat.start.voxel_projector import ProjectorPair, projector_pair
 
-__all__ = ["bridged_start"]
+__all__ = ["THIN", "bridged_start", "normalising_volume"]
 
 _log = logging.getLogger(__name__)
 
 # Attenuation, in multiples of the main matter, between which a voxel of the prior is made all soft matter.
 _AIR, _BONE = 0.4, 1.5
 # Rays whose prior is below this share of the largest are not normalised: they would only amplify noise.
-_THIN = 0.02
+THIN = 0.02
 # A trace that covers more of the object's rays than this leaves too few to bridge it with.
 _MOST_OF_RAYS = 0.5
 # Views of which the rays beside metal say which volume is the better one.
@@ -99,7 +99,7 @@ def _better(
     """The volume or the bridged one, whichever explains the rays beside metal, and words that say so."""
     # Half a voxel: less is the blur of the threshold's edge, and a wider trace loses more than it heals.
     trace = pair.forward(mask.float(), np.arange(geometry.views)) > 0.5 * float(grid.voxel_size.min())
-    matter = values > _THIN * float(values.nan_to_num(nan=-math.inf).max())
+    matter = values > THIN * float(values.nan_to_num(nan=-math.inf).max())
     covered = float((trace & matter).sum()) / max(float(matter.sum()), 1.0)
     if covered > _MOST_OF_RAYS:
         return volume, f"; metal not bridged: {covered:.0%} of the object's rays pass through it"
@@ -115,8 +115,21 @@ def _better(
     return volume, f"; metal not bridged, which {words}"
 
 
-def _prior(volume: torch.Tensor, mask: torch.Tensor, soft: float, metal: float) -> torch.Tensor:
-    """Air and soft matter made uniform, bone kept, and soft matter in place of metal."""
+def normalising_volume(volume: torch.Tensor, mask: torch.Tensor, soft: float, metal: float) -> torch.Tensor:
+    """What rays are divided by the projections of before they are bridged, the prior of Meyer et al. (2010).
+
+    Air and soft matter are made uniform and bone is kept; soft matter stands for metal, so that its trace is bridged
+    as if it were.
+
+    Parameters
+    ----------
+    volume : (nz, ny, nx) tensor
+        Made without the rays through metal.
+    mask : (nz, ny, nx) bool tensor
+        Voxels of metal.
+    soft, metal : float
+        Attenuation of the main matter, and what none exceeds.
+    """
     prior = torch.where(volume > _BONE * soft, volume.clamp(max=metal), soft)
     prior[volume < _AIR * soft] = 0
     prior[mask] = soft
@@ -134,8 +147,8 @@ def _made_without(
     """The volume of rays of which those through metal, NaN, are bridged."""
     first, _ = initial_volume_on(beside, geometry, grid)
     main = mass_level(first[~mask])
-    prior = pair.forward(_prior(first, mask, main, metal), np.arange(geometry.views))
-    thick = prior > _THIN * float(prior.max())
+    prior = pair.forward(normalising_volume(first, mask, main, metal), np.arange(geometry.views))
+    thick = prior > THIN * float(prior.max())
     ratio = torch.where(thick, beside / prior.clamp(min=1e-12), 0.0)
     bridged = torch.where(thick, fill_rows(ratio) * prior, fill_rows(beside))
     second, _ = initial_volume_on(bridged, geometry, grid)
