@@ -192,6 +192,7 @@ def _fitted(
 ) -> FitOutcome:
     """The fit; ``started`` is when the reconstruction began."""
     plan, scene, budget = begun.plan, begun.scene, wishes.time_budget
+    deadline = None if budget is None else started + budget - scene.seconds_of_basis(begun.gaussians)
     return fit(
         begun.gaussians,
         plan.spacing * problem.voxel,
@@ -201,7 +202,7 @@ def _fitted(
         views_per_step=plan.views_per_step,
         rng=np.random.default_rng(wishes.seed),
         started=started,
-        deadline=None if budget is None else started + budget,
+        deadline=deadline,
         volume=_volume_of(scene, plan, problem, flipped),
         callbacks=[lambda state: report(state.share, state.describe()), *wishes.callbacks],
         checkpoint=saved,
@@ -232,7 +233,7 @@ def _result(outcome: FitOutcome, begun: Begun, problem: Problem, grid: VolumeGri
         number, tunables = float(gaussians.shared_material[0]), about["settings"]
         plan.reasons["soft_material"] = describe_soft(number, tunables["soft_u"], tunables["soft_gain"])
     with torch.no_grad():
-        own = scene.basis(gaussians).cpu().numpy() * np.float32(plan.reference)
+        own = (scene.basis(gaussians) * plan.reference).cpu().numpy()
         heights = gaussians.weights(scene.reference_curve).sum(dim=0)
         parts = {
             "position": gaussians.position.cpu().numpy() * length + problem.centre,

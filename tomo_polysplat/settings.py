@@ -91,9 +91,9 @@ class Settings:
     tv_clip: float = 5.0
     """Attenuation above this many soft references does not count as variation, which would erode metal; what is lighter
     than metal, castings of aluminium too, is smoothed."""
-    tv_corner: float = 0.1
+    tv_corner: float = 0.0
     """Difference of neighbouring voxels, in soft references, up to which it counts in full; larger ones count by
-    their logarithm, so that edges and texture stay. 0: all in full."""
+    their logarithm, so that edges and texture stay. 0 leaves it to the plan; with 1000 all count in full."""
     tv_box: int = 0
     """Edge in voxels of the random box whose total variation is taken; 0 leaves it to the plan."""
     relocated: float = 0.03

@@ -17,6 +17,7 @@ from tomo_polysplat.baselines.voxel_model import VoxelModel, start_voxels
 from tomo_polysplat.fit.loss import misfit, total_variation
 from tomo_polysplat.fit.noise import photons_per_ray
 from tomo_polysplat.fit.optimise import FitState
+from tomo_polysplat.fit.plan import BODY, corner_for
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.quadrature import fit_quadrature
@@ -26,6 +27,7 @@ from tomo_polysplat.physics.water import transmitted_energy, water_equivalent
 from tomo_polysplat.render.renderer import detector_views
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.settings import Settings, make_settings
+from tomo_polysplat.start.agreement import halves_agree
 from tomo_polysplat.start.initial import initial_volume
 from tomo_polysplat.start.voxel_projector import ProjectorPair, project_voxels, projector_pair
 from tomo_polysplat.units import cm_per
@@ -90,7 +92,7 @@ def voxel_poly(
     )
     model = start_voxels(start, grid, chosen, target)
     with projector_pair(geometry, grid, target) as pair:
-        fit = _Fit(projections, geometry, spectrum, materials or Materials(), unit, model, pair, chosen)
+        fit = _Fit(projections, geometry, grid, spectrum, materials or Materials(), unit, model, pair, chosen)
         deadline = None if time_budget is None else started + time_budget
         best = fit.run(np.random.default_rng(seed), started, deadline, callbacks)
         return fit.volume(best)
@@ -103,6 +105,7 @@ class _Fit:
         self,
         projections: np.ndarray,
         geometry: Geometry,
+        grid: VolumeGrid,
         spectrum: Spectrum,
         materials: Materials,
         unit: str,
@@ -126,6 +129,10 @@ class _Fit:
             photons_per_ray(values),
             settings.model_error,
             settings.held_out,
+        )
+        body = model.relative * model.size > BODY
+        self.corner = settings.tv_corner or corner_for(
+            halves_agree(self.rays.projections, geometry, grid, body)
         )
         self.parameters = [model.relative.requires_grad_(), model.own.requires_grad_()]
         rates = (RATE_ATTENUATION, RATE_MATERIAL)
@@ -177,7 +184,7 @@ class _Fit:
         areal = project_voxels(weights, self.pair, views) * self.cm
         predicted = polychromatic_projection(areal, self.quadrature)
         fitted = misfit(predicted, measured, weight, self.settings)
-        rough = total_variation(self._output(weights), self.settings.tv_clip, self.settings.tv_corner)
+        rough = total_variation(self._output(weights), self.settings.tv_clip, self.corner)
         self.optimiser.zero_grad(set_to_none=True)
         (fitted + self.settings.tv_weight * rough).backward()
         self.optimiser.step()

@@ -84,7 +84,7 @@ GROUPS: dict[str, tuple[Variant, ...]] = {
         Variant("one energy, no TV", {"tv_weight": 0.0}, one_energy=True),
         Variant("one energy", one_energy=True),
         Variant("no TV", {"tv_weight": 0.0}),
-        Variant("every difference in full", {"tv_corner": 0.0}),
+        Variant("every difference in full", {"tv_corner": 1000.0}),
     ),
     "nodes": (
         *(Variant(f"{n} uniform samples", samples=n) for n in (7, 15, 31, 63)),

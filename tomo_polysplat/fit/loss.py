@@ -56,7 +56,7 @@ def roughness(gaussians: Gaussians, scene: FitScene, settings: Settings, box: Vo
         reach = VOXEL_CUTOFF * gaussians.log_scale.amax(dim=1, keepdim=True).exp()
         near = ((gaussians.position + reach >= lower) & (gaussians.position - reach <= upper)).all(dim=1)
     volume = scene.attenuation(gaussians.select(near.nonzero()[:, 0]), box)
-    return total_variation(volume, settings.tv_clip, settings.tv_corner)
+    return total_variation(volume, settings.tv_clip, scene.tv_corner)
 
 
 def total_variation(volume: torch.Tensor, ceiling: float, corner: float = 0.0) -> torch.Tensor:

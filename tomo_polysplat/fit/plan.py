@@ -22,7 +22,7 @@ from tomo_polysplat.start.levels import MAIN_SHARE, main_level, mass_level
 if TYPE_CHECKING:
     from tomo_polysplat.fit.problem import Problem
 
-__all__ = ["Plan", "make_plan", "soft_reference"]
+__all__ = ["BODY", "Plan", "corner_for", "make_plan", "soft_reference"]
 
 logger = logging.getLogger(__name__)
 
@@ -36,6 +36,10 @@ _STEPS, _MOST_VIEWS, _MOST_VIEWS_PLANAR = 300, {"cpu": 8, "cuda": 4}, 8
 # Voxels along an edge of the box that is smoothed. What a box seldom meets is smoothed by leaps, which upset the
 # optimiser's sense of scale (teeth, 128^3 voxels: 39.1, 39.7 and 40.2 dB with 32, 64 and 128).
 _TV_BOX, _TV_BOX_PLANAR = {"cpu": 48, "cuda": 128}, 256
+# What counts as the object where its smoothness is judged, in soft references. Differences of neighbouring voxels count
+# in full up to this many soft references where two halves of the views agree on their signs no more than by chance, and
+# up to that many where they agree on this share of them or more.
+BODY, _SMOOTH, _TEXTURED, _AGREEMENT = 0.3, 0.1, 0.02, 0.35
 # Gaussians that a laptop and a GPU fit in a time people wait for.
 _MOST_GAUSSIANS = {"cpu": 60_000, "cuda": 400_000}
 # Objects of solid metal are so many times as dense as water at most (rods of silver: 180, of gold: 280): only beyond
@@ -58,6 +62,8 @@ class Plan:
     views_per_step : int
     tv_box : int
         Edge in voxels of the random box whose total variation a step takes.
+    tv_corner : float
+        Difference of neighbouring voxels, in soft references, up to which it counts in full.
     curves : int
         Material curves of the model: three, or the first alone, as for a monochromatic one.
     blurred : bool
@@ -71,6 +77,7 @@ class Plan:
     finer: float
     views_per_step: int
     tv_box: int
+    tv_corner: float
     curves: int
     blurred: bool
     reasons: dict[str, Any] = field(default_factory=dict)
@@ -98,7 +105,8 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     soft = reference * problem.depth
     curves, needed = _curves(start, soft, problem.polychromatic, settings)
     blurred, told = _blurred(start, soft, settings)
-    plan = Plan(reference, spacing, finer, views, box, curves, blurred)
+    corner, texture = _tv_corner(start, soft, problem, settings)
+    plan = Plan(reference, spacing, finer, views, box, corner, curves, blurred)
     unit = "g/cm3" if problem.polychromatic else "per unit of length"
     plan.reasons = {
         "model": "polychromatic: a spectrum was given"
@@ -114,6 +122,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
         "seed_spacing_voxels": f"{spacing:.2f}: {because}",
         "views_per_step": f"{views} of {problem.geometry.views}: {reason}",
         "smoothed_box": _smoothed(box, start, settings),
+        "texture": texture,
         "detector_blur": told,
         "passes": f"{settings.passes:g} over the views at most, fewer where {settings.held_out:.1%} of the rays, held"
         f" out of the fit, have not improved for {settings.patience}",
@@ -163,6 +172,28 @@ def _curves(
     return 1, (
         f"the densest voxel of the start has {largest:.2g} soft references, so that no material number would be free"
     )
+
+
+def _tv_corner(
+    start: np.ndarray | torch.Tensor, soft: float, problem: Problem, settings: Settings
+) -> tuple[float, str]:
+    """Where differences begin to count by their logarithm: sooner the more of them are the object's own."""
+    if settings.tv_corner or not settings.tv_weight:
+        return settings.tv_corner, "asked for"
+    found = problem.agreement(start > BODY * soft)
+    corner = corner_for(found)
+    why = "no two halves of the views are at hand that would tell texture from noise"
+    if found is not None:
+        why = (
+            f"two halves of the views agree on the sign of {found:.0%} more differences than they contradict"
+        )
+    return corner, f"differences up to {corner:.2g} soft references are smoothed: {why}"
+
+
+def corner_for(agreement: float | None) -> float:
+    """Difference of neighbouring voxels that counts in full, for what `start.agreement.halves_agree` found."""
+    share = min(max((agreement or 0.0) / _AGREEMENT, 0.0), 1.0)
+    return _SMOOTH * (_TEXTURED / _SMOOTH) ** share
 
 
 def _blurred(start: np.ndarray | torch.Tensor, soft: float, settings: Settings) -> tuple[bool, str]:

@@ -37,6 +37,7 @@ from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.scan.snapped import snapped_geometry, snapped_grid
 from tomo_polysplat.scan.view_order import view_order
 from tomo_polysplat.settings import Settings
+from tomo_polysplat.start.agreement import halves_agree
 from tomo_polysplat.start.bridged import bridged_start
 from tomo_polysplat.start.initial import initial_volume_on
 from tomo_polysplat.units import LENGTH_UNITS, cm_per
@@ -57,6 +58,7 @@ class _Known:
 
     copies: dict[torch.device, torch.Tensor] = field(default_factory=dict)
     closed: tuple[bool, str] | None = None
+    agreement: tuple[float | None] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,6 +171,14 @@ class Problem:
             copies[device] = torch.from_numpy(self.projections).to(device if stay else "cpu")
         return copies[device]
 
+    def agreement(self, body: np.ndarray | torch.Tensor) -> float | None:
+        """How much of what varies in a body of voxels is the object's; see ``start.agreement``."""
+        if self._known.agreement is None:
+            voxels = torch.as_tensor(body)
+            found = halves_agree(self.measured(voxels.device), self.geometry, self.grid, voxels)
+            self._known.agreement = (found,)
+        return self._known.agreement[0]
+
     def _closed(self, device: torch.device) -> tuple[bool, str]:
         """Whether no matter lies beside the volume, and words that say so."""
         if self._known.closed is None:
@@ -196,6 +206,7 @@ class Problem:
             settings.metal_tail,
             plan.blurred,
             plan.tv_box,
+            plan.tv_corner,
             closed,
         )
 

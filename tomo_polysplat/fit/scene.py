@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -17,6 +18,9 @@ from tomo_polysplat.render.metal_edges import tail_factors
 from tomo_polysplat.render.renderer import project_gaussians, voxelise_gaussians, voxelise_means
 
 __all__ = ["FitScene"]
+
+# One of so many slices is made to tell how long all of them take.
+_SLICES_TIMED = 8
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,8 @@ class FitScene:
         Whether rays are seen through the detector's blur; see ``physics.detector_blur``.
     tv_box : int
         Edge in voxels of the random box whose total variation a step takes.
+    tv_corner : float
+        Difference of neighbouring voxels, in soft references, up to which it counts in full.
     closed : bool
         Whether all matter lies within the voxels, so that no Gaussian may leave them; see ``fit.inside``.
     """
@@ -59,6 +65,7 @@ class FitScene:
     metal_tail: float
     blurring: bool
     tv_box: int
+    tv_corner: float
     closed: bool = False
 
     def projections(self, gaussians: Gaussians, views: DetectorViews) -> tuple[torch.Tensor, int]:
@@ -89,6 +96,20 @@ class FitScene:
     def basis(self, gaussians: Gaussians) -> torch.Tensor:
         """(channels, nz, ny, nx) densities of the curves in soft references, means over the voxels."""
         return self._means(gaussians, gaussians.weights(self.reference_curve))
+
+    @torch.no_grad()
+    def seconds_of_basis(self, gaussians: Gaussians) -> float:
+        """About how long `basis` takes from the device to the host, from some slices in the middle.
+
+        They are made twice, as the first time may compile kernels.
+        """
+        nz, ny, nx = self.box.shape
+        depth = -(-nz // _SLICES_TIMED)
+        some = replace(self, box=self.box.part(((nz - depth) // 2, 0, 0), (depth, ny, nx)))
+        for _ in range(2):
+            begun = time.perf_counter()
+            some.basis(gaussians).cpu()
+        return (time.perf_counter() - begun) * nz / depth
 
     def _means(self, gaussians: Gaussians, weights: torch.Tensor) -> torch.Tensor:
         """Means over the voxels, with the tails of metal put back inside it."""

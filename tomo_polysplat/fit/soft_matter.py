@@ -36,6 +36,9 @@ _OTHER = 0.005
 _ONE, _CLOSE, _FEWEST, _LAYERS = 0.8, 0.1, 200, 6
 # Farthest from its start that the number goes: plastics and oil lie this far below water.
 _REACH = 0.1
+# Digits to which a change is rounded: the sums behind it repeat only to rounding on a GPU, and a fit that starts to
+# differ ends a percent apart.
+_DIGITS = 4
 # Own numbers below this belong to soft matter.
 _SOFT = 0.2
 
@@ -65,7 +68,7 @@ def flatten(gaussians: Gaussians, scene: FitScene, settings: Settings, share: fl
     number = gaussians.shared_material[0]
     # Less and less, as of any estimate that is averaged over a noisy run (Robbins and Monro 1951).
     gain = settings.soft_gain * (1 - share)
-    change = gain * (settings.soft_u - float(number) if found is None else -found)
+    change = round(gain * (settings.soft_u - float(number) if found is None else -found), _DIGITS)
     least, most = max(scene.least_u, settings.soft_u - _REACH), settings.soft_u + _REACH
     moved = number.add(change).clamp(least, most)
     own = gaussians.own_material

@@ -17,6 +17,7 @@ from tomo_polysplat.checks import fail
 __all__ = [
     "GROUP",
     "HALF_LOG2E",
+    "SIZES",
     "cross",
     "dot",
     "grain",
@@ -31,6 +32,9 @@ __all__ = [
 GROUP = 32
 # exp(-q / 2) = 2^-(HALF_LOG2E q): the kernels carry q scaled so, as the hardware's exponential has base 2.
 HALF_LOG2E = 0.7213475204444817
+# Arguments of kernels for whose values none is compiled anew. Triton would for 1 and for what sixteen divides, a third
+# of a second each, and the Gaussians of every call are another number.
+SIZES = ("count", "rows", "columns", "area", "beyond", "nz", "ny", "nx", "stride", "many", "parts")
 
 
 def on_device(tensor: torch.Tensor):

@@ -12,7 +12,7 @@ import triton.language as tl  # noqa: TID253
 from tomo_polysplat.kernels.project.triton_image import spread
 from tomo_polysplat.kernels.project.triton_setup import RECORD
 from tomo_polysplat.kernels.triton_lanes import SUMS, half_sums, load_four
-from tomo_polysplat.kernels.triton_maths import HALF_LOG2E, on_device
+from tomo_polysplat.kernels.triton_maths import HALF_LOG2E, SIZES, on_device
 from tomo_polysplat.kernels.views import DetectorViews
 
 __all__ = ["BLOCK", "beyond", "sum_moments"]
@@ -39,7 +39,7 @@ def _row_ends(i, first, high, yc, by_ry, xc, m, hx, columns, BLOCK_H: tl.constex
     return start, tl.max(tl.where(first <= high, wide, 0.0).to(tl.int32), 0) + 1
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def _moments_kernel(
     record, grad, moments, count, rows, columns, cut,
     CHANNELS: tl.constexpr, CONE: tl.constexpr, BLOCK_H: tl.constexpr, BLOCK_W: tl.constexpr,

@@ -16,7 +16,7 @@ import triton.language as tl  # noqa: TID253
 from tomo_polysplat.kernels.project.triton_image import spread
 from tomo_polysplat.kernels.project.triton_setup import RECORD
 from tomo_polysplat.kernels.triton_lanes import add_four, adds_four, lane_set, load_four, lowest_lane
-from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, grain, grained, on_device
+from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, SIZES, grain, grained, on_device
 from tomo_polysplat.kernels.views import DetectorViews
 
 __all__ = ["TILE", "splat"]
@@ -95,14 +95,14 @@ def _sum_tile(
     return sum0, sum1, sum2, sum3
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def _splat_kernel(
-    record, image, largest, count, rows, columns, cut,
+    record, image, largest, count, rows, columns, parts, cut,
     CHANNELS: tl.constexpr, CONE: tl.constexpr, TILE_H: tl.constexpr, TILE_W: tl.constexpr,
-    PARTS: tl.constexpr, GROUP: tl.constexpr, AT_ONCE: tl.constexpr, GRAINED: tl.constexpr,
+    GROUP: tl.constexpr, AT_ONCE: tl.constexpr, GRAINED: tl.constexpr,
 ):  # fmt: skip
     shift = grain(largest, GRAINED)
-    group, part = tl.program_id(0) // PARTS, tl.program_id(0) % PARTS
+    group, part = tl.program_id(0) // parts, tl.program_id(0) % parts
     view = tl.program_id(1).to(tl.int64)
     record += view * count * RECORD
     yc, ry, xc, m, hx = _outlines(record, group, count, GROUP)
@@ -120,7 +120,7 @@ def _splat_kernel(
         left0, top0 = x_low.to(tl.int32) // 2 * 2, y_low.to(tl.int32)
         across = (x_high.to(tl.int32) - left0) // TILE_W + 1
         tiles = ((y_high.to(tl.int32) - top0) // TILE_H + 1) * across
-        for tile in range(part, tiles, PARTS):
+        for tile in range(part, tiles, parts):
             down = tile // across
             left, top = left0 + (tile - down * across) * TILE_W, top0 + down * TILE_H
             x0, y0 = left.to(tl.float32), top.to(tl.float32)
@@ -161,8 +161,8 @@ def splat(
     with on_device(record):
         _splat_kernel[(groups * parts, many)](
             record, image, record if largest is None else largest, count, views.rows, views.columns,
-            cutoff * cutoff * HALF_LOG2E,
-            CHANNELS=channels, CONE=views.cone, TILE_H=tile[0], TILE_W=tile[1], PARTS=parts, GROUP=GROUP,
+            parts, cutoff * cutoff * HALF_LOG2E,
+            CHANNELS=channels, CONE=views.cone, TILE_H=tile[0], TILE_W=tile[1], GROUP=GROUP,
             AT_ONCE=adds_four(record.device), GRAINED=largest is not None, num_warps=1, num_stages=1,
         )  # fmt: skip
     return image

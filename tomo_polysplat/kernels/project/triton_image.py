@@ -15,7 +15,7 @@ import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.kernels.project.triton_setup import VIEW
 from tomo_polysplat.kernels.triton_lanes import load_four, store_four
-from tomo_polysplat.kernels.triton_maths import on_device
+from tomo_polysplat.kernels.triton_maths import SIZES, on_device
 from tomo_polysplat.kernels.views import DetectorViews
 
 __all__ = ["finish_image", "lay_out_gradient", "pixel_factor", "spread"]
@@ -43,7 +43,7 @@ def pixel_factor(views, view, pixel, columns, CONE: tl.constexpr):
     return _ROOT_TWO_PI * tl.sqrt((d0 * d0 + d1 * d1 + d2 * d2).to(tl.float32))
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def _finish_kernel(
     raw, image, views, area, columns, CHANNELS: tl.constexpr, CONE: tl.constexpr, BLOCK: tl.constexpr
 ):
@@ -79,7 +79,7 @@ def finish_image(raw: torch.Tensor, table: torch.Tensor, channels: int, views: D
     return image
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def _lay_out_kernel(
     grad,
     pixels,

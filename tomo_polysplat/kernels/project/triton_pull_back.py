@@ -12,7 +12,7 @@ import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.kernels.project.triton_setup import RECORD, ROOT, VIEW, chain, whitening
 from tomo_polysplat.kernels.triton_lanes import SUMS, load_four
-from tomo_polysplat.kernels.triton_maths import cross, dot, on_device, whitening_adjoint
+from tomo_polysplat.kernels.triton_maths import SIZES, cross, dot, on_device, whitening_adjoint
 from tomo_polysplat.kernels.views import DetectorViews
 
 __all__ = ["pull_back"]
@@ -37,7 +37,7 @@ def _mix(a, x0, x1, x2, b, y0, y1, y2):
     return a * x0 + b * y0, a * x1 + b * y1, a * x2 + b * y2
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def _pull_back_kernel(
     position, scale, rotation, views, record, moments,
     grad_position, grad_scale, grad_rotation, grad_weight, count, many,

@@ -20,7 +20,7 @@ import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.kernels.triton_lanes import store_four
-from tomo_polysplat.kernels.triton_maths import HALF_LOG2E, cross, dot, on_device, rotation_matrix
+from tomo_polysplat.kernels.triton_maths import HALF_LOG2E, SIZES, cross, dot, on_device, rotation_matrix
 from tomo_polysplat.kernels.views import DetectorViews
 
 __all__ = ["RECORD", "ROOT", "VIEW", "chain", "footprints", "whitening"]
@@ -129,7 +129,7 @@ def _weight(weight, n, count, live, k, inverse, CHANNELS: tl.constexpr):
     return tl.zeros_like(inverse).to(tl.float32)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def _footprint_kernel(
     position, scale, rotation, weight, views, record, skipped, count, rows, columns, cutoff,
     CHANNELS: tl.constexpr, CONE: tl.constexpr, PLANAR: tl.constexpr, BLOCK: tl.constexpr,

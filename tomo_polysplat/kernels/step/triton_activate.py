@@ -9,7 +9,7 @@ import torch
 import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
-from tomo_polysplat.kernels.triton_maths import dot, on_device
+from tomo_polysplat.kernels.triton_maths import SIZES, dot, on_device
 
 __all__ = ["activate", "material", "mixture"]
 
@@ -31,7 +31,7 @@ def mixture(u, curves):
     return m0, m1, m2, dot(tl.load(curves), tl.load(curves + 1), tl.load(curves + 2), m0, m1, m2)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def _activate_kernel(
     log_scale, attenuation, own, shared, group, curves, scale, weight, output, count,
     DIMS: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,

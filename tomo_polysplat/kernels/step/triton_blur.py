@@ -22,7 +22,7 @@ from tomo_polysplat.kernels.step.triton_misfit import (
     store_gradients,
 )
 from tomo_polysplat.kernels.step.triton_update import WHOLE_OF_BLUR
-from tomo_polysplat.kernels.triton_maths import on_device
+from tomo_polysplat.kernels.triton_maths import SIZES, on_device
 
 __all__ = ["blurred_misfit_gradient"]
 
@@ -42,7 +42,7 @@ def _taps(index, count, STEP: tl.constexpr, variance):
     return tl.where(there, beside, 0.0), tl.where(there, slope, 0.0), there
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def _sharp_kernel(
     raw, sharp, table, log_weights, attenuation, largest, area, columns, nodes, areal_scale,
     CURVES: tl.constexpr, CONE: tl.constexpr, BLOCK: tl.constexpr,
@@ -56,7 +56,7 @@ def _sharp_kernel(
     tl.store(sharp + at, predicted, mask=pixel < area)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def _blurred_kernel(
     sharp, slopes, blur, grad_blur, chosen, projections, totals, sums,
     area, rows, columns, noise, held_out, corner,
@@ -86,7 +86,7 @@ def _blurred_kernel(
     tl.store(slopes + k * area + pixel, slope, mask=inside)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def _gather_kernel(
     raw, pixels, table, slopes, blur, log_weights, attenuation,
     area, rows, columns, beyond, nodes, areal_scale,

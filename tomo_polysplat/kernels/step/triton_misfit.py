@@ -15,7 +15,7 @@ import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.kernels.project.triton_image import pixel_factor, spread
 from tomo_polysplat.kernels.triton_lanes import load_four, store_four
-from tomo_polysplat.kernels.triton_maths import on_device
+from tomo_polysplat.kernels.triton_maths import SIZES, on_device
 from tomo_polysplat.kernels.views import DetectorViews
 
 __all__ = [
@@ -229,7 +229,7 @@ def store_gradients(pixels, to, slope, d0, d1, d2, live, CURVES: tl.constexpr):
         store_four(pixels + 4 * to, slope * d0, slope * d1, slope * d2, tl.zeros_like(slope), live)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def _misfit_kernel(
     raw, pixels, table, chosen, projections, totals, log_weights, attenuation, sums, largest,
     area, columns, beyond, nodes, noise, held_out, corner, areal_scale,

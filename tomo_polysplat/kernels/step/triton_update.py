@@ -14,7 +14,7 @@ import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.kernels.step.triton_activate import material, mixture
-from tomo_polysplat.kernels.triton_maths import dot, on_device
+from tomo_polysplat.kernels.triton_maths import SIZES, dot, on_device
 
 __all__ = ["FIRST_DECAY", "SECOND_DECAY", "WHOLE", "WHOLE_OF_BLUR", "Bounds", "update"]
 
@@ -85,7 +85,7 @@ def _add_to_groups(grad_shared, member, value):
         tl.atomic_add(grad_shared + member, value, mask=(member > 0) & ~together, sem="relaxed")
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def _update_kernel(
     position, log_scale, rotation, attenuation, own, shared, group,
     position_1, log_scale_1, rotation_1, attenuation_1, own_1,
@@ -137,7 +137,7 @@ def _update_kernel(
     tl.store(attenuation + n, _kept(p, 0.0, float("inf")), mask=live)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def _common_kernel(
     parameter, first, second, gradient, rate, control, count, held, low, high, epsilon,
     UNITS: tl.constexpr, FREED: tl.constexpr, BLOCK: tl.constexpr,

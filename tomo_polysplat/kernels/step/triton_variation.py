@@ -6,7 +6,7 @@ import torch
 import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
-from tomo_polysplat.kernels.triton_maths import on_device
+from tomo_polysplat.kernels.triton_maths import SIZES, on_device
 
 __all__ = ["variation_gradient"]
 
@@ -30,7 +30,7 @@ def _along(volume, at, value, index, length, stride, live, ceiling, by_corner):
     return slope
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def _variation_kernel(volume, grad, largest, nz, ny, nx, ceiling, by_corner, factor, BLOCK: tl.constexpr):
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     size = nz * ny * nx

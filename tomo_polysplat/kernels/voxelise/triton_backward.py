@@ -11,7 +11,7 @@ import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.kernels.triton_lanes import SUMS, half_sums, load_four
-from tomo_polysplat.kernels.triton_maths import HALF_LOG2E, dot, on_device, whitening_adjoint
+from tomo_polysplat.kernels.triton_maths import HALF_LOG2E, SIZES, dot, on_device, whitening_adjoint
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.kernels.voxelise.triton_setup import RECORD, ROOT, scaled_whitening, triangle
 
@@ -30,7 +30,7 @@ def _indices(centre, half, length):
     return low, tl.maximum(high - low + 1, 0)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def _moments_kernel(
     record, grad, moments, count, nz, ny, nx, stride, cut,
     CHANNELS: tl.constexpr, BLOCK_H: tl.constexpr, BLOCK_W: tl.constexpr, RUN: tl.constexpr,
@@ -137,7 +137,7 @@ def _store_zeros(to, n, live, NUMBERS: tl.constexpr):
         tl.store(to + n * NUMBERS + k, tl.zeros(n.shape, tl.float32), mask=live)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def _pull_back_kernel(
     scale, rotation, table, moments, grad_position, grad_scale, grad_rotation, grad_weight, count,
     CHANNELS: tl.constexpr, BLOCK: tl.constexpr,

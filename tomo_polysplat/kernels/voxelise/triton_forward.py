@@ -11,7 +11,7 @@ import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.kernels.triton_lanes import lane_set, load_four, lowest_lane
-from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, dot, grain, grained, on_device
+from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, SIZES, dot, grain, grained, on_device
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.kernels.voxelise.triton_setup import RECORD
 
@@ -73,14 +73,14 @@ def _sum_brick(record, found, x, y, z, cut, CHANNELS: tl.constexpr):
     return sum0, sum1, sum2, sum3
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def _splat_kernel(
-    record, volume, largest, count, nz, ny, nx, stride, cut,
+    record, volume, largest, count, nz, ny, nx, stride, parts, cut,
     CHANNELS: tl.constexpr, D: tl.constexpr, H: tl.constexpr, W: tl.constexpr,
-    PARTS: tl.constexpr, GROUP: tl.constexpr, GRAINED: tl.constexpr,
+    GROUP: tl.constexpr, GRAINED: tl.constexpr,
 ):  # fmt: skip
     shift = grain(largest, GRAINED)
-    group, part, lane = tl.program_id(0) // PARTS, tl.program_id(0) % PARTS, tl.arange(0, GROUP)
+    group, part, lane = tl.program_id(0) // parts, tl.program_id(0) % parts, tl.arange(0, GROUP)
     n = group * GROUP + lane
     at = record + tl.minimum(n, count - 1).to(tl.int64) * RECORD
     cx, cy, cz, r11 = load_four(at)
@@ -95,7 +95,7 @@ def _splat_kernel(
         x0 = x0 // 8 * 8  # eight voxels fill a sector of memory
         across, down = (x1 - x0) // W + 1, (y1 - y0) // H + 1
         line = tl.arange(0, D * H)[None, :]
-        for brick in range(part, across * down * ((z1 - z0) // D + 1), PARTS):
+        for brick in range(part, across * down * ((z1 - z0) // D + 1), parts):
             slab = brick // across
             left, top, front = x0 + brick % across * W, y0 + slab % down * H, z0 + slab // down * D
             x, y, z = left + (W - 1) / 2 - cx, top + (H - 1) / 2 - cy, front + (D - 1) / 2 - cz
@@ -135,7 +135,7 @@ def splat(
     with on_device(record):
         _splat_kernel[(groups * parts,)](
             record, volume, record if largest is None else largest, count, *box.shape, volume.stride(0),
-            cutoff * cutoff * HALF_LOG2E, CHANNELS=channels, D=BRICK[0], H=BRICK[1], W=BRICK[2], PARTS=parts,
+            parts, cutoff * cutoff * HALF_LOG2E, CHANNELS=channels, D=BRICK[0], H=BRICK[1], W=BRICK[2],
             GROUP=GROUP, GRAINED=largest is not None, num_warps=1, num_stages=1,
         )  # fmt: skip
     return volume

@@ -17,7 +17,7 @@ import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.kernels.triton_lanes import store_four
-from tomo_polysplat.kernels.triton_maths import HALF_LOG2E, dot, on_device, rotation_matrix
+from tomo_polysplat.kernels.triton_maths import HALF_LOG2E, SIZES, dot, on_device, rotation_matrix
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 
 __all__ = ["RECORD", "ROOT", "box_table", "ellipsoids", "scaled_whitening", "triangle"]
@@ -98,7 +98,7 @@ def _weight(weight, n, count, live, k, CHANNELS: tl.constexpr):
     return tl.zeros(n.shape, tl.float32)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def _ellipsoid_kernel(
     position, scale, rotation, weight, table, record, count, cutoff,
     CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
