@@ -95,11 +95,11 @@ def test_total_variation_of_one_slice_leaves_the_missing_axis_out():
 
 def test_with_a_corner_noise_counts_in_full_and_an_edge_by_its_logarithm():
     noise = 1e-6 * torch.rand((5, 7, 4), generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    full, with_corner = (float(total_variation(noise, 10.0, corner)) for corner in (0.0, 0.1))
+    full, with_corner = (float(total_variation(noise, 10.0, (corner, corner))) for corner in (0.0, 0.1))
     assert with_corner == pytest.approx(full, rel=1e-5)
     edge = torch.zeros((1, 1, 4), dtype=torch.float64)
     edge[..., 2:] = 0.7
-    assert float(total_variation(edge, 10.0, 0.1)) == pytest.approx(0.1 * math.log(8.0) / 3)
+    assert float(total_variation(edge, 10.0, (0.1, 0.1))) == pytest.approx(0.1 * math.log(8.0) / 3)
 
 
 def test_the_pull_on_an_edge_falls_with_its_height():
@@ -108,7 +108,7 @@ def test_the_pull_on_an_edge_falls_with_its_height():
     pulls = []
     for height in heights:
         pair = torch.stack([torch.zeros_like(height), height])[None, None].requires_grad_()
-        total_variation(pair, 10.0, 0.1).backward()
+        total_variation(pair, 10.0, (0.1, 0.1)).backward()
         pulls.append(pair.grad[0, 0].tolist())
     expected = torch.tensor([1.0, 0.5, 0.1], dtype=torch.float64)
     assert torch.tensor(pulls, dtype=torch.float64).numpy() == pytest.approx(

@@ -39,7 +39,7 @@ def a_step_of_one_curve_under_a_spectrum(device):
 
 @case
 def a_step_in_two_dimensions(device):
-    compare_steps(_fused, device, ("cpu", "numba"), "fan", material_from=2.0, corner=0.0)
+    compare_steps(_fused, device, ("cpu", "numba"), "fan", material_from=2.0, corners=(0.0, 0.0))
 
 
 @case

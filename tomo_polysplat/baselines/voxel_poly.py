@@ -17,7 +17,7 @@ from tomo_polysplat.baselines.voxel_model import VoxelModel, start_voxels
 from tomo_polysplat.fit.loss import misfit, total_variation
 from tomo_polysplat.fit.noise import photons_per_ray
 from tomo_polysplat.fit.optimise import FitState
-from tomo_polysplat.fit.plan import BODY, corner_for
+from tomo_polysplat.fit.plan import bodies, corners_for
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.quadrature import fit_quadrature
@@ -130,10 +130,10 @@ class _Fit:
             settings.model_error,
             settings.held_out,
         )
-        body = model.relative * model.size > BODY
-        self.corner = settings.tv_corner or corner_for(
-            halves_agree(self.rays.projections, geometry, grid, body)
-        )
+        self.corners = (settings.tv_corner,) * 2
+        if not settings.tv_corner:
+            matter = bodies(model.relative * model.size, settings)
+            self.corners = corners_for(halves_agree(self.rays.projections, geometry, grid, matter))
         self.parameters = [model.relative.requires_grad_(), model.own.requires_grad_()]
         rates = (RATE_ATTENUATION, RATE_MATERIAL)
         groups = [{"params": [p], "lr": r, "rate": r} for p, r in zip(self.parameters, rates)]
@@ -184,7 +184,9 @@ class _Fit:
         areal = project_voxels(weights, self.pair, views) * self.cm
         predicted = polychromatic_projection(areal, self.quadrature)
         fitted = misfit(predicted, measured, weight, self.settings)
-        rough = total_variation(self._output(weights), self.settings.tv_clip, self.corner)
+        rough = total_variation(
+            self._output(weights), self.settings.tv_clip, self.corners, self.settings.bone_level
+        )
         self.optimiser.zero_grad(set_to_none=True)
         (fitted + self.settings.tv_weight * rough).backward()
         self.optimiser.step()

@@ -211,9 +211,11 @@ def _plan(parts: dict[str, Any]) -> Plan:
     plan = Plan(**parts)
     above_zero = min(plan.reference, plan.spacing, plan.views_per_step, plan.tv_box) > 0
     whole = isinstance(plan.views_per_step, int) and isinstance(plan.tv_box, int)
-    corner = isinstance(plan.tv_corner, float) and plan.tv_corner >= 0
+    soft, dense = plan.tv_corners
+    plan.tv_corners = float(soft), float(dense)
+    corners = min(plan.tv_corners) >= 0
     choices = plan.curves in (1, 3) and isinstance(plan.blurred, bool)
-    if not (above_zero and whole and corner and choices and isinstance(plan.reasons, dict)):
+    if not (above_zero and whole and corners and choices and isinstance(plan.reasons, dict)):
         raise TypeError(f"a plan, got {parts}")
     return plan
 

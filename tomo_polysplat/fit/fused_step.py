@@ -203,7 +203,12 @@ class FusedStep:
         volume = box_forward.splat(record, 1, box, VOXEL_CUTOFF, self._largest[1])
         chosen = self.settings
         slope = variation_gradient(
-            volume, chosen.tv_clip, self.scene.tv_corner, chosen.tv_weight, self._largest[1]
+            volume,
+            chosen.tv_clip,
+            self.scene.tv_corners,
+            chosen.bone_level,
+            chosen.tv_weight,
+            self._largest[1],
         )
         moments = box_backward.sum_moments(record, slope, box, VOXEL_CUTOFF)
         return box_backward.pull_back(*drawn, table, moments)

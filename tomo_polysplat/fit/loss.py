@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 
@@ -56,10 +58,15 @@ def roughness(gaussians: Gaussians, scene: FitScene, settings: Settings, box: Vo
         reach = VOXEL_CUTOFF * gaussians.log_scale.amax(dim=1, keepdim=True).exp()
         near = ((gaussians.position + reach >= lower) & (gaussians.position - reach <= upper)).all(dim=1)
     volume = scene.attenuation(gaussians.select(near.nonzero()[:, 0]), box)
-    return total_variation(volume, settings.tv_clip, scene.tv_corner)
+    return total_variation(volume, settings.tv_clip, scene.tv_corners, settings.bone_level)
 
 
-def total_variation(volume: torch.Tensor, ceiling: float, corner: float = 0.0) -> torch.Tensor:
+def total_variation(
+    volume: torch.Tensor,
+    ceiling: float,
+    corners: tuple[float, float] = (0.0, 0.0),
+    dense: float = math.inf,
+) -> torch.Tensor:
     """Mean absolute difference of neighbouring voxels per axis, summed over the axes.
 
     With a ``corner`` c each difference d counts as ``c log(1 + |d| / c)``: like |d| below c, hardly more with every
@@ -72,13 +79,22 @@ def total_variation(volume: torch.Tensor, ceiling: float, corner: float = 0.0) -
         Axes of length one contribute nothing.
     ceiling : float
         Values above it count as it: a piece of metal should not pay for its brightness, only for its surface.
-    corner : float
-        0 for the total variation itself.
+    corners : pair of float
+        Of matter up to ``dense``, and where one of two neighbours is above it; both 0 for the total variation itself.
+    dense : float
+        Below ``ceiling``, for the second corner to matter.
     """
     clipped = volume.clamp(max=ceiling)
     total = volume.new_zeros(())
     for axis in range(volume.ndim):
         if volume.shape[axis] > 1:
             height = clipped.diff(dim=axis).abs()
-            total = total + (corner * torch.log1p(height / corner) if corner else height).mean()
+            if any(corners):
+                length = volume.shape[axis] - 1
+                either = (
+                    torch.maximum(clipped.narrow(axis, 0, length), clipped.narrow(axis, 1, length)) > dense
+                )
+                corner = torch.where(either, volume.new_tensor(corners[1]), volume.new_tensor(corners[0]))
+                height = corner * torch.log1p(height / corner)
+            total = total + height.mean()
     return total

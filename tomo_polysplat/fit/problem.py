@@ -58,7 +58,7 @@ class _Known:
 
     copies: dict[torch.device, torch.Tensor] = field(default_factory=dict)
     closed: tuple[bool, str] | None = None
-    agreement: tuple[float | None] | None = None
+    agreement: list[float | None] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,13 +171,12 @@ class Problem:
             copies[device] = torch.from_numpy(self.projections).to(device if stay else "cpu")
         return copies[device]
 
-    def agreement(self, body: np.ndarray | torch.Tensor) -> float | None:
-        """How much of what varies in a body of voxels is the object's; see ``start.agreement``."""
+    def agreement(self, bodies: Sequence[torch.Tensor]) -> list[float | None]:
+        """How much of what varies in bodies of voxels is the object's, told once a scan; see ``start.agreement``."""
         if self._known.agreement is None:
-            voxels = torch.as_tensor(body)
-            found = halves_agree(self.measured(voxels.device), self.geometry, self.grid, voxels)
-            self._known.agreement = (found,)
-        return self._known.agreement[0]
+            values = self.measured(bodies[0].device)
+            self._known.agreement = halves_agree(values, self.geometry, self.grid, bodies)
+        return self._known.agreement
 
     def _closed(self, device: torch.device) -> tuple[bool, str]:
         """Whether no matter lies beside the volume, and words that say so."""
@@ -206,7 +205,7 @@ class Problem:
             settings.metal_tail,
             plan.blurred,
             plan.tv_box,
-            plan.tv_corner,
+            plan.tv_corners,
             closed,
         )
 

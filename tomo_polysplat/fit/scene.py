@@ -19,8 +19,9 @@ from tomo_polysplat.render.renderer import project_gaussians, voxelise_gaussians
 
 __all__ = ["FitScene"]
 
-# One of so many slices is made to tell how long all of them take.
-_SLICES_TIMED = 8
+# One of so many slices is made to tell how long all of them take, and how many times that it may be: the Gaussians of
+# the end are thinner than those of the start, and a host's memory is slower when it is new.
+_SLICES_TIMED, _SLACK = 8, 2.0
 
 
 @dataclass(frozen=True)
@@ -48,8 +49,9 @@ class FitScene:
         Whether rays are seen through the detector's blur; see ``physics.detector_blur``.
     tv_box : int
         Edge in voxels of the random box whose total variation a step takes.
-    tv_corner : float
-        Difference of neighbouring voxels, in soft references, up to which it counts in full.
+    tv_corners : pair of float
+        Difference of neighbouring voxels, in soft references, up to which it counts in full: of soft matter, and where
+        one of the two is bone-like or denser.
     closed : bool
         Whether all matter lies within the voxels, so that no Gaussian may leave them; see ``fit.inside``.
     """
@@ -65,7 +67,7 @@ class FitScene:
     metal_tail: float
     blurring: bool
     tv_box: int
-    tv_corner: float
+    tv_corners: tuple[float, float]
     closed: bool = False
 
     def projections(self, gaussians: Gaussians, views: DetectorViews) -> tuple[torch.Tensor, int]:
@@ -99,7 +101,7 @@ class FitScene:
 
     @torch.no_grad()
     def seconds_of_basis(self, gaussians: Gaussians) -> float:
-        """About how long `basis` takes from the device to the host, from some slices in the middle.
+        """How long `basis` will take from the device to the host at most, told by some slices in the middle.
 
         They are made twice, as the first time may compile kernels.
         """
@@ -109,7 +111,7 @@ class FitScene:
         for _ in range(2):
             begun = time.perf_counter()
             some.basis(gaussians).cpu()
-        return (time.perf_counter() - begun) * nz / depth
+        return _SLACK * (time.perf_counter() - begun) * nz / depth
 
     def _means(self, gaussians: Gaussians, weights: torch.Tensor) -> torch.Tensor:
         """Means over the voxels, with the tails of metal put back inside it."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -14,13 +15,15 @@ from tomo_polysplat.start.on_gpu import fdk_on_gpu
 
 __all__ = ["halves_agree"]
 
+# Pairs of voxels that tell a chance from a rule.
+_FEWEST = 1000
 # Voxels times views beyond which a CPU would spend longer on the two volumes than on much else.
 _MOST_ADDITIONS = 5e9
 
 
 def halves_agree(
-    projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid, body: torch.Tensor
-) -> float | None:
+    projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid, bodies: Sequence[torch.Tensor]
+) -> list[float | None]:
     """Mean over pairs of neighbouring voxels of whether two half scans see the same one as the denser.
 
     The halves are every other view. Noise is independent in them, and the streaks of too few views are opposite, so
@@ -33,30 +36,38 @@ def halves_agree(
     projections : (views, rows, columns) tensor
         -log(I/I0); NaN where a ray is not to be used.
     geometry, grid : Geometry, VolumeGrid
-    body : (nz, ny, nx) bool tensor
-        Voxels of the object.
+    bodies : sequence of (nz, ny, nx) bool tensors
+        Voxels of a kind of matter each.
 
     Returns
     -------
-    float or None
-        1 where all agree, 0 by chance, -1 where none does; None where no two volumes can be made by filtered
-        backprojection, or not in reasonable time.
+    list of float or None
+        For each body, 1 where all agree, 0 by chance, -1 where none does. None where it has too few voxels to tell, or
+        where no two volumes can be made by filtered backprojection, or not in reasonable time.
     """
-    if geometry.views < 2 * FEW_VIEWS or not bool(body.any()):
-        return None
+    nothing: list[float | None] = [None] * len(bodies)
+    if geometry.views < 2 * FEW_VIEWS:
+        return nothing
     halves = []
     for first in (0, 1):
         volume = _half(projections, geometry, grid, np.arange(first, geometry.views, 2))
         if volume is None:
-            return None
-        halves.append(volume.to(body.device))
-    signs = count = 0.0
-    for axis, length in enumerate(grid.shape):
+            return nothing
+        halves.append(volume.to(bodies[0].device))
+    one, other = halves
+    counted = [_signs(one, other, body) for body in bodies]
+    return [signs / pairs if pairs >= _FEWEST else None for signs, pairs in counted]
+
+
+def _signs(one: torch.Tensor, other: torch.Tensor, body: torch.Tensor) -> tuple[float, int]:
+    """Pairs of neighbours of which two volumes agree less those of which they do not, and all pairs."""
+    signs, pairs = 0.0, 0
+    for axis, length in enumerate(body.shape):
         if length > 1:
             both = body.narrow(axis, 1, length - 1) & body.narrow(axis, 0, length - 1)
-            one, other = (half.diff(dim=axis)[both].sign() for half in halves)
-            signs, count = signs + float((one * other).sum(dtype=torch.float64)), count + len(one)
-    return signs / count if count else None
+            product = one.diff(dim=axis)[both].sign() * other.diff(dim=axis)[both].sign()
+            signs, pairs = signs + float(product.sum(dtype=torch.float64)), pairs + len(product)
+    return signs, pairs
 
 
 def _half(

@@ -14,24 +14,27 @@ _BLOCK = 256
 
 
 @triton.jit
-def _slope(a, b, by_corner):
+def _slope(a, b, dense, by_corner, by_dense_corner):
     """Derivative of the penalty of a - b by a: the sign, less where the difference is large."""
     sign = tl.where(a > b, 1.0, 0.0) - tl.where(a < b, 1.0, 0.0)
+    by_corner = tl.where(tl.maximum(a, b) > dense, by_dense_corner, by_corner)
     return sign / (1.0 + tl.abs(a - b) * by_corner)
 
 
 @triton.jit
-def _along(volume, at, value, index, length, stride, live, ceiling, by_corner):
+def _along(volume, at, value, index, length, stride, live, ceiling, dense, by_corner, by_dense_corner):
     """d/dvalue of the penalties of the differences from both neighbours along an axis."""
     before = tl.minimum(tl.load(volume + at - stride, mask=live & (index > 0), other=0.0), ceiling)
     after = tl.minimum(tl.load(volume + at + stride, mask=live & (index < length - 1), other=0.0), ceiling)
-    slope = tl.where(index > 0, _slope(value, before, by_corner), 0.0)
-    slope -= tl.where(index < length - 1, _slope(after, value, by_corner), 0.0)
-    return slope
+    slope = tl.where(index > 0, _slope(value, before, dense, by_corner, by_dense_corner), 0.0)
+    rise = _slope(after, value, dense, by_corner, by_dense_corner)
+    return slope - tl.where(index < length - 1, rise, 0.0)
 
 
 @triton.jit(do_not_specialize=SIZES)
-def _variation_kernel(volume, grad, largest, nz, ny, nx, ceiling, by_corner, factor, BLOCK: tl.constexpr):
+def _variation_kernel(
+    volume, grad, largest, nz, ny, nx, ceiling, dense, by_corner, by_dense_corner, factor, BLOCK: tl.constexpr
+):  # fmt: skip
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     size = nz * ny * nx
     live = at < size
@@ -41,25 +44,32 @@ def _variation_kernel(volume, grad, largest, nz, ny, nx, ceiling, by_corner, fac
     value = tl.minimum(raw, ceiling)
     tl.atomic_max(largest, tl.max(raw, 0), sem="relaxed")
     # The mean over an axis has a term less a line than the volume has voxels.
-    slope = _along(volume, at, value, x, nx, 1, live, ceiling, by_corner) / tl.maximum(size - ny * nz, 1)
-    slope += _along(volume, at, value, y, ny, nx, live, ceiling, by_corner) / tl.maximum(size - nx * nz, 1)
-    slope += _along(volume, at, value, z, nz, nx * ny, live, ceiling, by_corner) / tl.maximum(
-        size - nx * ny, 1
-    )
+    along_x = _along(volume, at, value, x, nx, 1, live, ceiling, dense, by_corner, by_dense_corner)
+    along_y = _along(volume, at, value, y, ny, nx, live, ceiling, dense, by_corner, by_dense_corner)
+    along_z = _along(volume, at, value, z, nz, nx * ny, live, ceiling, dense, by_corner, by_dense_corner)
+    slope = along_x / tl.maximum(size - ny * nz, 1)
+    slope += along_y / tl.maximum(size - nx * nz, 1)
+    slope += along_z / tl.maximum(size - nx * ny, 1)
     tl.store(grad + at, tl.where(raw <= ceiling, slope * factor, 0.0), mask=live)
 
 
 def variation_gradient(
-    volume: torch.Tensor, ceiling: float, corner: float, factor: float, largest: torch.Tensor
+    volume: torch.Tensor,
+    ceiling: float,
+    corners: tuple[float, float],
+    dense: float,
+    factor: float,
+    largest: torch.Tensor,
 ) -> torch.Tensor:
     """``factor`` times the gradient of ``fit.loss.total_variation`` of a volume (1, nz, ny, nx), so shaped.
 
     ``largest``, a float32 tensor of one number, is raised to the largest value of the volume.
     """
     grad = torch.empty_like(volume)
+    by_corners = [1 / corner if corner else 0.0 for corner in corners]
     with on_device(volume):
         _variation_kernel[(triton.cdiv(volume.numel(), _BLOCK),)](
-            volume, grad, largest, *volume.shape[1:], ceiling, 1 / corner if corner else 0.0, factor,
+            volume, grad, largest, *volume.shape[1:], ceiling, dense, *by_corners, factor,
             BLOCK=_BLOCK, num_warps=4,
         )  # fmt: skip
     return grad
