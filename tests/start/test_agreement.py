@@ -65,6 +65,25 @@ def test_bodies_are_judged_apart():
     assert plain < 0.05
 
 
+def test_a_view_seen_twice_is_no_proof():
+    twice = np.repeat(np.arange(VIEWS), 2)
+    values = torch.from_numpy(noise())[torch.from_numpy(twice)]
+    (found,) = halves_agree(values, GEOMETRY.select(twice), GRID, [everywhere()])
+    assert abs(found) < 0.05
+
+
+def test_nor_are_parallel_rays_that_come_from_the_other_side():
+    """Half a turn on, which is an odd number of views here, each ray is seen again."""
+    angles = 2 * np.pi * np.arange(2 * VIEWS) / (2 * VIEWS)
+    geometry, _ = from_astra(
+        astra.create_proj_geom("parallel3d", 1.0, 1.0, 11, 49, angles), astra.create_vol_geom(9, 9, 3)
+    )
+    first = np.random.default_rng(4).normal(size=(VIEWS, 11, 49)).astype(np.float32)
+    values = torch.from_numpy(np.concatenate([first, first[:, :, ::-1]]))
+    (found,) = halves_agree(values, geometry, GRID, [everywhere()])
+    assert abs(found) < 0.05
+
+
 @pytest.mark.parametrize("what", ["few views", "few voxels", "no orbit", "a volume too large"])
 def test_what_cannot_be_told_is_not(what, monkeypatch):
     geometry, body = GEOMETRY, everywhere()

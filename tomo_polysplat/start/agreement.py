@@ -17,6 +17,8 @@ __all__ = ["halves_agree"]
 
 # Pairs of voxels that tell a chance from a rule.
 _FEWEST = 1000
+# Share of the mean step from view to view below which two views are from the same place.
+_SAME_PLACE = 0.1
 # Voxels times views beyond which a CPU would spend longer on the two volumes than on much else.
 _MOST_ADDITIONS = 5e9
 
@@ -26,10 +28,10 @@ def halves_agree(
 ) -> list[float | None]:
     """Mean over pairs of neighbouring voxels of whether two half scans see the same one as the denser.
 
-    The halves are every other view. Noise is independent in them, and the streaks of too few views are opposite, so
-    that of homogeneous matter the sign of a difference in one tells nothing of that in the other, or the contrary.
-    Where the object has texture that the scan resolves, they agree. Structural biologists compare half maps so to tell
-    resolution (Harauz and van Heel 1986).
+    The halves are every other view, and views from one place go to the same half. Noise is independent in them, and
+    the streaks of too few views are opposite, so that of homogeneous matter the sign of a difference in one tells
+    nothing of that in the other, or the contrary. Where the object has texture that the scan resolves, they agree.
+    Structural biologists compare half maps so to tell resolution (Harauz and van Heel 1986).
 
     Parameters
     ----------
@@ -46,17 +48,29 @@ def halves_agree(
         where no two volumes can be made by filtered backprojection, or not in reasonable time.
     """
     nothing: list[float | None] = [None] * len(bodies)
-    if geometry.views < 2 * FEW_VIEWS:
+    places = _places(geometry)
+    if places.max() + 1 < 2 * FEW_VIEWS:
         return nothing
     halves = []
-    for first in (0, 1):
-        volume = _half(projections, geometry, grid, np.arange(first, geometry.views, 2))
+    for half in (0, 1):
+        volume = _half(projections, geometry, grid, np.flatnonzero(places % 2 == half))
         if volume is None:
             return nothing
         halves.append(volume.to(bodies[0].device))
     one, other = halves
     counted = [_signs(one, other, body) for body in bodies]
     return [signs / pairs if pairs >= _FEWEST else None for signs, pairs in counted]
+
+
+def _places(geometry: Geometry) -> np.ndarray:
+    """(views,) places from which views are seen, counted round the axis; parallel rays are the same from both ends."""
+    turn = np.arctan2(geometry.origin[:, 1], geometry.origin[:, 0])
+    turn = np.mod(turn, np.pi if geometry.beam == "parallel" else 2 * np.pi)
+    order = np.argsort(turn, kind="stable")
+    apart = np.diff(turn[order]) > _SAME_PLACE * np.ptp(turn) / geometry.views
+    places = np.empty(geometry.views, int)
+    places[order] = np.concatenate([[0], np.cumsum(apart)])
+    return places
 
 
 def _signs(one: torch.Tensor, other: torch.Tensor, body: torch.Tensor) -> tuple[float, int]:
