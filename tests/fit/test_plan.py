@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from tomo_polysplat.fit.plan import make_plan
+from tomo_polysplat.fit.plan import bodies, corners_for, make_plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.spectrum import Spectrum
@@ -298,3 +298,29 @@ def test_metal_is_seen_in_a_start_and_noise_is_not_taken_for_it(views, photons):
         of = Problem.of(values, *from_astra(scan.proj_geom, scan.vol_geom), "cm", scan.spectrum, None)
         start, _ = of.start_volume(torch.device("cpu"))
         assert plan(of, start).curves == curves, (metal, plan(of, start).reasons["curves"])
+
+
+def test_what_two_halves_agree_on_is_smoothed_less():
+    """Soft and dense matter apart; not in coarse volumes, and not where nothing can be told."""
+    assert corners_for([None, None], 200) == corners_for([-0.4, -0.2], 200) == pytest.approx((0.1, 0.1))
+    assert corners_for([0.9, 0.9], 30) == pytest.approx((0.1, 0.1))
+    soft, dense = corners_for([0.0, 0.9], 200)
+    assert dense < 0.02 < soft == pytest.approx(0.1)
+    alone = corners_for([0.15, None], 200)
+    assert alone[0] == alone[1] and 0.02 < alone[0] < 0.1
+    assert alone[0] < corners_for([0.15, None], 50)[0] < 0.1
+
+
+def test_matter_beside_metal_is_no_witness():
+    relative = torch.zeros(1, 20, 30)
+    relative[:, 4:16, 4:26] = 1.0
+    relative[:, 8:12, 20:24] = 3.0
+    relative[:, 9, 8] = 50.0
+    soft, dense = bodies(relative, Settings())
+    assert not soft[0, 9, 5:12].any() and bool(soft[0, 9, 12])
+    assert int(dense.sum()) == 16 and not (soft & dense).any()
+
+
+def test_a_corner_that_is_asked_for_is_taken():
+    of = problem(polychromatic=True)
+    assert plan(of, ball(of, WATER), tv_corner=0.3).tv_corners == (0.3, 0.3)

@@ -133,7 +133,9 @@ class _Fit:
         self.corners = (settings.tv_corner,) * 2
         if not settings.tv_corner:
             matter = bodies(model.relative * model.size, settings)
-            self.corners = corners_for(halves_agree(self.rays.projections, geometry, grid, matter))
+            self.corners = corners_for(
+                halves_agree(self.rays.projections, geometry, grid, matter), max(grid.shape)
+            )
         self.parameters = [model.relative.requires_grad_(), model.own.requires_grad_()]
         rates = (RATE_ATTENUATION, RATE_MATERIAL)
         groups = [{"params": [p], "lr": r, "rate": r} for p, r in zip(self.parameters, rates)]
