@@ -149,10 +149,10 @@ def rewritten(path, **changes):
     np.savez(path, **{name: value for name, value in (arrays | changes).items() if value is not None})
 
 
-def with_numbers(path, **changes):
+def with_numbers(path, part="numbers", **changes):
     with np.load(path) as file:
         about = json.loads(file["about"].tobytes())
-    about["numbers"] |= changes
+    about[part] |= changes
     return np.frombuffer(json.dumps(about).encode(), np.uint8)
 
 
@@ -173,6 +173,8 @@ def with_numbers(path, **changes):
         lambda path: rewritten(path, about=with_numbers(path, random={"bit_generator": "MT19937"})),
         lambda path: rewritten(path, about=with_numbers(path, seconds=float("nan"))),
         lambda path: rewritten(path, about=with_numbers(path, largest=["much", 1.0])),
+        lambda path: rewritten(path, about=with_numbers(path, "plan", tv_corners=[0.1])),
+        lambda path: rewritten(path, about=with_numbers(path, "plan", tv_corners=["a", "tenth"])),
     ],
 )
 def test_a_damaged_file_is_refused(tmp_path, damage):

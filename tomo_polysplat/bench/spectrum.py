@@ -192,7 +192,7 @@ def _run(bench: SpectrumBench, scene: str, scan: Scan, case: Case, calibrated: b
         **compare(volume, scan.truth, scan.metal_mask),
         "soft_bias": float(volume[rest].sum() / scan.truth[rest].sum() - 1.0),
         "own_psnr": compare(result.volume, scan.truth, scan.metal_mask)["psnr"],
-        "held_out": result.history[-1]["held_out"],
+        "held_out": result.history[-1]["held_out"] if result.history else None,
         "seconds": result.seconds,
         "fitted": None if found is None else found["fitted"],
         "why": None if found is None else found["why"],

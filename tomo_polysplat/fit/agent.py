@@ -100,6 +100,10 @@ def _metal_as_named(settings: Settings, materials: Materials) -> tuple[Settings,
     return replace(settings, metal_u=1.0), {"metal": "starts as the dense material, which was named"}
 
 
+def _top(values: np.ndarray) -> float:
+    return float(np.quantile(values, 0.9))
+
+
 def levels_between(start: np.ndarray, bone_level: float) -> list[float]:
     """Levels of a start volume, in soft references, above which its pieces may be the agent.
 
@@ -110,6 +114,7 @@ def levels_between(start: np.ndarray, bone_level: float) -> list[float]:
     labels, number = ndimage.label(start > bone_level)
     if number < 2:
         return [bone_level] * number
-    tops = np.sort([np.quantile(start[labels == k + 1], 0.9) for k in range(number)])
+    # One look at the volume for all of them: noise can make thousands.
+    tops = np.sort(ndimage.labeled_comprehension(start, labels, np.arange(1, number + 1), _top, float, 0.0))
     widest = np.argsort(np.diff(tops))[::-1][:_DIVISIONS]
     return [float(0.5 * (tops[k] + tops[k + 1])) for k in sorted(widest)]

@@ -32,7 +32,7 @@ __all__ = ["Checkpoint", "Snapshot"]
 
 logger = logging.getLogger(__name__)
 
-FORMAT = 2
+FORMAT = 3
 # Writing takes at most this share of the time.
 _LARGEST_SHARE = 0.05
 _PARTS = tuple(field.name for field in fields(Gaussians))
@@ -159,6 +159,8 @@ class Checkpoint:
             about = _content(arrays["about"])
             self._require_same(about)
             self.plan = _plan(about["plan"])
+            if self.options.get("calibration") is not None:
+                _require_calibration(self.plan)
             self.snapshot = _snapshot(arrays, dict(about["numbers"]), self._views)
         except _DAMAGES as error:
             raise self._damaged(f"{type(error).__name__} {error}") from error
@@ -211,13 +213,21 @@ def _plan(parts: dict[str, Any]) -> Plan:
     plan = Plan(**parts)
     above_zero = min(plan.reference, plan.spacing, plan.views_per_step, plan.tv_box) > 0
     whole = isinstance(plan.views_per_step, int) and isinstance(plan.tv_box, int)
-    soft, dense = plan.tv_corners
-    plan.tv_corners = float(soft), float(dense)
-    corners = min(plan.tv_corners) >= 0
+    corners = len(plan.tv_corners) == 2 and all(
+        isinstance(corner, (int, float)) and corner >= 0 for corner in plan.tv_corners
+    )
     choices = plan.curves in (1, 3) and isinstance(plan.blurred, bool)
     if not (above_zero and whole and corners and choices and isinstance(plan.reasons, dict)):
         raise TypeError(f"a plan, got {parts}")
+    soft, dense = plan.tv_corners
+    plan.tv_corners = soft, dense
     return plan
+
+
+def _require_calibration(plan: Plan) -> None:
+    found = plan.reasons["calibration"]
+    if not (isinstance(found, dict) and isinstance(found.get("fitted"), dict)):
+        raise TypeError(f"what the calibration found, got {found}")
 
 
 def _snapshot(arrays: dict[str, np.ndarray], numbers: dict[str, Any], views: int) -> Snapshot:

@@ -175,7 +175,14 @@ class Problem:
         """How much of what varies in bodies of voxels is the object's, told once a scan; see ``start.agreement``."""
         if self._known.agreement is None:
             values = self.measured(bodies[0].device)
-            self._known.agreement = halves_agree(values, self.geometry, self.grid, bodies)
+            try:
+                self._known.agreement = halves_agree(values, self.geometry, self.grid, bodies)
+            except RuntimeError as problem:
+                # Torch's or ASTRA's, of a GPU that has no room for two more volumes.
+                if not values.is_cuda:
+                    raise
+                logger.warning("Texture is not told from noise: %s", problem)
+                self._known.agreement = [None] * len(bodies)
         return self._known.agreement
 
     def _closed(self, device: torch.device) -> tuple[bool, str]:
