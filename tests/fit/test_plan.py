@@ -302,17 +302,17 @@ def test_metal_is_seen_in_a_start_and_noise_is_not_taken_for_it(views, photons):
 
 def test_what_two_halves_agree_on_is_smoothed_less():
     """Soft and dense matter apart; not in coarse volumes, and not where nothing can be told."""
-    assert corners_for([None, None], 200) == corners_for([-0.4, -0.2], 200) == pytest.approx((0.1, 0.1))
-    assert corners_for([0.9, 0.9], 30) == pytest.approx((0.1, 0.1))
-    soft, dense = corners_for([0.0, 0.9], 200)
+    assert corners_for([None, None], 200**3) == corners_for([-0.4, -0.2], 200**3) == pytest.approx((0.1, 0.1))
+    assert corners_for([0.9, 0.9], 30**3) == pytest.approx((0.1, 0.1))
+    soft, dense = corners_for([0.0, 0.9], 200**3)
     assert dense < 0.02 < soft == pytest.approx(0.1)
-    alone = corners_for([0.15, None], 200)
+    alone = corners_for([0.15, None], 200**3)
     assert alone[0] == alone[1] and 0.02 < alone[0] < 0.1
-    assert alone[0] < corners_for([0.15, None], 50)[0] < 0.1
+    assert alone[0] < corners_for([0.15, None], 50**3)[0] < 0.1
 
 
 def test_matter_beside_metal_is_no_witness():
-    relative = torch.zeros(1, 20, 30)
+    relative = torch.zeros(1, 20, 30**3)
     relative[:, 4:16, 4:26] = 1.0
     relative[:, 8:12, 20:24] = 3.0
     relative[:, 9, 8] = 50.0

@@ -134,7 +134,7 @@ class _Fit:
         if not settings.tv_corner:
             matter = bodies(model.relative * model.size, settings)
             self.corners = corners_for(
-                halves_agree(self.rays.projections, geometry, grid, matter), max(grid.shape)
+                halves_agree(self.rays.projections, geometry, grid, matter), math.prod(grid.shape)
             )
         self.parameters = [model.relative.requires_grad_(), model.own.requires_grad_()]
         rates = (RATE_ATTENUATION, RATE_MATERIAL)
