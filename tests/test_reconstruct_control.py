@@ -2,13 +2,16 @@
 
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from small_scans import QUICK, fan, reconstruct, relative
 
+from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.kernels.device import one_torch_thread
+from tomo_polysplat.kernels.voxelise.box import VoxelBox
 
 MANY = {"passes": 10_000.0, "patience": 10_000}
 
@@ -158,3 +161,25 @@ def test_every_kernel_of_the_cpu_gives_the_same_volume():
     ]
     # Rounding differs, and a fit amplifies it.
     assert relative(*pair) < 0.01
+
+
+def test_a_volume_that_takes_the_budget_leaves_half_of_it_to_the_fit(monkeypatch):
+    reconstruct(fan())  # compiled and warm
+    monkeypatch.setattr(FitScene, "seconds_of_basis", lambda self, gaussians: 100.0)
+    result = reconstruct(fan(), settings=MANY, time_budget=2.0)
+    assert result.history and 0.5 < result.history[-1]["seconds"] < 1.9
+
+
+def test_what_a_volume_takes_is_told_by_some_of_its_slices():
+    """With a clock that a slice moves by a second."""
+    box, now = VoxelBox(np.zeros(3), np.ones(3), (17, 4, 5)), [0.0]
+    scene = FitScene(box, None, 1.0, None, None, 0.0, "reference", 3.0, 0.1, False, 8, (0.1, 0.1))
+
+    def basis(self, gaussians):
+        now[0] += self.box.shape[0]
+        return torch.zeros(1, *self.box.shape)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(FitScene, "basis", basis)
+        patch.setattr("tomo_polysplat.fit.scene.time", SimpleNamespace(perf_counter=lambda: now[0]))
+        assert scene.seconds_of_basis(None) == pytest.approx(2 * 17)

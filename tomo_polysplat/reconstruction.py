@@ -192,7 +192,11 @@ def _fitted(
 ) -> FitOutcome:
     """The fit; ``started`` is when the reconstruction began."""
     plan, scene, budget = begun.plan, begun.scene, wishes.time_budget
-    deadline = None if budget is None else started + budget - scene.seconds_of_basis(begun.gaussians)
+    deadline = None
+    if budget is not None:
+        # A volume that takes most of the budget still needs a fit: then the end is late.
+        left = max(started + budget - time.perf_counter(), 0.0)
+        deadline = started + budget - min(scene.seconds_of_basis(begun.gaussians), 0.5 * left)
     return fit(
         begun.gaussians,
         plan.spacing * problem.voxel,
