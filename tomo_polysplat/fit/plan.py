@@ -200,11 +200,17 @@ def _tv_corners(
     found = problem.agreement(bodies(relative, settings))
     corners = corners_for(found, voxels)
     words = f"differences up to {corners[0]:.2g} soft references are smoothed, in dense matter up to {corners[1]:.2g}"
-    shares = ["cannot be told" if share is None else f"{share:+.0%}" for share in found]
-    return (
-        corners,
-        f"{words}: two halves of the views agree on their signs by {shares[0]}, and by {shares[1]}",
+    told = [
+        f"of {kind} by {share:+.0%}"
+        for kind, share in zip(("soft matter", "dense matter"), found)
+        if share is not None
+    ]
+    why = (
+        f"two halves of the views agree on the signs {', '.join(told)}"
+        if told
+        else "halves of the views do not tell"
     )
+    return corners, f"{words}: {why}"
 
 
 def bodies(relative: torch.Tensor, settings: Settings) -> list[torch.Tensor]:

@@ -18,12 +18,14 @@ __all__ = ["fdk_cuda", "fdk_cuda_tensor", "suits_fdk_cuda"]
 _COLUMNS_AT_ONCE = 32
 
 
-def suits_fdk_cuda(geometry: Geometry, grid: VolumeGrid, orbit: Orbit) -> tuple[bool, str]:
+def suits_fdk_cuda(
+    geometry: Geometry, grid: VolumeGrid, orbit: Orbit, uneven: float = 0.02
+) -> tuple[bool, str]:
     """Whether ASTRA's FDK_CUDA may and can do a scan, and why not.
 
     It reads the distances from the first view, takes the views as evenly spread over a full turn and the
     detector as centred and facing the axis, and knows cubic voxels only. Without a usable GPU it would end
-    the process, so that is asked first.
+    the process, so that is asked first. Steps from view to view may differ by the share ``uneven`` of their mean.
     """
     import astra
     import torch
@@ -34,7 +36,7 @@ def suits_fdk_cuda(geometry: Geometry, grid: VolumeGrid, orbit: Orbit) -> tuple[
         return False, "not a 3D cone beam"
     if np.ptp(grid.voxel_size) > 1e-6 * grid.voxel_size.max():
         return False, "voxels are not cubes"
-    even = orbit.full and np.ptp(orbit.steps) < 0.02 * orbit.steps.mean()
+    even = orbit.full and np.ptp(orbit.steps) < uneven * orbit.steps.mean()
     if not even:
         return False, "views are not evenly spread over a full turn"
     axis = np.column_stack([np.tile(orbit.axis, (geometry.views, 1)), geometry.origin[:, 2]])

@@ -13,18 +13,22 @@ __all__ = ["fdk_on_gpu", "fill_rows"]
 _CHUNK = 32
 
 
-def fdk_on_gpu(projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid) -> torch.Tensor | None:
+def fdk_on_gpu(
+    projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid, uneven: float = 0.02
+) -> torch.Tensor | None:
     """Smooth filtered backprojection (nz, ny, nx), or None where ASTRA cannot do this scan on a GPU.
 
     Parameters
     ----------
     projections : (views, rows, columns) float32 CUDA tensor
         -log(I/I0) of a scan that `fits_fdk`; pixels that are not finite are interpolated from their row.
+    uneven : float
+        Largest difference between the steps from view to view, as a share of their mean.
     """
     from tomo_polysplat.start.astra_fdk import fdk_cuda_tensor, suits_fdk_cuda
 
     orbit, _ = find_orbit(geometry)
-    if orbit is None or not suits_fdk_cuda(geometry, grid, orbit)[0]:
+    if orbit is None or not suits_fdk_cuda(geometry, grid, orbit, uneven)[0]:
         return None
     # Smooth: the noise of a sharp filter would be seeded as if it were matter.
     return fdk_cuda_tensor(fill_rows(projections), geometry, grid, orbit, "hann")
