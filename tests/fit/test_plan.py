@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from tomo_polysplat.fit.plan import bodies, corners_for, make_plan
+from tomo_polysplat.fit.plan import bodies, corners_for, make_plan, share_alike
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.spectrum import Spectrum
@@ -301,14 +301,30 @@ def test_metal_is_seen_in_a_start_and_noise_is_not_taken_for_it(views, photons):
 
 
 def test_what_two_halves_agree_on_is_smoothed_less():
-    """Soft and dense matter apart; not in coarse volumes, and not where nothing can be told."""
-    assert corners_for([None, None], 200**3) == corners_for([-0.4, -0.2], 200**3) == pytest.approx((0.1, 0.1))
-    assert corners_for([0.9, 0.9], 30**3) == pytest.approx((0.1, 0.1))
-    soft, dense = corners_for([0.0, 0.9], 200**3)
+    """Soft and dense matter apart; not in small volumes, in homogeneous matter, nor where nothing can be told."""
+    large, small = 200**3, 30**3
+    smooth = pytest.approx((0.1, 0.1))
+    assert corners_for([None, None], large, 0.0) == corners_for([-0.4, -0.2], large, 0.0) == smooth
+    assert corners_for([0.9, 0.9], small, 0.0) == corners_for([0.9, None], large, 0.8) == smooth
+    soft, dense = corners_for([0.0, 0.9], large, 0.0)
     assert dense < 0.02 < soft == pytest.approx(0.1)
-    alone = corners_for([0.15, None], 200**3)
+    alone = corners_for([0.15, None], large, 0.0)
     assert alone[0] == alone[1] and 0.02 < alone[0] < 0.1
-    assert alone[0] < corners_for([0.15, None], 50**3)[0] < 0.1
+    assert alone[0] < corners_for([0.15, None], 50**3, 0.0)[0] < 0.1
+    assert alone[0] < corners_for([0.15, None], large, 0.7)[0] < 0.1
+
+
+@pytest.mark.parametrize("shape", [(1, 61, 67), (15, 21, 23)])
+def test_homogeneous_matter_is_alike_inside_and_textured_matter_is_not(shape):
+    z, y, x = np.meshgrid(*(np.linspace(-1, 1, n) if n > 1 else [0.0] for n in shape), indexing="ij")
+    body = torch.from_numpy(x**2 + y**2 + z**2 < 0.9)
+    rng = np.random.default_rng(5)
+    blurred = torch.where(body, 1.0, 0.4)
+    noise = torch.from_numpy(rng.normal(size=shape)).float()
+    assert share_alike(blurred, body) == 1.0
+    assert share_alike(blurred * (1 + 0.02 * noise), body) > 0.95
+    assert share_alike(blurred * (1 + 0.3 * noise), body) < 0.3
+    assert share_alike(blurred, body & (torch.from_numpy(x) > 0.8)) == 0.0, "too few to tell"
 
 
 def test_matter_beside_metal_is_no_witness():

@@ -17,7 +17,7 @@ from tomo_polysplat.baselines.voxel_model import VoxelModel, start_voxels
 from tomo_polysplat.fit.loss import misfit, total_variation
 from tomo_polysplat.fit.noise import photons_per_ray
 from tomo_polysplat.fit.optimise import FitState
-from tomo_polysplat.fit.plan import bodies, corners_for
+from tomo_polysplat.fit.plan import bodies, corners_for, share_alike
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.quadrature import fit_quadrature
@@ -132,10 +132,10 @@ class _Fit:
         )
         self.corners = (settings.tv_corner,) * 2
         if not settings.tv_corner:
-            matter = bodies(model.relative * model.size, settings)
-            self.corners = corners_for(
-                halves_agree(self.rays.projections, geometry, grid, matter), math.prod(grid.shape)
-            )
+            relative = model.relative * model.size
+            matter = bodies(relative, settings)
+            found = halves_agree(self.rays.projections, geometry, grid, matter)
+            self.corners = corners_for(found, math.prod(grid.shape), share_alike(relative, matter[0]))
         self.parameters = [model.relative.requires_grad_(), model.own.requires_grad_()]
         rates = (RATE_ATTENUATION, RATE_MATERIAL)
         groups = [{"params": [p], "lr": r, "rate": r} for p, r in zip(self.parameters, rates)]

@@ -23,7 +23,7 @@ from tomo_polysplat.start.levels import MAIN_SHARE, main_level, mass_level
 if TYPE_CHECKING:
     from tomo_polysplat.fit.problem import Problem
 
-__all__ = ["Plan", "bodies", "corners_for", "make_plan", "soft_reference"]
+__all__ = ["Plan", "bodies", "corners_for", "make_plan", "share_alike", "soft_reference"]
 
 logger = logging.getLogger(__name__)
 
@@ -51,6 +51,10 @@ _OF_SOFT, _OF_DENSE = (0.0, 0.3), (0.2, 0.5)
 # 0.1 and what agreement alone would say, pancreas 40^3: 37.6 and 36.0 dB; pins 69 x 69 x 16: 33.2 and 30.9; teeth 64^3:
 # 39.3 and 40.5).
 _SMALL, _LARGE = 40, 64
+# Soft matter counts as textured where up to the first share of its inside is this close to its median, and as
+# homogeneous from the second on (pins of 48 to 96 voxels along an edge 0.73 to 0.76, the other scenes 0.00 to 0.62),
+# told by so many voxels.
+_ALIKE, _ONE_MATTER, _FEWEST = 0.05, (0.6, 0.75), 1000
 # Gaussians that a laptop and a GPU fit in a time people wait for.
 _MOST_GAUSSIANS = {"cpu": 60_000, "cuda": 400_000}
 # Objects of solid metal are so many times as dense as water at most (rods of silver: 180, of gold: 280): only beyond
@@ -197,8 +201,10 @@ def _tv_corners(
         words = f"differences up to {_SMOOTH:g} soft references are smoothed"
         return (_SMOOTH, _SMOOTH), f"{words}: in so few voxels edges cannot be told from texture"
     relative = torch.as_tensor(start) / soft if soft else torch.as_tensor(start)
-    found = problem.agreement(bodies(relative, settings))
-    corners = corners_for(found, voxels)
+    matter = bodies(relative, settings)
+    found = problem.agreement(matter)
+    alike = share_alike(relative, matter[0])
+    corners = corners_for(found, voxels, alike)
     words = f"differences up to {corners[0]:.2g} soft references are smoothed, in dense matter up to {corners[1]:.2g}"
     told = [
         f"of {kind} by {share:+.0%}"
@@ -206,32 +212,47 @@ def _tv_corners(
         if share is not None
     ]
     why = (
-        f"two halves of the views agree on the signs {', '.join(told)}"
+        f"two halves of the views agree on the signs {', '.join(told)}, and {alike:.0%} of the soft matter is alike"
         if told
         else "halves of the views do not tell"
     )
     return corners, f"{words}: {why}"
 
 
+def share_alike(relative: torch.Tensor, body: torch.Tensor) -> float:
+    """Share of a body's voxels, away from its surface, whose value is close to their median; 0 of too few."""
+    values = relative[~_widened(~body, 1)]
+    if len(values) < _FEWEST:
+        return 0.0
+    return float(((values / values.median() - 1).abs() < _ALIKE).float().mean())
+
+
 def bodies(relative: torch.Tensor, settings: Settings) -> list[torch.Tensor]:
     """Voxels of soft and of bone-like matter in a volume in soft references, none of them near metal."""
-    metal = (relative > settings.metal_level).to(torch.float32)[None]
-    for axis in range(3):
-        window, margin = [1, 1, 1], [0, 0, 0]
-        window[axis], margin[axis] = 2 * _BESIDE_METAL + 1, _BESIDE_METAL
-        metal = torch.nn.functional.max_pool3d(metal, window, 1, margin)
-    dense, away = relative > settings.bone_level, metal[0] == 0
+    dense, away = relative > settings.bone_level, ~_widened(relative > settings.metal_level, _BESIDE_METAL)
     return [(relative > _BODY) & ~dense & away, dense & away]
 
 
-def corners_for(agreement: Sequence[float | None], voxels: int) -> tuple[float, float]:
+def _widened(mask: torch.Tensor, reach: int) -> torch.Tensor:
+    """The voxels of a mask and those up to ``reach`` from them along every axis."""
+    wide = mask.to(torch.float32)[None]
+    for axis in range(3):
+        window, margin = [1, 1, 1], [0, 0, 0]
+        window[axis], margin[axis] = 2 * reach + 1, reach
+        wide = torch.nn.functional.max_pool3d(wide, window, 1, margin)
+    return wide[0] > 0
+
+
+def corners_for(agreement: Sequence[float | None], voxels: int, alike: float) -> tuple[float, float]:
     """Differences of neighbouring voxels that count in full, of soft and of dense matter.
 
-    ``agreement`` is what `start.agreement.halves_agree` found of `bodies`, and ``voxels`` the number of them all.
+    ``agreement`` is what `start.agreement.halves_agree` found of `bodies`, ``voxels`` the number of them all, and
+    ``alike`` the `share_alike` of soft matter: what two halves agree on in a homogeneous body is its edges, and streaks
+    of metal.
     """
     fine = _ramp(voxels ** (1 / 3), _SMALL, _LARGE)
     soft, dense = agreement
-    of_soft = 0.0 if soft is None else _ramp(soft, *_OF_SOFT)
+    of_soft = 0.0 if soft is None else _ramp(soft, *_OF_SOFT) * (1 - _ramp(alike, *_ONE_MATTER))
     of_dense = of_soft if dense is None else _ramp(dense, *_OF_DENSE)
     ratio = _TEXTURED / _SMOOTH
     return _SMOOTH * ratio ** (fine * of_soft), _SMOOTH * ratio ** (fine * of_dense)
