@@ -17,8 +17,8 @@ from tomo_polysplat.baselines.voxel_model import VoxelModel, start_voxels
 from tomo_polysplat.fit.loss import misfit, total_variation
 from tomo_polysplat.fit.noise import photons_per_ray
 from tomo_polysplat.fit.optimise import FitState
-from tomo_polysplat.fit.plan import bodies, corners_for, share_alike
 from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.texture import tv_corners
 from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.quadrature import fit_quadrature
 from tomo_polysplat.physics.spectrum import Spectrum
@@ -130,12 +130,12 @@ class _Fit:
             settings.model_error,
             settings.held_out,
         )
-        self.corners = (settings.tv_corner,) * 2
-        if not settings.tv_corner:
-            relative = model.relative * model.size
-            matter = bodies(relative, settings)
-            found = halves_agree(self.rays.projections, geometry, grid, matter)
-            self.corners = corners_for(found, math.prod(grid.shape), share_alike(relative, matter[0]))
+        measured = self.rays.projections
+        self.corners, _ = tv_corners(
+            model.relative * model.size,
+            settings,
+            lambda bodies: halves_agree(measured, geometry, grid, bodies),
+        )
         self.parameters = [model.relative.requires_grad_(), model.own.requires_grad_()]
         rates = (RATE_ATTENUATION, RATE_MATERIAL)
         groups = [{"params": [p], "lr": r, "rate": r} for p, r in zip(self.parameters, rates)]

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
+from tomo_polysplat.fit.texture import tv_corners
 from tomo_polysplat.physics.detector_blur import describe_blur
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.levels import MAIN_SHARE, main_level, mass_level
@@ -23,7 +23,7 @@ from tomo_polysplat.start.levels import MAIN_SHARE, main_level, mass_level
 if TYPE_CHECKING:
     from tomo_polysplat.fit.problem import Problem
 
-__all__ = ["Plan", "bodies", "corners_for", "make_plan", "share_alike", "soft_reference"]
+__all__ = ["Plan", "make_plan", "soft_reference"]
 
 logger = logging.getLogger(__name__)
 
@@ -37,24 +37,6 @@ _STEPS, _MOST_VIEWS, _MOST_VIEWS_PLANAR = 300, {"cpu": 8, "cuda": 4}, 8
 # Voxels along an edge of the box that is smoothed. What a box seldom meets is smoothed by leaps, which upset the
 # optimiser's sense of scale (teeth, 128^3 voxels: 39.1, 39.7 and 40.2 dB with 32, 64 and 128).
 _TV_BOX, _TV_BOX_PLANAR = {"cpu": 48, "cuda": 128}, 256
-# What counts as the object where its smoothness is judged, in soft references, and how many voxels from metal.
-_BODY, _BESIDE_METAL = 0.3, 3
-# Differences of neighbouring voxels count in full up to so many soft references where nothing tells texture, and where
-# all is texture. That is told by the agreement of two halves of the views on their signs: from the first value to the
-# second, of soft matter and of dense matter, whose surfaces alone agree by as much. Chosen on the six scenes of the
-# bench and on slices of other simulators (broccoli, 256^3, with 0.1, 0.03 and 0.01: 33.5, 37.1 and 39.8 dB; pepper,
-# 64^3, with 0.02 and 0.01: 31.8 and 31.4; a hip with 0.1 and 0.03: 32.0 and 31.4).
-_SMOOTH, _TEXTURED = 0.1, 0.015
-_OF_SOFT, _OF_DENSE = (0.0, 0.3), (0.2, 0.5)
-# In a small volume nearly all voxels lie at edges, of which both halves tell, and what varies within a voxel is left to
-# smoothing: the agreement counts from the first cube root of the number of voxels on, and in full from the second (with
-# 0.1 and what agreement alone would say, pancreas 40^3: 37.6 and 36.0 dB; pins 69 x 69 x 16: 33.2 and 30.9; teeth 64^3:
-# 39.3 and 40.5).
-_SMALL, _LARGE = 40, 64
-# Soft matter counts as textured where up to the first share of its inside is this close to its median, and as
-# homogeneous from the second on (pins of 48 to 96 voxels along an edge 0.73 to 0.76, the other scenes 0.00 to 0.62),
-# told by so many voxels.
-_ALIKE, _ONE_MATTER, _FEWEST = 0.05, (0.6, 0.75), 1000
 # Gaussians that a laptop and a GPU fit in a time people wait for.
 _MOST_GAUSSIANS = {"cpu": 60_000, "cuda": 400_000}
 # Objects of solid metal are so many times as dense as water at most (rods of silver: 180, of gold: 280): only beyond
@@ -121,7 +103,8 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     soft = reference * problem.depth
     curves, needed = _curves(start, soft, problem.polychromatic, settings)
     blurred, told = _blurred(start, soft, settings)
-    corners, texture = _tv_corners(start, soft, problem, settings)
+    relative = torch.as_tensor(start) / soft if soft else torch.as_tensor(start)
+    corners, texture = tv_corners(relative, settings, problem.agreement)
     plan = Plan(reference, spacing, finer, views, box, corners, curves, blurred)
     unit = "g/cm3" if problem.polychromatic else "per unit of length"
     plan.reasons = {
@@ -188,79 +171,6 @@ def _curves(
     return 1, (
         f"the densest voxel of the start has {largest:.2g} soft references, so that no material number would be free"
     )
-
-
-def _tv_corners(
-    start: np.ndarray | torch.Tensor, soft: float, problem: Problem, settings: Settings
-) -> tuple[tuple[float, float], str]:
-    """Where differences begin to count by their logarithm: sooner the more of them are the object's own."""
-    if settings.tv_corner or not settings.tv_weight:
-        return (settings.tv_corner, settings.tv_corner), "asked for"
-    voxels = math.prod(start.shape)
-    if voxels <= _SMALL**3:
-        words = f"differences up to {_SMOOTH:g} soft references are smoothed"
-        return (_SMOOTH, _SMOOTH), f"{words}: in so few voxels edges cannot be told from texture"
-    relative = torch.as_tensor(start) / soft if soft else torch.as_tensor(start)
-    matter = bodies(relative, settings)
-    found = problem.agreement(matter)
-    alike = share_alike(relative, matter[0])
-    corners = corners_for(found, voxels, alike)
-    words = f"differences up to {corners[0]:.2g} soft references are smoothed, in dense matter up to {corners[1]:.2g}"
-    told = [
-        f"of {kind} by {share:+.0%}"
-        for kind, share in zip(("soft matter", "dense matter"), found)
-        if share is not None
-    ]
-    why = (
-        f"two halves of the views agree on the signs {', '.join(told)}, and {alike:.0%} of the soft matter is alike"
-        if told
-        else "halves of the views do not tell"
-    )
-    return corners, f"{words}: {why}"
-
-
-def share_alike(relative: torch.Tensor, body: torch.Tensor) -> float:
-    """Share of a body's voxels, away from its surface, whose value is close to their median; 0 of too few."""
-    values = relative[~_widened(~body, 1)]
-    if len(values) < _FEWEST:
-        return 0.0
-    return float(((values / values.median() - 1).abs() < _ALIKE).float().mean())
-
-
-def bodies(relative: torch.Tensor, settings: Settings) -> list[torch.Tensor]:
-    """Voxels of soft and of bone-like matter in a volume in soft references, none of them near metal."""
-    dense, away = relative > settings.bone_level, ~_widened(relative > settings.metal_level, _BESIDE_METAL)
-    return [(relative > _BODY) & ~dense & away, dense & away]
-
-
-def _widened(mask: torch.Tensor, reach: int) -> torch.Tensor:
-    """The voxels of a mask and those up to ``reach`` from them along every axis."""
-    wide = mask.to(torch.float32)[None]
-    for axis in range(3):
-        window, margin = [1, 1, 1], [0, 0, 0]
-        window[axis], margin[axis] = 2 * reach + 1, reach
-        wide = torch.nn.functional.max_pool3d(wide, window, 1, margin)
-    return wide[0] > 0
-
-
-def corners_for(agreement: Sequence[float | None], voxels: int, alike: float) -> tuple[float, float]:
-    """Differences of neighbouring voxels that count in full, of soft and of dense matter.
-
-    ``agreement`` is what `start.agreement.halves_agree` found of `bodies`, ``voxels`` the number of them all, and
-    ``alike`` the `share_alike` of soft matter: what two halves agree on in a homogeneous body is its edges, and streaks
-    of metal.
-    """
-    fine = _ramp(voxels ** (1 / 3), _SMALL, _LARGE)
-    soft, dense = agreement
-    of_soft = 0.0 if soft is None else _ramp(soft, *_OF_SOFT) * (1 - _ramp(alike, *_ONE_MATTER))
-    of_dense = of_soft if dense is None else _ramp(dense, *_OF_DENSE)
-    ratio = _TEXTURED / _SMOOTH
-    return _SMOOTH * ratio ** (fine * of_soft), _SMOOTH * ratio ** (fine * of_dense)
-
-
-def _ramp(value: float, start: float, end: float) -> float:
-    """From 0 to 1."""
-    return min(max((value - start) / (end - start), 0.0), 1.0)
 
 
 def _blurred(start: np.ndarray | torch.Tensor, soft: float, settings: Settings) -> tuple[bool, str]:
