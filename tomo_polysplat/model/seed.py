@@ -15,6 +15,8 @@ import torch
 
 from tomo_polysplat.kernels.spatial_order import spatial_order
 from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.model.seed_edges import edge_shapes
+from tomo_polysplat.model.seed_samples import box_mean, voxel_of
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.settings import Settings
 
@@ -60,9 +62,11 @@ def seed_gaussians(
     # height a lattice of them averages to the wanted value: the cell's integral over the Gaussian's.
     width = settings.seed_width * size
     attenuation = value * cell / (math.sqrt(2 * math.pi) * width) ** dims
-    rotation = points.new_zeros((len(points), 4))
-    rotation[:, 0] = 1.0
-    log_scale = width.log()[:, None].repeat(1, dims)
+    # Metal has seeds fine enough; what is beside it is too uncertain to follow its edge.
+    beside = _reaches(start, points, grid, settings.metal_level, float(grid.voxel_size[:dims].min()))
+    visible, round_ones = start.clamp(0.0, settings.tv_clip), size.masked_fill(beside, 0.0)
+    rotation, thinner = edge_shapes(visible, points, round_ones, grid, settings.seed_edge, dims)
+    log_scale = width.log()[:, None] + thinner
     parts = (points, log_scale, rotation, attenuation, own, shared, rotation.new_tensor([settings.blur]))
     position, log_scale, rotation, attenuation, own, shared, blur = (part.float() for part in parts)
     gaussians = Gaussians(position, log_scale, rotation, attenuation, own, shared, group, blur)
@@ -156,9 +160,9 @@ def _varied(
     # Means over cells of half the step, against noise; from one such cell's middle to the next it is half a step.
     half = np.ones(3, int)
     half[3 - dims :] = np.maximum(np.round(0.5 * step / grid.voxel_size[:dims]).astype(int), 1)[::-1]
-    mean = _box_mean(start.clamp(0.0, settings.tv_clip), half)
+    mean = box_mean(start.clamp(0.0, settings.tv_clip), half)
     reach = [int(n) if size > 1 else 0 for n, size in zip(half, start.shape)]
-    spread = (_largest_around(mean, reach) + _largest_around(-mean, reach))[_voxel_of(points, grid)]
+    spread = (_largest_around(mean, reach) + _largest_around(-mean, reach))[voxel_of(points, grid)]
     chosen = torch.zeros_like(supported)
     chosen[spread.masked_fill(~supported, -1.0).topk(min(most, len(points))).indices] = True
     return chosen & supported
@@ -192,21 +196,12 @@ def _sample(
     """Mean of the start over the cell of each seed, and the largest such mean among it and its neighbours."""
     cells = np.ones(3, int)
     cells[3 - len(cell) :] = np.maximum(np.round(cell / grid.voxel_size[: len(cell)]).astype(int), 1)[::-1]
-    mean, index = _box_mean(start, cells), _voxel_of(points, grid)
+    mean, index = box_mean(start, cells), voxel_of(points, grid)
     around = mean[index]
     for offset in itertools.product((-1, 0, 1), repeat=3):
         beside = tuple((i + d).clamp_(0, n - 1) for i, d, n in zip(index, offset, mean.shape))
         around = torch.maximum(around, mean[beside])
     return mean[index].double(), around
-
-
-def _box_mean(volume: torch.Tensor, cells: np.ndarray) -> torch.Tensor:
-    """Mean over (z, y, x) voxels about each one; the volume's faces go on beyond it."""
-    if cells.max() == 1:
-        return volume
-    margins = [side for n in cells[::-1].tolist() for side in (n // 2, n - 1 - n // 2)]
-    padded = torch.nn.functional.pad(volume[None, None], margins, mode="replicate")
-    return torch.nn.functional.avg_pool3d(padded, cells.tolist(), stride=1)[0, 0]
 
 
 def _split(points: torch.Tensor, step: np.ndarray, times: int) -> torch.Tensor:
@@ -229,7 +224,7 @@ def _reaches(
     for axis, size in enumerate(grid.voxel_size[::-1]):
         # A whole number of voxels must not lose one to rounding.
         near = _grown(near, axis, int(reach / size + 1e-6))
-    return near[_voxel_of(points, grid)]
+    return near[voxel_of(points, grid)]
 
 
 def _grown(mask: torch.Tensor, axis: int, voxels: int) -> torch.Tensor:
@@ -267,12 +262,6 @@ def _materials(
     box, pieces, number = _pieces(_metal(start, settings))
     labels = torch.zeros(start.shape, dtype=torch.int64, device=start.device)
     labels[box] = torch.from_numpy(pieces.astype(np.int64)).to(start.device)
-    piece = labels[_voxel_of(points, grid)]
+    piece = labels[voxel_of(points, grid)]
     group = torch.where(piece > 0, piece, group)
     return own, value.new_tensor([settings.soft_u, *[settings.metal_u] * number]), group
-
-
-def _voxel_of(points: torch.Tensor, grid: VolumeGrid) -> tuple[torch.Tensor, ...]:
-    lower, size = (torch.from_numpy(np.array(v)).to(points.device) for v in (grid.lower, grid.voxel_size))
-    index = ((points - lower) / size).long()
-    return tuple(index[:, 2 - k].clamp(0, grid.shape[k] - 1) for k in range(3))

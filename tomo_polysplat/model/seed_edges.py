@@ -1,0 +1,80 @@
+"""Seeds made thin across the edges of the start, and wider along them.
+
+A round Gaussian cannot show an edge finer than itself, and a fit has few steps to turn and flatten it. The start,
+however noisy, tells which way its edges run.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from tomo_polysplat.model.seed_samples import box_mean, voxel_of
+from tomo_polysplat.scan.geometry import VolumeGrid
+
+__all__ = ["edge_shapes"]
+
+# Voxels along an axis over which the start is averaged, twice, before its slope is taken: against noise.
+_AVERAGED = 3
+# No seed is thinner than this share of a round one: neighbours would no longer overlap (teeth, 96^3 voxels: 54.2 dB
+# everywhere with 0.4, 53.5 with 0.3).
+_THINNEST = 0.4
+
+
+def edge_shapes(
+    start: torch.Tensor, points: torch.Tensor, size: torch.Tensor, grid: VolumeGrid, half: float, dims: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rotations and changes of scale of seeds, by the slope of the start.
+
+    Parameters
+    ----------
+    start : (nz, ny, nx) tensor
+        In soft references, without what should not count as an edge.
+    points : (n, 3) tensor
+        The seeds, in the grid's unit.
+    size : (n,) tensor
+        Distance of a seed from its neighbours; 0 for one that stays round.
+    grid : VolumeGrid
+    half : float
+        Variation of the start over a seed's size, in soft references, that makes it half as thick; 0: all are round.
+    dims : int
+        2 or 3.
+
+    Returns
+    -------
+    rotation : (n, 4) tensor
+        Quaternions (w, x, y, z) that turn the first axis to the slope.
+    log_scale : (n, dims) tensor
+        To be added to the logarithms of the deviations; they sum to 0, so that the mass stays.
+    """
+    rotation, change = points.new_zeros((len(points), 4)), points.new_zeros((len(points), dims))
+    rotation[:, 0] = 1.0
+    if not half:
+        return rotation, change
+    slope = _slope(start, points, grid, dims)
+    steepness = slope.norm(dim=1)
+    direction = slope / steepness.clamp(min=torch.finfo(slope.dtype).tiny)[:, None]
+    # An axis has no sign; with this one the rotation is never a half turn, which would have no axis of its own.
+    direction = torch.where(direction[:, :1] < 0, -direction, direction)
+    rotation[:, 0] = 1 + direction[:, 0]
+    rotation[:, 2], rotation[:, 3] = -direction[:, 2], direction[:, 1]
+    thinner = (half / (half + steepness * size)).clamp(min=_THINNEST).log()
+    change[:, 0] = thinner
+    change[:, 1:] = -thinner[:, None] / (dims - 1)
+    return torch.nn.functional.normalize(rotation, dim=1), change
+
+
+def _slope(start: torch.Tensor, points: torch.Tensor, grid: VolumeGrid, dims: int) -> torch.Tensor:
+    """(n, 3) derivatives along x, y and z of the start, smoothed, at the seeds."""
+    window = np.minimum(_AVERAGED, start.shape)
+    smooth = box_mean(box_mean(start, window), window)
+    index = voxel_of(points, grid)
+    slope = points.new_zeros((len(points), 3))
+    for k in range(dims):
+        axis = 2 - k
+        before, behind = list(index), list(index)
+        before[axis] = (index[axis] - 1).clamp(min=0)
+        behind[axis] = (index[axis] + 1).clamp(max=start.shape[axis] - 1)
+        length = (behind[axis] - before[axis]).clamp(min=1) * float(grid.voxel_size[k])
+        slope[:, k] = (smooth[tuple(behind)] - smooth[tuple(before)]) / length
+    return slope
