@@ -43,7 +43,7 @@ class Settings:
     """Standard deviation of a seed in units of the spacing."""
     seed_edge: float = 0.2
     """Variation of the start over a spacing, in soft references, that makes a seed half as thick across the edge, and
-    wider along it; 0: all seeds are round."""
+    wider along it, where Gaussians are fewer than the detector could tell apart; 0: all seeds are round."""
     support_level: float = 0.1
     """Where the start is below this share of the soft reference in a seed's cell and those around it, there is none."""
     smallest_scale: float = 0.2

@@ -56,6 +56,8 @@ class Plan:
         Distance of the seeds in voxels.
     finer : float
         Share of the Gaussians that is seeded twice as finely as the rest; see ``model.seed``.
+    finest : float
+        Distance of seeds in voxels that the detector could tell apart, or ``spacing`` if that was asked for.
     views_per_step : int
     tv_box : int
         Edge in voxels of the random box whose total variation a step takes.
@@ -73,6 +75,7 @@ class Plan:
     reference: float
     spacing: float
     finer: float
+    finest: float
     views_per_step: int
     tv_box: int
     tv_corners: tuple[float, float]
@@ -96,7 +99,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     reference, level = soft_reference(start, problem)
     why = _why_reference(reference, level, problem.polychromatic)
     support = int((start > settings.support_level * reference * problem.depth).sum())
-    spacing, finer, because = _seed_spacing(support, problem, settings, device)
+    (spacing, finer, finest), because = _seed_spacing(support, problem, settings, device)
     most = _MOST_VIEWS_PLANAR if problem.planar else _MOST_VIEWS[device]
     views, reason = _views_per_step(problem.geometry.views, settings, most)
     box = settings.tv_box or (_TV_BOX_PLANAR if problem.planar else _TV_BOX[device])
@@ -105,7 +108,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     blurred, told = _blurred(start, soft, settings)
     relative = torch.as_tensor(start) / soft if soft else torch.as_tensor(start)
     corners, texture = tv_corners(relative, settings, problem.agreement)
-    plan = Plan(reference, spacing, finer, views, box, corners, curves, blurred)
+    plan = Plan(reference, spacing, finer, finest, views, box, corners, curves, blurred)
     unit = "g/cm3" if problem.polychromatic else "per unit of length"
     plan.reasons = {
         "model": "polychromatic: a spectrum was given"
@@ -187,20 +190,24 @@ def _blurred(start: np.ndarray | torch.Tensor, soft: float, settings: Settings) 
 
 def _seed_spacing(
     support: int, problem: Problem, settings: Settings, device: str
-) -> tuple[float, float, str]:
-    """Distance of the seeds in voxels (the shortest edge), for a support of as many voxels, and the finer share."""
+) -> tuple[tuple[float, float, float], str]:
+    """Distance of the seeds in voxels (the shortest edge), the finer share and the finest distance, and why.
+
+    ``support`` is the number of voxels with matter.
+    """
     if settings.seed_spacing:
-        return settings.seed_spacing, 0.0, "asked for"
+        return (settings.seed_spacing, 0.0, settings.seed_spacing), "asked for"
     dims = 2 if problem.planar else 3
     most = settings.max_gaussians or _MOST_GAUSSIANS[device]
     finest, because = _finest_spacing(problem)
     cells = support * float(np.prod(problem.grid.voxel_size[:dims] / problem.voxel))
     crowded = (cells / most) ** (1 / dims)
     if crowded <= finest:
-        return finest, 0.0, because
+        return (finest, 0.0, finest), because
     because = f"at most {most} Gaussians over {support} voxels of support"
     finer = settings.finer_seeds
-    return crowded, finer, f"{because}, {finer:.0%} of them closer where the start varies"
+    because += f", {finer:.0%} of them closer where the start varies"
+    return (crowded, finer, finest), because + (", thin across its edges" if settings.seed_edge else "")
 
 
 def _finest_spacing(problem: Problem) -> tuple[float, str]:

@@ -252,10 +252,10 @@ class Problem:
     ) -> Gaussians:
         """Gaussians to start from."""
         relative = start / (self.depth * plan.reference)
-        spacing = plan.spacing * self.voxel
+        spacing, finest = plan.spacing * self.voxel, plan.finest * self.voxel
         several = plan.curves > 1
         gaussians = seed_gaussians(
-            relative, self.grid, spacing, settings, several, self.planar, device, plan.finer
+            relative, self.grid, spacing, settings, several, self.planar, device, plan.finer, finest
         )
         free = int((gaussians.group < 0).sum())
         plan.reasons["gaussians"] = f"{len(gaussians)}" + (

@@ -35,6 +35,7 @@ def seed_gaussians(
     planar: bool,
     device: torch.device,
     finer: float = 0.0,
+    finest: float = math.inf,
 ) -> Gaussians:
     """Seed the support of a start volume.
 
@@ -51,6 +52,9 @@ def seed_gaussians(
     finer : float
         Share of the Gaussians, below 1, that lie where the start varies most, on a grid twice as fine as the
         rest; as many as a grid of one ``spacing`` would have in all.
+    finest : float
+        Distance of seeds as close as the detector could tell apart; those that are farther apart are made as thin as
+        that across edges of the start (``seed_edges``). Infinite: all are round.
     """
     dims = 2 if planar else 3
     values = start if isinstance(start, torch.Tensor) else torch.tensor(start)
@@ -65,7 +69,7 @@ def seed_gaussians(
     # Metal has seeds fine enough; what is beside it is too uncertain to follow its edge.
     beside = _reaches(start, points, grid, settings.metal_level, float(grid.voxel_size[:dims].min()))
     visible, round_ones = start.clamp(0.0, settings.tv_clip), size.masked_fill(beside, 0.0)
-    rotation, thinner = edge_shapes(visible, points, round_ones, grid, settings.seed_edge, dims)
+    rotation, thinner = edge_shapes(visible, points, round_ones, grid, settings.seed_edge, finest, dims)
     log_scale = width.log()[:, None] + thinner
     parts = (points, log_scale, rotation, attenuation, own, shared, rotation.new_tensor([settings.blur]))
     position, log_scale, rotation, attenuation, own, shared, blur = (part.float() for part in parts)

@@ -1,7 +1,7 @@
 """Seeds made thin across the edges of the start, and wider along them.
 
-A round Gaussian cannot show an edge finer than itself, and a fit has few steps to turn and flatten it. The start,
-however noisy, tells which way its edges run.
+Where Gaussians are fewer than the detector could tell apart, a round one cannot show the edges there are, and a fit has
+few steps to turn and flatten it. The start, however noisy, tells which way its edges run.
 """
 
 from __future__ import annotations
@@ -22,7 +22,13 @@ _THINNEST = 0.4
 
 
 def edge_shapes(
-    start: torch.Tensor, points: torch.Tensor, size: torch.Tensor, grid: VolumeGrid, half: float, dims: int
+    start: torch.Tensor,
+    points: torch.Tensor,
+    size: torch.Tensor,
+    grid: VolumeGrid,
+    half: float,
+    finest: float,
+    dims: int,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Rotations and changes of scale of seeds, by the slope of the start.
 
@@ -33,10 +39,13 @@ def edge_shapes(
     points : (n, 3) tensor
         The seeds, in the grid's unit.
     size : (n,) tensor
-        Distance of a seed from its neighbours; 0 for one that stays round.
+        Distance of a seed from its neighbours, in the grid's unit; 0 for one that stays round.
     grid : VolumeGrid
     half : float
         Variation of the start over a seed's size, in soft references, that makes it half as thick; 0: all are round.
+    finest : float
+        Distance, in the grid's unit, of seeds as close as the detector could tell apart. No seed gets thinner than
+        those would be: the scan may be no sharper (fan-beam slices whose edges are blurred lose 1.7 dB otherwise).
     dims : int
         2 or 3.
 
@@ -58,7 +67,8 @@ def edge_shapes(
     direction = torch.where(direction[:, :1] < 0, -direction, direction)
     rotation[:, 0] = 1 + direction[:, 0]
     rotation[:, 2], rotation[:, 3] = -direction[:, 2], direction[:, 1]
-    thinner = (half / (half + steepness * size)).clamp(min=_THINNEST).log()
+    thinnest = (finest / size.clamp(min=finest)).clamp(min=_THINNEST)
+    thinner = torch.maximum(half / (half + steepness * size), thinnest).log()
     change[:, 0] = thinner
     change[:, 1:] = -thinner[:, None] / (dims - 1)
     return torch.nn.functional.normalize(rotation, dim=1), change
