@@ -10,7 +10,7 @@ from tomo_polysplat.settings import Settings
 
 def test_what_two_halves_agree_on_is_smoothed_less():
     """Soft and dense matter apart; not in small volumes, in homogeneous matter, nor where nothing can be told."""
-    large, small = 200**3, 30**3
+    large, small = (40, 400, 500), (30, 30, 30)
     smooth = pytest.approx((0.1, 0.1))
     assert corners_for([None, None], large, 0.0) == corners_for([-0.4, -0.2], large, 0.0) == smooth
     assert corners_for([0.9, 0.9], small, 0.0) == corners_for([0.9, None], large, 0.8) == smooth
@@ -18,8 +18,22 @@ def test_what_two_halves_agree_on_is_smoothed_less():
     assert dense < 0.02 < soft == pytest.approx(0.1)
     alone = corners_for([0.15, None], large, 0.0)
     assert alone[0] == alone[1] and 0.02 < alone[0] < 0.1
-    assert alone[0] < corners_for([0.15, None], 50**3, 0.0)[0] < 0.1
+    assert alone[0] < corners_for([0.15, None], (50, 50, 50), 0.0)[0] < 0.1
     assert alone[0] < corners_for([0.15, None], large, 0.7)[0] < 0.1
+
+
+def test_thick_volumes_of_several_matters_are_smoothed_less_whatever_the_halves_say():
+    thin, thick = (40, 400, 500), (200, 201, 203)
+    noisy = corners_for([-0.1, 0.0], thick, 0.0)
+    assert noisy[0] == pytest.approx(0.03, rel=0.05) and noisy[1] == pytest.approx(0.1)
+    assert noisy[0] < corners_for([-0.1, 0.0], (96, 201, 203), 0.0)[0] < 0.1
+    assert (
+        corners_for([-0.1, 0.0], thin, 0.0)[0]
+        == corners_for([-0.1, 0.0], thick, 0.8)[0]
+        == pytest.approx(0.1)
+    )
+    assert corners_for([0.9, 0.0], thick, 0.0)[0] == pytest.approx(0.015), "texture is texture still"
+    assert corners_for([None, None], thick, 0.0)[0] == pytest.approx(0.1), "nothing is told"
 
 
 @pytest.mark.parametrize("shape", [(1, 61, 67), (15, 21, 23)])

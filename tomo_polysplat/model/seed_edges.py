@@ -58,7 +58,7 @@ def edge_shapes(
     """
     rotation, change = points.new_zeros((len(points), 4)), points.new_zeros((len(points), dims))
     rotation[:, 0] = 1.0
-    if not half:
+    if not (half and bool((size > finest).any())):
         return rotation, change
     slope = _slope(start, points, grid, dims)
     steepness = slope.norm(dim=1)
@@ -67,7 +67,7 @@ def edge_shapes(
     direction = torch.where(direction[:, :1] < 0, -direction, direction)
     rotation[:, 0] = 1 + direction[:, 0]
     rotation[:, 2], rotation[:, 3] = -direction[:, 2], direction[:, 1]
-    thinnest = (finest / size.clamp(min=finest)).clamp(min=_THINNEST)
+    thinnest = (finest / size).clamp(_THINNEST, 1.0)
     thinner = torch.maximum(half / (half + steepness * size), thinnest).log()
     change[:, 0] = thinner
     change[:, 1:] = -thinner[:, None] / (dims - 1)
