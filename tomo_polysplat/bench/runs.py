@@ -22,8 +22,9 @@ Record = dict[str, Any]
 Progress = Callable[[str], Any]
 Errors = Callable[[Any, Scan], dict[str, Any]]
 
-# A warm-up uses few views of a scan of full size, so that all that depends on a size gets compiled.
-_WARM_UP_VIEWS, _WARM_UP_BUDGET = 45, 1.0
+# A warm-up uses few views of a scan of full size, so that all that depends on a size gets compiled; but enough for
+# their halves to be compared (`start.agreement`), which loads code as well.
+_WARM_UP_VIEWS, _WARM_UP_BUDGET = 90, 1.0
 # A run that ended by itself before this share of its budget would not use a larger one.
 _USED_UP = 0.9
 # Bytes a voxel that finding the errors of one volume takes.
