@@ -17,7 +17,7 @@ SMALL = {
     "03_astra_cone_geometry": {"SIZE, VIEWS, QUALITY = 40, 120": "SIZE, VIEWS, QUALITY = 20, 48"},
     "04_spectrum_and_materials": {"SIZE, VIEWS, QUALITY = 40, 120": "SIZE, VIEWS, QUALITY = 32, 60"},
     "05_speed_against_error": {
-        "SIZE, VIEWS, BUDGETS = 40, 120, (3.0, 10.0)": "SIZE, VIEWS, BUDGETS = 20, 40, (0.5, 1.0)"
+        "SIZE, VIEWS, BUDGETS = 40, 120, (3.0, 10.0)": "SIZE, VIEWS, BUDGETS = 20, 40, (1.0, 2.0)"
     },
 }
 
