@@ -8,6 +8,7 @@ import torch
 
 from tomo_polysplat.model.seed_edges import edge_shapes
 from tomo_polysplat.scan.geometry import VolumeGrid
+from tomo_polysplat.settings import Settings
 
 HALF, FINEST = 0.2, 0.13
 
@@ -31,7 +32,8 @@ def first_axis(rotation):
 def shapes(case, size, finest=FINEST, half=HALF):
     grid, points, height = case
     dims = 2 if grid.planar else 3
-    return edge_shapes(height, points, torch.full((len(points),), size).double(), grid, half, finest, dims)
+    sizes = torch.full((len(points),), size).double()
+    return edge_shapes(height, points, sizes, grid, Settings(seed_edge=half), finest, dims)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 
+from tomo_polysplat.model.seed_samples import grown
 from tomo_polysplat.settings import Settings
 
 __all__ = ["bodies", "corners_for", "share_alike", "tv_corners"]
@@ -96,12 +97,9 @@ def bodies(relative: torch.Tensor, settings: Settings) -> list[torch.Tensor]:
 
 def _widened(mask: torch.Tensor, reach: int) -> torch.Tensor:
     """The voxels of a mask and those up to ``reach`` from them along every axis."""
-    wide = mask.to(torch.float32)[None]
-    for axis in range(3):
-        window, margin = [1, 1, 1], [0, 0, 0]
-        window[axis], margin[axis] = 2 * reach + 1, reach
-        wide = torch.nn.functional.max_pool3d(wide, window, 1, margin)
-    return wide[0] > 0
+    for axis in range(mask.ndim):
+        mask = grown(mask, axis, reach)
+    return mask
 
 
 def corners_for(agreement: Sequence[float | None], shape: Sequence[int], alike: float) -> tuple[float, float]:

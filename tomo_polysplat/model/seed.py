@@ -16,7 +16,7 @@ import torch
 from tomo_polysplat.kernels.spatial_order import spatial_order
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.model.seed_edges import edge_shapes
-from tomo_polysplat.model.seed_samples import box_mean, voxel_of
+from tomo_polysplat.model.seed_samples import box_mean, reaches, voxel_of
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.settings import Settings
 
@@ -66,10 +66,7 @@ def seed_gaussians(
     # height a lattice of them averages to the wanted value: the cell's integral over the Gaussian's.
     width = settings.seed_width * size
     attenuation = value * cell / (math.sqrt(2 * math.pi) * width) ** dims
-    # Metal has seeds fine enough; what is beside it is too uncertain to follow its edge.
-    beside = _reaches(start, points, grid, settings.metal_level, float(grid.voxel_size[:dims].min()))
-    visible, round_ones = start.clamp(0.0, settings.tv_clip), size.masked_fill(beside, 0.0)
-    rotation, thinner = edge_shapes(visible, points, round_ones, grid, settings.seed_edge, finest, dims)
+    rotation, thinner = edge_shapes(start, points, size, grid, settings, finest, dims)
     log_scale = width.log()[:, None] + thinner
     parts = (points, log_scale, rotation, attenuation, own, shared, rotation.new_tensor([settings.blur]))
     position, log_scale, rotation, attenuation, own, shared, blur = (part.float() for part in parts)
@@ -131,7 +128,7 @@ def _lattices(
     """Points (n, 3) on the support; spacing, volume of the cell and the start's mean over it, (n,) each."""
     spacing = spacing / (1 - finer) ** (1 / dims)
     coarse, step = _lattice(grid, spacing, dims, start.device)
-    metal = _reaches(start, coarse, grid, settings.metal_level, spacing)
+    metal = reaches(start, coarse, grid, settings.metal_level, spacing)
     parted = {1: ~metal, 2: metal}
     if finer:
         varied = _varied(start, coarse, grid, step, settings, finer) & ~metal
@@ -218,31 +215,6 @@ def _split(points: torch.Tensor, step: np.ndarray, times: int) -> torch.Tensor:
     return (points[:, None] + torch.from_numpy(offsets).to(points.device)).reshape(-1, 3)
 
 
-def _reaches(
-    start: torch.Tensor, points: torch.Tensor, grid: VolumeGrid, level: float, reach: float
-) -> torch.Tensor:
-    """Points within a distance, along every axis, of a voxel above a level."""
-    near = start > level
-    if not bool(near.any()):
-        return torch.zeros(len(points), dtype=torch.bool, device=points.device)
-    for axis, size in enumerate(grid.voxel_size[::-1]):
-        # A whole number of voxels must not lose one to rounding.
-        near = _grown(near, axis, int(reach / size + 1e-6))
-    return near[voxel_of(points, grid)]
-
-
-def _grown(mask: torch.Tensor, axis: int, voxels: int) -> torch.Tensor:
-    """What is true, and as many voxels before and behind it; every step nearly trebles the width."""
-    length, half = mask.shape[axis], 0
-    while half < min(voxels, length - 1):
-        step = min(2 * half + 1, voxels - half, length - 1)
-        wider = mask.clone()
-        wider.narrow(axis, step, length - step).logical_or_(mask.narrow(axis, 0, length - step))
-        wider.narrow(axis, 0, length - step).logical_or_(mask.narrow(axis, step, length - step))
-        mask, half = wider, half + step
-    return mask
-
-
 def _materials(
     start: torch.Tensor,
     points: torch.Tensor,
@@ -261,7 +233,7 @@ def _materials(
     own = torch.full_like(value, settings.soft_u)
     if not polychromatic:
         return own, value.new_tensor([settings.soft_u]), group
-    group[_reaches(start, points, grid, settings.bone_level, reach)] = -1
+    group[reaches(start, points, grid, settings.bone_level, reach)] = -1
     own[value > settings.bone_level] = settings.bone_u
     box, pieces, number = _pieces(_metal(start, settings))
     labels = torch.zeros(start.shape, dtype=torch.int64, device=start.device)

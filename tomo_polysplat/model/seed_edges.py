@@ -9,8 +9,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from tomo_polysplat.model.seed_samples import box_mean, voxel_of
+from tomo_polysplat.model.seed_samples import box_mean, reaches, voxel_of
 from tomo_polysplat.scan.geometry import VolumeGrid
+from tomo_polysplat.settings import Settings
 
 __all__ = ["edge_shapes"]
 
@@ -26,7 +27,7 @@ def edge_shapes(
     points: torch.Tensor,
     size: torch.Tensor,
     grid: VolumeGrid,
-    half: float,
+    settings: Settings,
     finest: float,
     dims: int,
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -35,14 +36,14 @@ def edge_shapes(
     Parameters
     ----------
     start : (nz, ny, nx) tensor
-        In soft references, without what should not count as an edge.
+        In soft references; what is above ``tv_clip`` counts as that.
     points : (n, 3) tensor
         The seeds, in the grid's unit.
     size : (n,) tensor
-        Distance of a seed from its neighbours, in the grid's unit; 0 for one that stays round.
+        Distance of a seed from its neighbours, in the grid's unit.
     grid : VolumeGrid
-    half : float
-        Variation of the start over a seed's size, in soft references, that makes it half as thick; 0: all are round.
+    settings : Settings
+        ``seed_edge`` is the variation of the start over a seed's size that makes it half as thick; 0: all are round.
     finest : float
         Distance, in the grid's unit, of seeds as close as the detector could tell apart. No seed gets thinner than
         those would be: the scan may be no sharper (fan-beam slices whose edges are blurred lose 1.7 dB otherwise).
@@ -58,9 +59,13 @@ def edge_shapes(
     """
     rotation, change = points.new_zeros((len(points), 4)), points.new_zeros((len(points), dims))
     rotation[:, 0] = 1.0
+    half = settings.seed_edge
     if not (half and bool((size > finest).any())):
         return rotation, change
-    slope = _slope(start, points, grid, dims)
+    # Metal has seeds fine enough; what is beside it is too uncertain to follow its edge.
+    beside = reaches(start, points, grid, settings.metal_level, float(grid.voxel_size[:dims].min()))
+    size = size.masked_fill(beside, 0.0)
+    slope = _slope(start.clamp(0.0, settings.tv_clip), points, grid, dims)
     steepness = slope.norm(dim=1)
     direction = slope / steepness.clamp(min=torch.finfo(slope.dtype).tiny)[:, None]
     # An axis has no sign; with this one the rotation is never a half turn, which would have no axis of its own.

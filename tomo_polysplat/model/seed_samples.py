@@ -7,7 +7,7 @@ import torch
 
 from tomo_polysplat.scan.geometry import VolumeGrid
 
-__all__ = ["box_mean", "voxel_of"]
+__all__ = ["box_mean", "grown", "reaches", "voxel_of"]
 
 
 def box_mean(volume: torch.Tensor, cells: np.ndarray) -> torch.Tensor:
@@ -24,3 +24,28 @@ def voxel_of(points: torch.Tensor, grid: VolumeGrid) -> tuple[torch.Tensor, ...]
     lower, size = (torch.from_numpy(np.array(v)).to(points.device) for v in (grid.lower, grid.voxel_size))
     index = ((points - lower) / size).long()
     return tuple(index[:, 2 - k].clamp(0, grid.shape[k] - 1) for k in range(3))
+
+
+def reaches(
+    start: torch.Tensor, points: torch.Tensor, grid: VolumeGrid, level: float, reach: float
+) -> torch.Tensor:
+    """Points within a distance, along every axis, of a voxel above a level."""
+    near = start > level
+    if not bool(near.any()):
+        return torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    for axis, size in enumerate(grid.voxel_size[::-1]):
+        # A whole number of voxels must not lose one to rounding.
+        near = grown(near, axis, int(reach / size + 1e-6))
+    return near[voxel_of(points, grid)]
+
+
+def grown(mask: torch.Tensor, axis: int, voxels: int) -> torch.Tensor:
+    """What is true, and as many voxels before and behind it; every step nearly trebles the width."""
+    length, half = mask.shape[axis], 0
+    while half < min(voxels, length - 1):
+        step = min(2 * half + 1, voxels - half, length - 1)
+        wider = mask.clone()
+        wider.narrow(axis, step, length - step).logical_or_(mask.narrow(axis, 0, length - step))
+        wider.narrow(axis, 0, length - step).logical_or_(mask.narrow(axis, step, length - step))
+        mask, half = wider, half + step
+    return mask
