@@ -190,7 +190,7 @@ class FusedStep:
             pixels = blurred_misfit_gradient(seen, self.gaussians.blur, self._grad_blur)
         else:
             pixels = misfit_gradient(seen)
-        moments = rays_backward.sum_moments(record, pixels, channels, views, cutoff)
+        moments = rays_backward.sum_moments(record, pixels, channels, views)
         return rays_pull_back(*drawn, table, views, record, moments)
 
     def _join(self) -> None:

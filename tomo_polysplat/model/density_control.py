@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from tomo_polysplat.model.gaussians import OF_ALL, Gaussians
+from tomo_polysplat.model.gaussians import Gaussians
 
 __all__ = ["relocate"]
 
@@ -46,10 +46,8 @@ def relocate(gaussians: Gaussians, pull: torch.Tensor, share: float) -> torch.Te
     half = 0.5 * gaussians.log_scale[source, axis].exp()[:, None] * _axis(gaussians.rotation[source], axis)
     gaussians.log_scale[source, axis] += math.log(0.7)
     gaussians.attenuation[source] *= 0.5 / 0.7
-    for name, tensor in gaussians.parameters().items():
-        if name not in OF_ALL:
-            tensor[target] = tensor[source]
-    gaussians.group[target] = gaussians.group[source]
+    for tensor in gaussians.each().values():
+        tensor[target] = tensor[source]
     gaussians.position[source] -= half
     gaussians.position[target] += half
     return torch.cat([source, target])

@@ -73,10 +73,12 @@ class Gaussians:
 
     def select(self, chosen: torch.Tensor) -> Gaussians:
         """The Gaussians of these (m,) int64 indices, still attached to the graph."""
-        whole = {name: getattr(self, name) for name in OF_ALL}
-        names = [field.name for field in fields(self) if field.name not in whole]
-        own = {name: getattr(self, name).index_select(0, chosen) for name in names}
-        return Gaussians(**own, **whole)
+        own = {name: tensor.index_select(0, chosen) for name, tensor in self.each().items()}
+        return Gaussians(**own, **{name: getattr(self, name) for name in OF_ALL})
+
+    def each(self) -> dict[str, torch.Tensor]:
+        """What every Gaussian has of its own, by name."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in OF_ALL}
 
     @property
     def planar(self) -> bool:

@@ -10,7 +10,7 @@ import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.kernels.project.triton_image import spread
-from tomo_polysplat.kernels.project.triton_setup import RECORD
+from tomo_polysplat.kernels.project.triton_setup import RECORD, SLACK
 from tomo_polysplat.kernels.triton_lanes import SUMS, half_sums, load_four
 from tomo_polysplat.kernels.triton_maths import HALF_LOG2E, SIZES, on_device
 from tomo_polysplat.kernels.views import DetectorViews
@@ -22,26 +22,28 @@ _PLANAR_BLOCK = (1, 16)
 _RUN = 4  # times two neighbours handled by one warp: more programs cost more to start than to run
 _TINY = tl.constexpr(1e-20)
 _TWO_LN2 = tl.constexpr(1 / HALF_LOG2E)
-_NOWHERE = tl.constexpr(1e30)
 
 
 @triton.jit
-def _row_ends(i, first, high, yc, by_ry, xc, m, hx, columns, BLOCK_H: tl.constexpr):
-    """Where the rows ``i`` of the outlines begin, and how many columns the widest of them has."""
+def _row_ends(i, first, high, yc, ry, xc, m, hx, columns, BLOCK_H: tl.constexpr):
+    """First column of the rows ``i`` of the outlines, where they end, and how many columns the widest has."""
+    by_ry = 1.0 / ry
     offset = i.to(tl.float32) - yc
     u = offset * by_ry
-    start = xc + m * offset - hx * tl.sqrt(tl.maximum(1.0 - u * u, 0.0))
-    start = tl.math.ceil(tl.minimum(tl.maximum(start, 0.0), columns + 0.0))
+    half = hx * tl.sqrt(tl.maximum(1.0 - u * u, 0.0))
+    middle = xc + m * offset
+    start = tl.math.ceil(tl.minimum(tl.maximum(middle - half, 0.0), columns + 0.0))
+    stop = tl.where(i <= high, tl.minimum(middle + half, columns - 0.5), -1.0)
     # The row nearest to the middle is the widest.
     top = first.to(tl.float32)
     u = (tl.minimum(tl.maximum(yc, top), top + (BLOCK_H - 1)) - yc) * by_ry
     wide = tl.minimum(2 * hx * tl.sqrt(tl.maximum(1.0 - u * u, 0.0)), columns - 1.0)
-    return start, tl.max(tl.where(first <= high, wide, 0.0).to(tl.int32), 0) + 1
+    return start, stop, tl.max(tl.where(first <= high, wide, 0.0).to(tl.int32), 0) + 1
 
 
 @triton.jit(do_not_specialize=SIZES)
 def _moments_kernel(
-    record, grad, moments, count, rows, columns, cut,
+    record, grad, moments, count, rows, columns,
     CHANNELS: tl.constexpr, CONE: tl.constexpr, BLOCK_H: tl.constexpr, BLOCK_W: tl.constexpr,
     RUN: tl.constexpr, SPREAD: tl.constexpr,
 ):  # fmt: skip
@@ -59,27 +61,29 @@ def _moments_kernel(
         if CONE:
             lxx, lxy, lyy, _ = load_four(at + 12)
         w0, w1, w2, w3 = load_four(at + 16)
-        ht, hu, htt, htu, huu = zero, zero, zero, zero, zero
-        s, st, su, stt, stu, suu = zero, zero, zero, zero, zero, zero
+        h_sum, ht, hu, htt, htu, huu = zero, zero, zero, zero, zero, zero
+        k, kt, ku, ktt, ktu, kuu = zero, zero, zero, zero, zero, zero
         c0, c1, c2, c3 = zero, zero, zero, zero
-        by_ry, end = 1.0 / ry, columns - 0.5 - column0
+        # The outlines' slack is for finding tiles; a pixel counts here where it counts in the image.
+        hx -= SLACK
         # A Gaussian off the detector has no rows, from a pixel that exists all the same.
         low = tl.math.ceil(tl.minimum(tl.maximum(yc - ry, 0.0), rows - 1.0)).to(tl.int32)
         high = tl.math.floor(tl.minimum(tl.maximum(yc + ry, -1.0), rows - 1.0)).to(tl.int32)
         high = tl.where(ry > 0, high, -1)
+        ry = tl.maximum(ry - SLACK, _TINY)
         for first in range(0, tl.max(high - low, 0) + 1, BLOCK_H):
             i = low + first + down
-            start, width = _row_ends(i, low + first, high, yc, by_ry, xc, m, hx, columns, BLOCK_H)
+            start, stop, width = _row_ends(i, low + first, high, yc, ry, xc, m, hx, columns, BLOCK_H)
             y = i.to(tl.float32) - row0
             u = r22 * y
-            # Lanes past the last row read its pixels, far outside their Gaussian; those past the last
-            # column read the zeros or finite numbers that follow and are cut off below.
-            uu = tl.where(i <= high, u * u, _NOWHERE)
+            uu = u * u
+            # Lanes past their row's end read the pixels that follow, zeros or finite numbers.
+            stop -= column0
             line = (view * rows + tl.minimum(i, rows - 1)) * columns + start.to(tl.int32)
             pixel = grad + (line + across) * SPREAD
             x = (start - column0) + across.to(tl.float32)
             l0, l1, shift = 1.0 + y * (ly + lyy * y), lx + lxy * y, r12 * y
-            h0, h1, s0, s1 = zero, zero, zero, zero
+            h0, h1, k0, k1 = zero, zero, zero, zero
             for _walked in range(0, width, BLOCK_W):
                 if CHANNELS == 1:
                     g0 = tl.load(pixel)
@@ -87,15 +91,15 @@ def _moments_kernel(
                     g0, g1, g2, g3 = load_four(pixel)
                 t = r11 * x + shift
                 q = t * t + uu
-                # Far from a needle's footprint rounding can make l negative; its root would spoil the sums.
+                inside = x <= stop
                 if CONE:
-                    root = tl.math.rsqrt(tl.maximum(l0 + x * (l1 + lxx * x), _TINY))
+                    # Far from a needle's footprint rounding can make l negative: no root is used there.
+                    root = tl.where(inside, tl.math.rsqrt(tl.abs(l0 + x * (l1 + lxx * x))), 0.0)
                     inverse = root * root
                     q *= inverse
                     value = tl.exp2(-1.0 * q) * root
                 else:
-                    value = tl.exp2(-1.0 * q)
-                value = tl.where((q <= cut) & (x < end), value, 0.0)
+                    value = tl.where(inside, tl.exp2(-1.0 * q), 0.0)
                 h = w0 * g0
                 c0 += g0 * value
                 if CHANNELS > 1:
@@ -114,24 +118,28 @@ def _moments_kernel(
                 h0 += h
                 h1 += along
                 htt += along * t
-                rest = h - h * (q * _TWO_LN2)
-                s0 += rest
+                by_q = h * q
+                k0 += by_q
                 if CONE:
-                    along = rest * t
-                    s1 += along
-                    stt += along * t
+                    along = by_q * t
+                    k1 += along
+                    ktt += along * t
                 x += BLOCK_W
                 pixel += BLOCK_W * SPREAD
             ht += h1
             hu += h0 * u
             htu += h1 * u
             huu += h0 * (u * u)
-            s += s0
+            h_sum += h0
+            k += k0
             if CONE:
-                st += s1
-                su += s0 * u
-                stu += s1 * u
-                suu += s0 * (u * u)
+                kt += k1
+                ku += k0 * u
+                ktu += k1 * u
+                kuu += k0 * (u * u)
+        s = h_sum - _TWO_LN2 * k
+        st, su = ht - _TWO_LN2 * kt, hu - _TWO_LN2 * ku
+        stt, stu, suu = htt - _TWO_LN2 * ktt, htu - _TWO_LN2 * ktu, huu - _TWO_LN2 * kuu
         total = half_sums(lane, ht, hu, htt, htu, huu, s, st, su, stt, stu, suu, c0, c1, c2, c3, zero)
         tl.store(moments + (view * count + n) * SUMS + lane % 16, total, mask=n < count)
 
@@ -141,9 +149,7 @@ def beyond(views: DetectorViews) -> int:
     return 2 * views.columns + 32
 
 
-def sum_moments(
-    record, pixels: torch.Tensor, channels: int, views: DetectorViews, cutoff: float
-) -> torch.Tensor:
+def sum_moments(record, pixels: torch.Tensor, channels: int, views: DetectorViews) -> torch.Tensor:
     """(views, count, 16) sums over each footprint, with t = r11 x + r12 y and u = r22 y of the record.
 
     First of h (t, u, t^2, tu, u^2), from 5 of s (1, t, u, t^2, tu, u^2), from 11 of f dL/df by channel, where
@@ -155,8 +161,7 @@ def sum_moments(
     block = _PLANAR_BLOCK if views.rows == 1 else BLOCK
     with on_device(record):
         _moments_kernel[(triton.cdiv(count, 2 * _RUN), many)](
-            record, pixels, moments, count, views.rows, views.columns, cutoff * cutoff * HALF_LOG2E,
-            CHANNELS=channels, CONE=views.cone, BLOCK_H=block[0], BLOCK_W=block[1], RUN=_RUN, SPREAD=spread(channels),
-            num_warps=1, num_stages=1,
+            record, pixels, moments, count, views.rows, views.columns, CHANNELS=channels, CONE=views.cone,
+            BLOCK_H=block[0], BLOCK_W=block[1], RUN=_RUN, SPREAD=spread(channels), num_warps=1, num_stages=1,
         )  # fmt: skip
     return moments

@@ -56,7 +56,7 @@ class _Project(torch.autograd.Function):
         record = footprints(position, scale, rotation, weight, views, table, cutoff, skipped)
         image = finish_image(splat(record, len(weight), views, cutoff), table, len(weight), views)
         ctx.save_for_backward(position, scale, rotation, weight, table, record)
-        ctx.views, ctx.cutoff = views, cutoff
+        ctx.views = views
         ctx.mark_non_differentiable(skipped)
         return image, skipped
 
@@ -66,6 +66,6 @@ class _Project(torch.autograd.Function):
         if not (record.numel() and grad_image.numel()):
             return (*map(torch.zeros_like, (position, scale, rotation, weight)), None, None)
         pixels = lay_out_gradient(grad_image, table, ctx.views, beyond(ctx.views))
-        moments = sum_moments(record, pixels, len(grad_image), ctx.views, ctx.cutoff)
+        moments = sum_moments(record, pixels, len(grad_image), ctx.views)
         grads = pull_back(position, scale, rotation, weight, table, ctx.views, record, moments)
         return (*grads, None, None)

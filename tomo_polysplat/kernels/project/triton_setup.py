@@ -23,12 +23,12 @@ from tomo_polysplat.kernels.triton_lanes import store_four
 from tomo_polysplat.kernels.triton_maths import HALF_LOG2E, SIZES, cross, dot, on_device, rotation_matrix
 from tomo_polysplat.kernels.views import DetectorViews
 
-__all__ = ["RECORD", "ROOT", "VIEW", "chain", "footprints", "whitening"]
+__all__ = ["RECORD", "ROOT", "SLACK", "VIEW", "chain", "footprints", "whitening"]
 
 RECORD = tl.constexpr(20)
 VIEW = tl.constexpr(21)  # origin, inverse and matrix of a view, row by row
 ROOT = tl.constexpr(HALF_LOG2E**0.5)
-_SLACK = tl.constexpr(0.01)  # of a pixel, on the outline: rounding must not cut what q still includes
+SLACK = tl.constexpr(0.01)  # of a pixel, on the outline: rounding must not cut what q still includes
 _BLOCK = 128
 
 
@@ -172,7 +172,7 @@ def _footprint_kernel(
         row = zero
     cut = cutoff * cutoff
     yc, ry, xc, m, hx, outlined = _outline(cut, r11, r12, r22, 1.0, lx, ly, lxx, lxy, lyy, PLANAR)
-    yc, ry, xc, hx = yc + row, ry + _SLACK, xc + column, hx + _SLACK
+    yc, ry, xc, hx = yc + row, ry + SLACK, xc + column, hx + SLACK
     reach = tl.sqrt(m * m * ry * ry + hx * hx)
     valid &= (
         outlined & (yc + ry >= 0) & (yc - ry <= rows - 1) & (xc + reach >= 0) & (xc - reach <= columns - 1)
