@@ -138,6 +138,29 @@ def test_seeds_are_uneven_only_where_they_are_too_few():
     assert plan(of, start, max_gaussians=500, finer_seeds=0.0).finer == 0.0
 
 
+def most_gaussians(of, start, **settings):
+    told = plan(of, start, "cuda", **settings).reasons["seed_spacing_voxels"]
+    return int(told.split("at most ")[1].split()[0])
+
+
+def test_a_gpu_seeds_by_the_surfaces_there_are():
+    """Those of a ball grow by the square of its size; noise has none, and small volumes are seeded as ever."""
+    small, large = problem(81), problem(121)
+    few, many = (most_gaussians(of, ball(of, 1.0)) for of in (small, large))
+    assert few == 60_000 < many
+    half = 0.9**0.5 * 60  # radius in voxels
+    noise = np.random.default_rng(0).normal(0, 0.4 * large.depth, large.grid.shape).astype(np.float32)
+    noisy = ball(large, 1.0)
+    noisy[noisy > 0] += noise[noisy > 0]
+    assert most_gaussians(large, noisy) == pytest.approx(many, rel=0.1)
+    layer = many / 1.7 / (4 * np.pi * half**2)
+    assert 0.8 < layer < 2.0
+    assert most_gaussians(large, ball(large, 1.0), max_gaussians=5000) == 5000
+    assert "surfaces" not in plan(large, ball(large, 1.0)).reasons["seed_spacing_voxels"]
+    tiny = problem(33)
+    assert plan(tiny, ball(tiny, 1.0), "cuda").spacing == pytest.approx(1.3)
+
+
 @pytest.mark.parametrize("share", [0.3, 0.5])
 def test_uneven_seeds_are_as_many_as_even_ones(share):
     of = problem(32)
