@@ -32,7 +32,7 @@ __all__ = ["Checkpoint", "Snapshot"]
 
 logger = logging.getLogger(__name__)
 
-FORMAT = 4
+FORMAT = 5
 # Writing takes at most this share of the time.
 _LARGEST_SHARE = 0.05
 _PARTS = tuple(field.name for field in fields(Gaussians))
@@ -211,7 +211,7 @@ def _content(about: np.ndarray) -> dict[str, Any]:
 
 def _plan(parts: dict[str, Any]) -> Plan:
     plan = Plan(**parts)
-    above_zero = min(plan.reference, plan.spacing, plan.finest, plan.views_per_step, plan.tv_box) > 0
+    above_zero = min(plan.reference, plan.spacing, plan.views_per_step, plan.tv_box) > 0
     whole = isinstance(plan.views_per_step, int) and isinstance(plan.tv_box, int)
     corners = len(plan.tv_corners) == 2 and all(
         isinstance(corner, (int, float)) and corner >= 0 for corner in plan.tv_corners

@@ -24,7 +24,7 @@ from tomo_polysplat.start.levels import MAIN_SHARE, main_level, mass_level
 if TYPE_CHECKING:
     from tomo_polysplat.fit.problem import Problem
 
-__all__ = ["Plan", "make_plan", "soft_reference"]
+__all__ = ["Plan", "finest_spacing", "make_plan", "soft_reference"]
 
 logger = logging.getLogger(__name__)
 
@@ -61,8 +61,6 @@ class Plan:
         Distance of the seeds in voxels.
     finer : float
         Share of the Gaussians that is seeded twice as finely as the rest; see ``model.seed``.
-    finest : float
-        Distance of seeds in voxels that the detector could tell apart, or ``spacing`` if that was asked for.
     views_per_step : int
     tv_box : int
         Edge in voxels of the random box whose total variation a step takes.
@@ -80,7 +78,6 @@ class Plan:
     reference: float
     spacing: float
     finer: float
-    finest: float
     views_per_step: int
     tv_box: int
     tv_corners: tuple[float, float]
@@ -106,7 +103,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     least = settings.support_level * reference * problem.depth
     support = int((start > least).sum())
     most, limit = _most_gaussians(start, least, problem, settings, device)
-    (spacing, finer, finest), because = _seed_spacing(support, most, limit, problem, settings)
+    spacing, finer, because = _seed_spacing(support, most, limit, problem, settings)
     most = _MOST_VIEWS_PLANAR if problem.planar else _MOST_VIEWS[device]
     views, reason = _views_per_step(problem.geometry.views, settings, most)
     box = settings.tv_box or (_TV_BOX_PLANAR if problem.planar else _TV_BOX[device])
@@ -115,7 +112,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     blurred, told = _blurred(start, soft, settings)
     relative = torch.as_tensor(start) / soft if soft else torch.as_tensor(start)
     corners, texture = tv_corners(relative, settings, problem.agreement)
-    plan = Plan(reference, spacing, finer, finest, views, box, corners, curves, blurred)
+    plan = Plan(reference, spacing, finer, views, box, corners, curves, blurred)
     unit = "g/cm3" if problem.polychromatic else "per unit of length"
     plan.reasons = {
         "model": "polychromatic: a spectrum was given"
@@ -197,23 +194,23 @@ def _blurred(start: np.ndarray | torch.Tensor, soft: float, settings: Settings) 
 
 def _seed_spacing(
     support: int, most: int, limit: str, problem: Problem, settings: Settings
-) -> tuple[tuple[float, float, float], str]:
-    """Distance of the seeds in voxels (the shortest edge), the finer share and the finest distance, and why.
+) -> tuple[float, float, str]:
+    """Distance of the seeds in voxels (the shortest edge), the finer share, and why.
 
     ``support`` is the number of voxels with matter, ``most`` that of Gaussians at most, for which ``limit`` has words.
     """
     if settings.seed_spacing:
-        return (settings.seed_spacing, 0.0, settings.seed_spacing), "asked for"
+        return settings.seed_spacing, 0.0, "asked for"
     dims = 2 if problem.planar else 3
-    finest, because = _finest_spacing(problem)
+    finest, because = finest_spacing(problem)
     cells = support * float(np.prod(problem.grid.voxel_size[:dims] / problem.voxel))
     crowded = (cells / most) ** (1 / dims)
     if crowded <= finest:
-        return (finest, 0.0, finest), because
+        return finest, 0.0, because
     because = f"at most {most} Gaussians{limit} over {support} voxels of support"
     finer = settings.finer_seeds
     because += f", {finer:.0%} of them closer where the start varies"
-    return (crowded, finer, finest), because + (", thin across its edges" if settings.seed_edge else "")
+    return crowded, finer, because + (", thin across its edges" if settings.seed_edge else "")
 
 
 def _most_gaussians(
@@ -234,8 +231,11 @@ def _most_gaussians(
     return (most, "") if most <= enough else (enough, f", for {surface} voxels at its surfaces,")
 
 
-def _finest_spacing(problem: Problem) -> tuple[float, str]:
-    """Seeds no closer than the detector can tell apart, and than the voxels can show, unless these are few."""
+def finest_spacing(problem: Problem) -> tuple[float, str]:
+    """Distance of seeds in voxels, and why.
+
+    No closer than the detector can tell apart and the voxels can show, unless these are few.
+    """
     width, height = problem.geometry.pixel_size_at(problem.grid.centre)
     pixel = (width if problem.planar else math.sqrt(width * height)) / problem.voxel
     edge = float((problem.grid.extent / problem.voxel)[: 2 if problem.planar else 3].max())

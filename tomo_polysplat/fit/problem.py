@@ -19,7 +19,7 @@ from tomo_polysplat.checks import require_choice
 from tomo_polysplat.fit.inside import matter_is_inside
 from tomo_polysplat.fit.memory import projections_stay, require_room
 from tomo_polysplat.fit.noise import photons_per_ray
-from tomo_polysplat.fit.plan import Plan, soft_reference
+from tomo_polysplat.fit.plan import Plan, finest_spacing, soft_reference
 from tomo_polysplat.fit.plan_costs import alternatives, work
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
@@ -252,7 +252,9 @@ class Problem:
     ) -> Gaussians:
         """Gaussians to start from."""
         relative = start / (self.depth * plan.reference)
-        spacing, finest = plan.spacing * self.voxel, plan.finest * self.voxel
+        spacing = plan.spacing * self.voxel
+        # A spacing that was asked for is nobody's lack of Gaussians, which thin ones make up for.
+        finest = math.inf if settings.seed_spacing else finest_spacing(self)[0] * self.voxel
         several = plan.curves > 1
         gaussians = seed_gaussians(
             relative, self.grid, spacing, settings, several, self.planar, device, plan.finer, finest
