@@ -84,9 +84,9 @@ def error_figure(record: Mapping[str, Any], scene: str, size: int) -> Figure:
                 c for c in record["curves"] if (c["scene"], c["size"], c["method"]) == (scene, size, name)
             ]
             for curve in curves:
-                axis.plot(
-                    *zip(*[(p["seconds"], p[key]) for p in curve["history"]]), color=colour(name, record)
-                )
+                course = [(p["seconds"], p[key]) for p in curve["history"]]
+                # Small dots, as a course of a single pass has no line.
+                axis.plot(*zip(*course), color=colour(name, record), marker=".", markersize=4)
         axis.set(xscale="log", xlabel="seconds, from projections to volume", ylabel=f"PSNR {label} (dB)")
         dress(axis)
     if axis.lines:
