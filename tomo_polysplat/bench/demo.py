@@ -28,7 +28,7 @@ FILES = ("demo.png", "demo.h5", "demo.json")
 
 # Small enough for a laptop's patience, large enough to see.
 _SIZE, _VIEWS = 64, 90
-_SETTINGS = {"passes": 3.0, "views_per_step": 4, "max_gaussians": 30_000}
+_SETTINGS = {"passes": 3.0, "views_per_step": 4, "max_gaussians": 24_000, "tv_box": 32}
 
 
 def run_demo(
