@@ -11,30 +11,32 @@ import math
 import numpy as np
 from numba import njit
 
-from tomo_polysplat.kernels.gaussian_maths import scalar_step, whitening
+from tomo_polysplat.kernels.gaussian_maths import SCALAR, whitening
 
 __all__ = ["MOMENTS", "RECORD", "pull_back", "ray_frame", "set_up"]
 
 RECORD = 12  # numbers of a footprint, in the order written by _describe
 MOMENTS = 11  # sums over a footprint, in the order read by pull_back
 
+_step = njit(**SCALAR)
 
-@scalar_step
+
+@_step
 def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@scalar_step
+@_step
 def _cross(a, b):
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@scalar_step
+@_step
 def _mix(a, x, b, y):
     return a * x[0] + b * y[0], a * x[1] + b * y[1], a * x[2] + b * y[2]
 
 
-@scalar_step
+@_step
 def _apply(matrix, x):
     return (
         matrix[0, 0] * x[0] + matrix[0, 1] * x[1] + matrix[0, 2] * x[2],
@@ -43,12 +45,12 @@ def _apply(matrix, x):
     )
 
 
-@scalar_step
+@_step
 def _column(matrix, k):
     return matrix[0, k], matrix[1, k], matrix[2, k]
 
 
-@scalar_step
+@_step
 def ray_frame(position, cone, origin, inverse, matrix, white, n, v):
     """Column, row and kappa (0 if behind the source) of the centre, the ray r there, W r, W U and W V."""
     r = position[n, 0] - origin[v, 0], position[n, 1] - origin[v, 1], position[n, 2] - origin[v, 2]
@@ -62,7 +64,7 @@ def ray_frame(position, cone, origin, inverse, matrix, white, n, v):
     return (a * kappa, b * kappa, kappa), r, _apply(white, r), _apply(white, u), _apply(white, v_)
 
 
-@scalar_step
+@_step
 def _triangle(nu, nv):
     """Orthonormal q1, q2 and r11, r12, r22 with ``nu = r11 q1`` and ``nv = r12 q1 + r22 q2``."""
     r11 = math.sqrt(_dot(nu, nu))
@@ -75,7 +77,7 @@ def _triangle(nu, nv):
     return q1, (rest[0] * by_r22, rest[1] * by_r22, rest[2] * by_r22), r11, r12, r22
 
 
-@scalar_step
+@_step
 def _describe(cone, planar, cutoff, rows, columns, centre, w, wu, wv, rec, span):
     """Fill ``rec``, and ``span`` with the half-open ranges of rows and columns (all 0 if there are none).
 
@@ -106,7 +108,7 @@ def _describe(cone, planar, cutoff, rows, columns, centre, w, wu, wv, rec, span)
         span[0] = span[1] = span[2] = span[3] = 0
 
 
-@scalar_step
+@_step
 def _range(square, half, rest, centre, length):
     """Half-open range of the indices i with ``square x^2 + 2 half x + rest <= 0``, x = i - centre."""
     inside = half * half - square * rest
@@ -117,7 +119,7 @@ def _range(square, half, rest, centre, length):
     return (int(low), int(high) + 1) if low <= high else (0, 0)
 
 
-@scalar_step
+@_step
 def _reach(white, scale, n, toward):
     """Standard deviation along the axis ``toward``; axes of infinite scale lie across it and do not count."""
     total = 0.0
@@ -150,7 +152,7 @@ def set_up(
     return skipped
 
 
-@scalar_step
+@_step
 def pull_back(cone, planar, frame, inverse, matrix, white, m, grad_point, grad_white):
     """Add dL/dposition and dL/dW of one view, from the moments ``m`` of its footprint.
 
