@@ -5,12 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-__all__ = ["FAST", "SCALAR", "gaussian", "whitening", "whitening_adjoint"]
+__all__ = ["FAST", "gaussian", "whitening", "whitening_adjoint"]
 
 # Rounding may be reordered for speed; NaN and infinity keep their meaning (planar Gaussians use infinity).
 FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
-# For steps outside of the loops over pixels: LLVM inlines them as well as Numba, which needs twice the time for it.
-SCALAR = {"error_model": "numpy"}
 
 
 @njit(inline="always")
@@ -36,7 +34,7 @@ def gaussian(q, cut):
     return power if q <= cut else np.float32(0)
 
 
-@njit(**SCALAR)
+@njit(inline="always")
 def whitening(scale, rotation, n, out):
     """Fill ``out`` (3, 3) float64 with ``W = diag(1/scale) R^T`` of Gaussian ``n``."""
     w, x, y, z = rotation[n, 0], rotation[n, 1], rotation[n, 2], rotation[n, 3]
@@ -54,7 +52,7 @@ def whitening(scale, rotation, n, out):
     out[2, 2] = c * (1 - 2 * (x * x + y * y))
 
 
-@njit(**SCALAR)
+@njit(inline="always")
 def whitening_adjoint(scale, rotation, n, white, grad, grad_scale, grad_rotation):
     """Write the gradients of scale and quaternion of Gaussian ``n`` from ``grad`` = dL/dW (3, 3)."""
     w, x, y, z = rotation[n, 0], rotation[n, 1], rotation[n, 2], rotation[n, 3]

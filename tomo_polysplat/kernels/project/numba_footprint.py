@@ -11,14 +11,14 @@ import math
 import numpy as np
 from numba import njit
 
-from tomo_polysplat.kernels.gaussian_maths import SCALAR, whitening
+from tomo_polysplat.kernels.gaussian_maths import whitening
 
 __all__ = ["MOMENTS", "RECORD", "pull_back", "ray_frame", "set_up"]
 
 RECORD = 12  # numbers of a footprint, in the order written by _describe
 MOMENTS = 11  # sums over a footprint, in the order read by pull_back
 
-_step = njit(**SCALAR)
+_step = njit(error_model="numpy", inline="always")
 
 
 @_step

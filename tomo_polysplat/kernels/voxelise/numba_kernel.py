@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
-from tomo_polysplat.kernels.gaussian_maths import FAST, SCALAR, gaussian, whitening, whitening_adjoint
+from tomo_polysplat.kernels.gaussian_maths import FAST, gaussian, whitening, whitening_adjoint
 from tomo_polysplat.kernels.numba_lanes import LANES, add_product, add_scaled, lane_sum
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.parallel import cpu_threads, run_tasks, split_range
@@ -18,7 +18,7 @@ from tomo_polysplat.parallel import cpu_threads, run_tasks, split_range
 __all__ = ["backward", "forward"]
 
 
-@njit(**SCALAR)
+@njit(inline="always")
 def _triangle(position, scale, rotation, n, first, spacing, white, q, rec):
     """Fill ``white`` = W, ``q`` with orthonormal columns and ``rec`` with the centre in voxels and r11, r12, r13,
     r22, r23, r33, so that W diag(spacing) = q r. The squared distance of the offset (x, y, z) in voxels is
@@ -146,7 +146,7 @@ def _gather(n, rec, weight, cutoff, nx, grad_volume, value, total, sums, acc):
                     acc[8 * LANES + k] += h * deep * deep
 
 
-@njit(**SCALAR)
+@njit(inline="always")
 def _pull_back(n, white, q, rec, spacing, m, grad_position, grad_white):
     """Write dL/dposition, and dL/dW to ``grad_white``, from the moments ``m`` of h with t = r (x, y, z)."""
     by_r33 = 1.0 / rec[8] if rec[8] > 0.0 else 0.0
