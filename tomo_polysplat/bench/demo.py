@@ -27,8 +27,8 @@ __all__ = ["FILES", "run_demo"]
 FILES = ("demo.png", "demo.h5", "demo.json")
 
 # Small enough for a laptop's patience, large enough to see.
-_SIZE, _VIEWS = 64, 90
-_SETTINGS = {"passes": 3.0, "views_per_step": 4, "max_gaussians": 24_000, "tv_box": 32}
+_SIZE, _VIEWS = 56, 84
+_SETTINGS = {"passes": 3.0, "views_per_step": 4, "max_gaussians": 22_000, "tv_box": 32}
 
 
 def run_demo(
