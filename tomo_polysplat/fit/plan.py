@@ -102,8 +102,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     why = _why_reference(reference, level, problem.polychromatic)
     least = settings.support_level * reference * problem.depth
     support = int((start > least).sum())
-    most, limit = _most_gaussians(start, least, problem, settings, device)
-    spacing, finer, because = _seed_spacing(support, most, limit, problem, settings)
+    spacing, finer, because = _seed_spacing(start, least, support, problem, settings, device)
     most = _MOST_VIEWS_PLANAR if problem.planar else _MOST_VIEWS[device]
     views, reason = _views_per_step(problem.geometry.views, settings, most)
     box = settings.tv_box or (_TV_BOX_PLANAR if problem.planar else _TV_BOX[device])
@@ -193,15 +192,21 @@ def _blurred(start: np.ndarray | torch.Tensor, soft: float, settings: Settings) 
 
 
 def _seed_spacing(
-    support: int, most: int, limit: str, problem: Problem, settings: Settings
+    start: np.ndarray | torch.Tensor,
+    least: float,
+    support: int,
+    problem: Problem,
+    settings: Settings,
+    device: str,
 ) -> tuple[float, float, str]:
     """Distance of the seeds in voxels (the shortest edge), the finer share, and why.
 
-    ``support`` is the number of voxels with matter, ``most`` that of Gaussians at most, for which ``limit`` has words.
+    Matter is what is above ``least``; ``support`` voxels have some.
     """
     if settings.seed_spacing:
         return settings.seed_spacing, 0.0, "asked for"
     dims = 2 if problem.planar else 3
+    most, limit = _most_gaussians(start, least, problem, settings, device)
     finest, because = finest_spacing(problem)
     cells = support * float(np.prod(problem.grid.voxel_size[:dims] / problem.voxel))
     crowded = (cells / most) ** (1 / dims)
@@ -214,14 +219,14 @@ def _seed_spacing(
 
 
 def _most_gaussians(
-    start: np.ndarray | torch.Tensor, level: float, problem: Problem, settings: Settings, device: str
+    start: np.ndarray | torch.Tensor, least: float, problem: Problem, settings: Settings, device: str
 ) -> tuple[int, str]:
-    """How many Gaussians at most, and why not more; matter is what is above ``level``."""
+    """How many Gaussians at most, and why not more; matter is what is above ``least``."""
     most = settings.max_gaussians or _MOST_GAUSSIANS[device]
     if settings.max_gaussians or problem.planar or most <= _NOT_TOO_MANY:
         return most, ""
     # Averaged, as noise would make holes with surfaces of their own.
-    matter = box_mean(torch.as_tensor(start), np.minimum(3, start.shape)) > level
+    matter = box_mean(torch.as_tensor(start), np.minimum(3, start.shape)) > least
     beside = ~matter
     for axis in range(3):
         beside = grown(beside, axis, 1)
