@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.fit.texture import tv_corners
-from tomo_polysplat.model.seed_samples import box_mean, grown
+from tomo_polysplat.model.seed_samples import box_mean, widened
 from tomo_polysplat.physics.detector_blur import describe_blur
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.levels import MAIN_SHARE, main_level, mass_level
@@ -227,10 +227,7 @@ def _most_gaussians(
         return most, ""
     # Averaged, as noise would make holes with surfaces of their own.
     matter = box_mean(torch.as_tensor(start), np.minimum(3, start.shape)) > least
-    beside = ~matter
-    for axis in range(3):
-        beside = grown(beside, axis, 1)
-    surface = int((matter & beside).sum())
+    surface = int((matter & widened(~matter, 1)).sum())
     cell = float(np.prod(problem.grid.voxel_size / problem.voxel))
     enough = max(_NOT_TOO_MANY, round(_MOST_PER_SURFACE * surface * cell ** (2 / 3)))
     return (most, "") if most <= enough else (enough, f", for {surface} voxels at its surfaces,")

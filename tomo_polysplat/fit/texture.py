@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 
-from tomo_polysplat.model.seed_samples import grown
+from tomo_polysplat.model.seed_samples import widened
 from tomo_polysplat.settings import Settings
 
 __all__ = ["bodies", "corners_for", "share_alike", "tv_corners"]
@@ -83,7 +83,7 @@ def tv_corners(
 
 def share_alike(relative: torch.Tensor, body: torch.Tensor) -> float:
     """Share of a body's voxels, away from its surface, whose value is close to their median; 0 of too few."""
-    values = relative[~_widened(~body, 1)]
+    values = relative[~widened(~body, 1)]
     if len(values) < _FEWEST:
         return 0.0
     return float(((values / values.median() - 1).abs() < _ALIKE).float().mean())
@@ -91,15 +91,8 @@ def share_alike(relative: torch.Tensor, body: torch.Tensor) -> float:
 
 def bodies(relative: torch.Tensor, settings: Settings) -> list[torch.Tensor]:
     """Voxels of soft and of bone-like matter in a volume in soft references, none of them near metal."""
-    dense, away = relative > settings.bone_level, ~_widened(relative > settings.metal_level, _BESIDE_METAL)
+    dense, away = relative > settings.bone_level, ~widened(relative > settings.metal_level, _BESIDE_METAL)
     return [(relative > _BODY) & ~dense & away, dense & away]
-
-
-def _widened(mask: torch.Tensor, reach: int) -> torch.Tensor:
-    """The voxels of a mask and those up to ``reach`` from them along every axis."""
-    for axis in range(mask.ndim):
-        mask = grown(mask, axis, reach)
-    return mask
 
 
 def corners_for(agreement: Sequence[float | None], shape: Sequence[int], alike: float) -> tuple[float, float]:

@@ -7,7 +7,7 @@ import torch
 
 from tomo_polysplat.scan.geometry import VolumeGrid
 
-__all__ = ["box_mean", "grown", "reaches", "voxel_of"]
+__all__ = ["box_mean", "reaches", "voxel_of", "widened"]
 
 
 def box_mean(volume: torch.Tensor, cells: np.ndarray) -> torch.Tensor:
@@ -35,11 +35,11 @@ def reaches(
         return torch.zeros(len(points), dtype=torch.bool, device=points.device)
     for axis, size in enumerate(grid.voxel_size[::-1]):
         # A whole number of voxels must not lose one to rounding.
-        near = grown(near, axis, int(reach / size + 1e-6))
+        near = _grown(near, axis, int(reach / size + 1e-6))
     return near[voxel_of(points, grid)]
 
 
-def grown(mask: torch.Tensor, axis: int, voxels: int) -> torch.Tensor:
+def _grown(mask: torch.Tensor, axis: int, voxels: int) -> torch.Tensor:
     """What is true, and as many voxels before and behind it; every step nearly trebles the width."""
     length, half = mask.shape[axis], 0
     while half < min(voxels, length - 1):
@@ -48,4 +48,11 @@ def grown(mask: torch.Tensor, axis: int, voxels: int) -> torch.Tensor:
         wider.narrow(axis, step, length - step).logical_or_(mask.narrow(axis, 0, length - step))
         wider.narrow(axis, 0, length - step).logical_or_(mask.narrow(axis, step, length - step))
         mask, half = wider, half + step
+    return mask
+
+
+def widened(mask: torch.Tensor, reach: int) -> torch.Tensor:
+    """The voxels of a mask and those up to ``reach`` from them along every axis."""
+    for axis in range(mask.ndim):
+        mask = _grown(mask, axis, reach)
     return mask
