@@ -24,6 +24,7 @@ from tomo_polysplat.fit.soft_matter import describe_soft
 from tomo_polysplat.interrupts import postponed_interrupts
 from tomo_polysplat.kernels.device import one_torch_thread, usual_modes
 from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.parallel import kept_threads
 from tomo_polysplat.physics.detector_blur import describe_blur
 from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.spectrum import Spectrum
@@ -139,7 +140,7 @@ def reconstruct(
     options = wishes.options() | {"calibration": None if wanted is None else asdict(wanted)}
     saved = _checkpoint(checkpoint, resume, problem, options)
     started -= 0.0 if saved is None else saved.seconds
-    with one_torch_thread(wishes.device), progress_reports(progress) as report:
+    with one_torch_thread(wishes.device), kept_threads(), progress_reports(progress) as report:
         report(0.0, "start volume")
         problem, known = physics(problem, wanted, wishes, saved)
         begun = begin(problem, wishes, saved)

@@ -14,14 +14,18 @@ from tomo_polysplat.settings import PRESETS, make_settings
 
 @pytest.mark.parametrize("name", SCANS)
 def test_variants_change_the_settings_each_in_its_own_way(name):
-    changed = [(v.one_energy, make_settings(changes=dict(v.settings))) for v in variants(SCANS[name])]
-    assert changed[0] == (False, make_settings())
+    varied = [DEFAULT, *variants(SCANS[name], 3)]
+    changed = [(v.one_energy, make_settings(changes=dict(v.settings))) for v in varied]
     assert all(one != other for k, one in enumerate(changed) for other in changed[:k])
-    assert len({v.label for v in variants(SCANS[name])}) == len(changed)
+    assert len({v.label for v in varied}) == len(changed)
     # The last two take every decision otherwise that is about the model.
     model = {"curves", "spectral_nodes", "support_level", "free_radius"}
-    everything, finer = (variant.settings for variant in variants(SCANS[name])[-2:])
-    assert model <= everything.keys() and finer == everything | {"seed_spacing": 1.0}
+    everything, finer = (variant.settings for variant in varied[-2:])
+    assert (
+        model <= everything.keys()
+        and everything["views_per_step"] == 3
+        and finer == everything | {"seed_spacing": 1.0}
+    )
 
 
 def test_scans_are_what_their_names_say():
@@ -39,7 +43,9 @@ def test_unknown_scans_are_refused():
 
 
 def test_the_command_leaves_a_record(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("tomo_polysplat.bench.plan.variants", lambda scan: [DEFAULT, variants(scan)[2]])
+    monkeypatch.setattr(
+        "tomo_polysplat.bench.plan.variants", lambda scan, together: [variants(scan, together)[1]]
+    )
     monkeypatch.setitem(PRESETS, "balanced", {"passes": 2.0})
     chosen = ["--scans", "narrow spectrum", "--size", "7", "--views", "12", "--device", "cpu"]
     assert main(["bench", "plan", *chosen, "--record", str(tmp_path)]) == 0

@@ -71,7 +71,8 @@ class Variant:
         # Samples of a spectrum have a mean of their own; the truth is at that of the whole.
         energy = scan.truth_energy_kev
         volume = result.volume if self.one_energy or energy is None else result.attenuation(energy)
-        return volume, {"plan": {key: result.plan.get(key) for key in ("spectrum", "gaussians", "stop")}}
+        told = ("spectrum", "gaussians", "views_per_step", "stop")
+        return volume, {"plan": {key: result.plan.get(key) for key in told}}
 
 
 DEFAULT = Variant("default")

@@ -103,8 +103,11 @@ class PlanBench:
             raise fail("size, views", "at least 1", f"{self.size}, {self.views}")
 
 
-def variants(scan: PlanScan) -> list[Variant]:
-    """The plan, each of its decisions taken otherwise, and all of them left out."""
+def variants(scan: PlanScan, views_per_step: int) -> list[Variant]:
+    """Each decision of the plan taken otherwise, and all of those about the model left out.
+
+    These last make as many steps as the plan, which would give a larger cloud fewer: ``views_per_step`` is its own.
+    """
     # Where nothing is dense, numbers are free only if matter of any density counts as dense.
     free = {"curves": 3, "free_radius": _EVERYWHERE}
     free |= {} if scan.metal else {"bone_level": 0.1, "bone_u": 0.0}
@@ -113,9 +116,9 @@ def variants(scan: PlanScan) -> list[Variant]:
     # A blur is held rather than fitted: without metal nothing would hold it.
     blur = {"learning_rate_blur": 0.0} | ({"blur": 0.0} if scan.metal else {})
     whole = {**free, **every, **empty, **({} if scan.metal else blur)}
+    whole["views_per_step"] = views_per_step
     curves = 1 if scan.metal else 3
     return [
-        DEFAULT,
         Variant("no spectrum", one_energy=True),
         Variant(f"{curves} curve{'s' if curves > 1 else ''}", {"curves": curves}),
         Variant("every energy a node", every),
@@ -163,13 +166,22 @@ def run_plan_bench(
         scan.name = name
         task = Task.of(scan, bench.device, bench.seed)
         warm_up({"plan": DEFAULT.method()}, task, bench.settings, progress)
-        for variant in variants(SCANS[name]):
-            runs = timed_runs({variant.label: variant.method()}, task, (), bench.settings, progress)
-            record["runs"] += [{"scan": name, **run} for run in with_errors(runs, scan)]
+        planned = _run(DEFAULT, task, bench.settings, progress)
+        record["runs"].append(planned)
+        if planned["seconds"] is None:
+            continue
+        together = int(planned["about"]["plan"]["views_per_step"].partition(" ")[0])
+        for variant in variants(SCANS[name], together):
             update(record)
+            record["runs"].append(_run(variant, task, bench.settings, progress))
         record["stopping"].append(_stopping(task, bench.settings, progress))
         update(record)
     return record
+
+
+def _run(variant: Variant, task: Task, settings: Mapping[str, Any], progress: Progress) -> Record:
+    runs = timed_runs({variant.label: variant.method()}, task, (), dict(settings), progress)
+    return {"scan": task.scan.name, **with_errors(runs, task.scan)[0]}
 
 
 def _stopping(task: Task, settings: Mapping[str, Any], progress: Progress) -> Record:
