@@ -6,7 +6,7 @@ import logging
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -203,7 +203,7 @@ def _fitted(
         plan.spacing * problem.voxel,
         begun.rays,
         scene,
-        wishes.settings,
+        replace(wishes.settings, passes=plan.passes),
         views_per_step=plan.views_per_step,
         rng=np.random.default_rng(wishes.seed),
         started=started,

@@ -29,8 +29,8 @@ class Settings:
     units of the scan's soft reference (water, for most objects).
     """
 
-    passes: float = 10.0
-    """Times every view is used, unless the held-out rays or a time budget end the run before."""
+    passes: float = 0.0
+    """Times every view is used, unless held-out rays or a time budget end the run before; 0 leaves it to the plan."""
     views_per_step: int = 0
     """Views whose gradients make one step of the optimiser; 0 leaves it to the plan."""
     max_gaussians: int = 0

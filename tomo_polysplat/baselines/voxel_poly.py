@@ -17,6 +17,7 @@ from tomo_polysplat.baselines.voxel_model import VoxelModel, start_voxels
 from tomo_polysplat.fit.loss import misfit, total_variation
 from tomo_polysplat.fit.noise import photons_per_ray
 from tomo_polysplat.fit.optimise import FitState
+from tomo_polysplat.fit.plan import PASSES
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.texture import tv_corners
 from tomo_polysplat.physics.materials import Materials
@@ -151,7 +152,7 @@ class _Fit:
         """The model of the pass whose held-out rays fitted best."""
         begun, step, lowest, waited = time.perf_counter(), 0, math.inf, 0
         groups = _interleaved(len(self.rays.views))
-        steps = math.ceil(self.settings.passes * len(groups))
+        steps = math.ceil((self.settings.passes or PASSES) * len(groups))
         best = self.model.copy()
 
         def share() -> float:

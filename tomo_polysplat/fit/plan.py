@@ -24,7 +24,7 @@ from tomo_polysplat.start.levels import MAIN_SHARE, main_level, mass_level
 if TYPE_CHECKING:
     from tomo_polysplat.fit.problem import Problem
 
-__all__ = ["Plan", "finest_spacing", "make_plan", "soft_reference"]
+__all__ = ["PASSES", "Plan", "finest_spacing", "make_plan", "soft_reference"]
 
 logger = logging.getLogger(__name__)
 
@@ -35,10 +35,12 @@ _FEWEST_SEEDS = 12
 # steps cost little, makes more of them (256^3: 40.1 dB with 4 views a step, 39.0 with 8, for 1.6 times the time).
 # The few rays of a planar view do with fewer steps (five fan-beam slices: 38.0 dB with 4 views a step, 38.3 with 8).
 _STEPS, _MOST_VIEWS, _MOST_VIEWS_PLANAR = 300, {"cpu": 8, "cuda": 4}, 8
-# Steps of a small cloud cost little, so that it takes up to twice as many: all of them up to so many seeds in matter,
-# none from twice as many on (40^3, 72 views, two and one a step: pepper 30.0 and 30.6 dB in 7 and 12 s, pins and
-# teeth, of four times the matter, 29.9 and 30.4, 39.2 and 39.2 in 13 and 23 s).
-_MORE_STEPS, _SMALL_CLOUD = 2.0, 5000
+# Passes of a run that nobody has given a length.
+PASSES = 10.0
+# Steps of a small cloud cost little: with up to so many seeds in matter a run is longer by this factor, in steps and
+# passes, and as it was from 1.5 times as many seeds on. 32^3, 60 views, 300 steps of two views, 600 of one in as many
+# passes, 450 of two (dB without metal): pins 28.5, 28.4, 29.1; pancreas 35.2, 35.3, 35.5. Those of one are noisier.
+_LONGER, _SMALL_CLOUD = 1.5, 6000
 # Voxels along an edge of the box that is smoothed. What a box seldom meets is smoothed by leaps, which upset the
 # optimiser's sense of scale (teeth, 128^3 voxels: 39.1, 39.7 and 40.2 dB with 32, 64 and 128).
 _TV_BOX, _TV_BOX_PLANAR = {"cpu": 48, "cuda": 128}, 256
@@ -66,6 +68,8 @@ class Plan:
     finer : float
         Share of the Gaussians that is seeded twice as finely as the rest; see ``model.seed``.
     views_per_step : int
+    passes : float
+        Times that every view is used.
     tv_box : int
         Edge in voxels of the random box whose total variation a step takes.
     tv_corners : pair of float
@@ -83,6 +87,7 @@ class Plan:
     spacing: float
     finer: float
     views_per_step: int
+    passes: float
     tv_box: int
     tv_corners: tuple[float, float]
     curves: int
@@ -108,15 +113,15 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     support = int((start > least).sum())
     spacing, finer, because = _seed_spacing(start, least, support, problem, settings, device)
     most = _MOST_VIEWS_PLANAR if problem.planar else _MOST_VIEWS[device]
-    steps = _steps(support / spacing**3, problem.planar)
-    views, reason = _views_per_step(problem.geometry.views, settings, most, steps)
+    seeds = math.inf if problem.planar else support / spacing**3
+    passes, views, reason = _length(problem.geometry.views, settings, most, seeds)
     box = settings.tv_box or (_TV_BOX_PLANAR if problem.planar else _TV_BOX[device])
     soft = reference * problem.depth
     curves, needed = _curves(start, soft, problem.polychromatic, settings)
     blurred, told = _blurred(start, soft, settings)
     relative = torch.as_tensor(start) / soft if soft else torch.as_tensor(start)
     corners, texture = tv_corners(relative, settings, problem.agreement)
-    plan = Plan(reference, spacing, finer, views, box, corners, curves, blurred)
+    plan = Plan(reference, spacing, finer, views, passes, box, corners, curves, blurred)
     unit = "g/cm3" if problem.polychromatic else "per unit of length"
     plan.reasons = {
         "model": "polychromatic: a spectrum was given"
@@ -134,7 +139,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
         "smoothed_box": _smoothed(box, start, settings),
         "texture": texture,
         "detector_blur": told,
-        "passes": f"{settings.passes:g} over the views at most, fewer where {settings.held_out:.1%} of the rays, held"
+        "passes": f"{passes:g} over the views at most, fewer where {settings.held_out:.1%} of the rays, held"
         f" out of the fit, have not improved for {settings.patience}",
     }
     return plan
@@ -260,16 +265,14 @@ def _smoothed(box: int, start: np.ndarray | torch.Tensor, settings: Settings) ->
     return f"{where}: {'asked for' if settings.tv_box else 'what a step has time for'}"
 
 
-def _steps(seeds: float, planar: bool) -> int:
-    """About how many steps a run of ``seeds`` seeds in matter should have."""
-    if planar:
-        return _STEPS
-    return round(_STEPS * min(_MORE_STEPS, max(1.0, _MORE_STEPS * _SMALL_CLOUD / max(1.0, seeds))))
-
-
-def _views_per_step(views: int, settings: Settings, most: int, steps: int) -> tuple[int, str]:
-    """As many as leave enough steps."""
+def _length(views: int, settings: Settings, most: int, seeds: float) -> tuple[float, int, str]:
+    """Passes, views of a step, and why so many of these: as many as leave enough steps."""
+    longer = min(_LONGER, max(1.0, _LONGER * _SMALL_CLOUD / max(1.0, seeds)))
+    # Not where views are so few that a step would have one of them.
+    if settings.passes or round(PASSES * views / _STEPS) < 2:
+        longer = 1.0
+    passes = settings.passes or longer * PASSES
     if settings.views_per_step:
-        return min(views, settings.views_per_step), "asked for"
-    together = max(1, min(views, most, round(settings.passes * views / steps)))
-    return together, f"for about {steps} steps, and at most {most} views in each"
+        return passes, min(views, settings.views_per_step), "asked for"
+    together = max(1, min(views, most, round(passes * views / (longer * _STEPS))))
+    return passes, together, f"for about {longer * _STEPS:.0f} steps, and at most {most} views in each"

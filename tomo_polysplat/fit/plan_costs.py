@@ -46,7 +46,7 @@ def alternatives(plan: Plan, problem: Problem, settings: Settings, gaussians: in
     told = {
         "seed_spacing": f"{half:.2g}: {2**dims} times the Gaussians, twice the pairs",
         "support_level": f"0: up to {everywhere:.3g} Gaussians for {gaussians}, the empty space with them",
-        "passes": f"{2 * settings.passes:g} for {settings.passes:g}: twice the time",
+        "passes": f"{2 * plan.passes:g} for {plan.passes:g}: twice the time",
         "patience": f"{settings.patience} passes without improvement end it sooner",
         "tv_weight": "0: no smoothed box, which on a CPU takes about half of the time",
     }

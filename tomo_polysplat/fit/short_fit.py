@@ -98,7 +98,7 @@ def short_fit(
     plan = make_plan(start, problem, replace(settings, curves=3), device.type)
     passes = max(_PASSES, fewest_steps * plan.views_per_step / problem.geometry.views)
     # The soft matter stays what it was said to be: calibration asks what else could explain the rays.
-    short = replace(settings, passes=min(passes, settings.passes), soft_gain=0.0)
+    short = replace(settings, passes=min(passes, plan.passes), soft_gain=0.0)
     scene, rays = problem.scene(plan, short, device), problem.rays(plan, short, device)
     started = time.perf_counter()
     outcome = fit(
