@@ -160,6 +160,13 @@ def test_the_main_matter_is_where_voxels_crowd():
     assert main_density(np.zeros((5, 1, 3))) == 0.0
 
 
+def test_metal_that_outweighs_the_rest_is_not_the_main_matter():
+    density = np.full((19, 21, 23), 0.97)
+    density[4:9, 6:13, 8:15] = 75.0
+    assert main_density(density) == 75.0
+    assert main_density(density, metal=6.0) == pytest.approx(0.97)
+
+
 def test_walls_do_not_tell_their_density():
     density = np.zeros((19, 21, 23))
     density[::3] = 0.9  # one voxel thick, and lighter than they are

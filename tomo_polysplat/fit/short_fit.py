@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, replace
 
@@ -44,7 +45,8 @@ class ShortFit:
     held_out : float
         Misfit of the held-out rays, or of the fitted ones where there are too few.
     soft_density : float
-        Density in g/cm3 of what most of the object is made of, were it the first material; 0 where that is too thin.
+        Density in g/cm3 of what most of the object is made of besides metal, were it the first material; 0 where that
+        is too thin.
     areal : (3, rays) array
         Areal densities in g/cm2 of some of the rays.
     measured, weight : (rays,) arrays
@@ -119,22 +121,25 @@ def short_fit(
         density = scene.volume(outcome.gaussians).cpu().numpy() * plan.reference
         sample = _sample(outcome.gaussians, scene, rays, seed)
     errors = [entry["held_out"] or entry["loss"] for entry in outcome.history] or [np.inf]
-    return ShortFit(fitted, float(min(errors)), main_density(density), *sample)
+    main = main_density(density, settings.metal_level * plan.reference)
+    return ShortFit(fitted, float(min(errors)), main, *sample)
 
 
-def main_density(density: np.ndarray) -> float:
+def main_density(density: np.ndarray, metal: float = math.inf) -> float:
     """Density of the matter that most of an object is made of: where the voxels inside of it crowd.
 
     Parameters
     ----------
     density : (nz, ny, nx) array
+    metal : float
+        What is denser does not count: a wire in a sponge weighs more than the sponge.
 
     Returns
     -------
     float
         0 where too little of that matter lies inside of it to show its density.
     """
-    level = mass_level(density)
+    level = mass_level(density[density <= metal])
     near = (density > 0.6 * level) & (density < 1.6 * level)
     inside = np.sort(density[ndimage.binary_erosion(near, border_value=1)].astype(np.float64))
     if len(inside) < max(1.0, _SOLID * np.count_nonzero(near)):
