@@ -113,7 +113,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     support = int((start > least).sum())
     spacing, finer, because = _seed_spacing(start, least, support, problem, settings, device)
     most = _MOST_VIEWS_PLANAR if problem.planar else _MOST_VIEWS[device]
-    seeds = math.inf if problem.planar else support / spacing**3
+    seeds = math.inf if problem.planar else _cells(support, problem) / spacing**3
     passes, views, reason = _length(problem.geometry.views, settings, most, seeds)
     box = settings.tv_box or (_TV_BOX_PLANAR if problem.planar else _TV_BOX[device])
     soft = reference * problem.depth
@@ -218,14 +218,19 @@ def _seed_spacing(
     dims = 2 if problem.planar else 3
     most, limit = _most_gaussians(start, least, problem, settings, device)
     finest, because = finest_spacing(problem)
-    cells = support * float(np.prod(problem.grid.voxel_size[:dims] / problem.voxel))
-    crowded = (cells / most) ** (1 / dims)
+    crowded = (_cells(support, problem) / most) ** (1 / dims)
     if crowded <= finest:
         return finest, 0.0, because
     because = f"at most {most} Gaussians{limit} over {support} voxels of support"
     finer = settings.finer_seeds
     because += f", {finer:.0%} of them closer where the start varies"
     return crowded, finer, because + (", thin across its edges" if settings.seed_edge else "")
+
+
+def _cells(voxels: int, problem: Problem) -> float:
+    """So many voxels in cubes, or squares, of their shortest edge."""
+    dims = 2 if problem.planar else 3
+    return voxels * float(np.prod(problem.grid.voxel_size[:dims] / problem.voxel))
 
 
 def _most_gaussians(
@@ -238,8 +243,7 @@ def _most_gaussians(
     # Averaged, as noise would make holes with surfaces of their own.
     matter = box_mean(torch.as_tensor(start), np.minimum(3, start.shape)) > least
     surface = int((matter & widened(~matter, 1)).sum())
-    cell = float(np.prod(problem.grid.voxel_size / problem.voxel))
-    enough = max(_NOT_TOO_MANY, round(_MOST_PER_SURFACE * surface * cell ** (2 / 3)))
+    enough = max(_NOT_TOO_MANY, round(_MOST_PER_SURFACE * surface * _cells(1, problem) ** (2 / 3)))
     return (most, "") if most <= enough else (enough, f", for {surface} voxels at its surfaces,")
 
 
