@@ -16,6 +16,7 @@ from tomo_polysplat.settings import PRESETS, make_settings
 def test_variants_change_the_settings_each_in_its_own_way(name):
     varied = [DEFAULT, *variants(SCANS[name], 3)]
     changed = [(v.one_energy, make_settings(changes=dict(v.settings))) for v in varied]
+    assert changed[0] == (False, make_settings())
     assert all(one != other for k, one in enumerate(changed) for other in changed[:k])
     assert len({v.label for v in varied}) == len(changed)
     # The last two take every decision otherwise that is about the model.

@@ -168,12 +168,13 @@ def run_plan_bench(
         warm_up({"plan": DEFAULT.method()}, task, bench.settings, progress)
         planned = _run(DEFAULT, task, bench.settings, progress)
         record["runs"].append(planned)
+        update(record)
         if planned["seconds"] is None:
             continue
         together = int(planned["about"]["plan"]["views_per_step"].partition(" ")[0])
         for variant in variants(SCANS[name], together):
-            update(record)
             record["runs"].append(_run(variant, task, bench.settings, progress))
+            update(record)
         record["stopping"].append(_stopping(task, bench.settings, progress))
         update(record)
     return record

@@ -271,12 +271,12 @@ def _smoothed(box: int, start: np.ndarray | torch.Tensor, settings: Settings) ->
 
 def _length(views: int, settings: Settings, most: int, seeds: float) -> tuple[float, int, str]:
     """Passes, views of a step, and why so many of these: as many as leave enough steps."""
-    longer = min(_LONGER, max(1.0, _LONGER * _SMALL_CLOUD / max(1.0, seeds)))
-    # Not where views are so few that a step would have one of them.
-    if settings.passes or round(PASSES * views / _STEPS) < 2:
-        longer = 1.0
-    passes = settings.passes or longer * PASSES
+    passes, longer = settings.passes or PASSES, 1.0
+    together = max(1, min(views, most, round(passes * views / _STEPS)))
+    # Not where views are so few that a step has one of them.
+    if not settings.passes and together > 1:
+        longer = min(_LONGER, max(1.0, _LONGER * _SMALL_CLOUD / max(1.0, seeds)))
+    passes *= longer
     if settings.views_per_step:
         return passes, min(views, settings.views_per_step), "asked for"
-    together = max(1, min(views, most, round(passes * views / (longer * _STEPS))))
     return passes, together, f"for about {longer * _STEPS:.0f} steps, and at most {most} views in each"
