@@ -268,10 +268,19 @@ def test_views_of_a_step_leave_enough_steps(passes):
     assert 200 < steps < 600 or views in (1, 8)
 
 
-@pytest.mark.parametrize(("size", "views", "longer"), [(12, 50, 1.5), (12, 20, 1.0), (45, 50, 1.0)])
-def test_a_run_is_longer_for_a_small_cloud_of_many_views(size, views, longer):
+@pytest.mark.parametrize(
+    ("size", "views", "planar", "longer"),
+    [
+        (12, 50, False, 1.5),
+        (12, 20, False, 1.0),
+        (45, 50, False, 1.0),
+        (30, 50, True, 2.0),
+        (400, 50, True, 1.0),
+    ],
+)
+def test_a_run_is_longer_for_a_small_cloud_of_many_views(size, views, planar, longer):
     """In passes and in steps alike, so that a step keeps its views; not where somebody has said how long."""
-    of = problem(size, views=views)
+    of = problem(size, views=views, planar=planar)
     made, fixed = plan(of, ball(of, WATER)), plan(of, ball(of, WATER), passes=10.0)
     assert made.passes == longer * fixed.passes == longer * 10.0
     assert made.views_per_step == fixed.views_per_step == max(1, round(views / 30))

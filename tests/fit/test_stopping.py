@@ -6,7 +6,7 @@ import time
 import pytest
 import torch
 
-from tomo_polysplat.fit.stopping import Clock, FitState, Watch
+from tomo_polysplat.fit.stopping import Clock, FitState, Watch, patience_of
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 
@@ -37,54 +37,60 @@ def best(watch):
 
 
 def test_the_state_with_the_lowest_held_out_error_is_kept():
-    watch = Watch(Settings(patience=10))
+    watch = Watch(10)
     assert judge(watch, [5.0, 3.0, 1.0, 2.0, 1.5]) == [""] * 5
     assert best(watch) == 2
 
 
 def test_what_is_kept_is_a_copy():
-    watch, gaussians = Watch(Settings()), cloud(1)
+    watch, gaussians = Watch(4), cloud(1)
     watch.judge(FitState(0.0, 0, 1, 1.0, 1.0, 0.5, lambda: None), gaussians)
     gaussians.attenuation.fill_(7)
     assert best(watch) == 1
 
 
 def test_a_run_ends_after_as_many_passes_without_improvement():
-    watch = Watch(Settings(patience=3))
+    watch = Watch(3)
     answers = judge(watch, [2.0, 1.0, 1.1, 1.2, 1.3])
     assert answers[:4] == [""] * 4 and "3 passes" in answers[4]
     assert best(watch) == 1
 
 
 def test_a_hair_is_no_improvement_but_still_the_best():
-    watch = Watch(Settings(patience=3))
+    watch = Watch(3)
     answers = judge(watch, [1.0, 0.9999, 0.9998, 0.9997])
     assert answers[-1] and best(watch) == 3
 
 
 def test_gaussians_that_are_no_numbers_are_never_kept_however_good_the_misfit():
-    watch, bad = Watch(Settings()), cloud(1)
+    watch, bad = Watch(4), cloud(1)
     assert judge(watch, [1.0]) == [""]
     bad.rotation[0, 2] = math.nan
     state = FitState(0.0, 0, 1, 0.5, 0.5, 0.5, lambda: None)
     assert "finite" in watch.judge(state, bad) and watch.best.finite()
     with pytest.raises(FloatingPointError):
-        Watch(Settings()).judge(state, bad)
+        Watch(4).judge(state, bad)
+
+
+@pytest.mark.parametrize(("passes", "patience"), [(1.0, 4), (10.0, 4), (12.4, 5), (20.0, 8)])
+def test_longer_runs_have_more_patience_unless_it_is_set(passes, patience):
+    assert patience_of(Settings(), passes) == patience
+    assert patience_of(Settings(patience=3), passes) == 3
 
 
 def test_patience_starts_again_with_every_improvement():
-    watch = Watch(Settings(patience=2))
+    watch = Watch(2)
     assert not any(judge(watch, [1.0, 1.1, 0.9, 1.0, 0.8, 0.9, 0.7]))
 
 
 def test_without_held_out_rays_the_loss_is_watched_and_nothing_ends_early():
-    watch = Watch(Settings(patience=1, held_out=0.0))
+    watch = Watch(1)
     assert judge(watch, [(loss, math.nan) for loss in (3.0, 1.0, 2.0, 2.0, 2.0)]) == [""] * 5
     assert best(watch) == 1
 
 
 def test_a_loss_that_is_no_number_ends_the_run_with_what_was_best():
-    watch = Watch(Settings())
+    watch = Watch(4)
     assert "finite" in judge(watch, [2.0, 1.0, (math.nan, math.nan)])[-1]
     assert best(watch) == 1
 
@@ -92,7 +98,7 @@ def test_a_loss_that_is_no_number_ends_the_run_with_what_was_best():
 @pytest.mark.parametrize("loss", [math.nan, math.inf])
 def test_a_run_that_never_was_finite_says_so(loss):
     with pytest.raises(FloatingPointError, match="first pass"):
-        judge(Watch(Settings()), [(loss, math.nan)])
+        judge(Watch(4), [(loss, math.nan)])
 
 
 def test_a_run_without_a_deadline_is_timed_by_its_steps():

@@ -16,9 +16,9 @@ import torch
 from tomo_polysplat.baselines.voxel_model import VoxelModel, start_voxels
 from tomo_polysplat.fit.loss import misfit, total_variation
 from tomo_polysplat.fit.noise import photons_per_ray
-from tomo_polysplat.fit.optimise import FitState
 from tomo_polysplat.fit.plan import PASSES
 from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.stopping import FitState, patience_of
 from tomo_polysplat.fit.texture import tv_corners
 from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.quadrature import fit_quadrature
@@ -152,14 +152,15 @@ class _Fit:
         """The model of the pass whose held-out rays fitted best."""
         begun, step, lowest, waited = time.perf_counter(), 0, math.inf, 0
         groups = _interleaved(len(self.rays.views))
-        steps = math.ceil((self.settings.passes or PASSES) * len(groups))
+        passes = self.settings.passes or PASSES
+        steps, patience = math.ceil(passes * len(groups)), patience_of(self.settings, passes)
         best = self.model.copy()
 
         def share() -> float:
             used = 0.0 if deadline is None else (time.perf_counter() - begun) / max(deadline - begun, 1e-9)
             return max(step / steps, used)
 
-        while share() < 1 and waited < self.settings.patience:
+        while share() < 1 and waited < patience:
             errors = []
             for group in rng.permutation(len(groups)):
                 if share() >= 1:

@@ -18,7 +18,7 @@ from tomo_polysplat.fit.loss import random_box
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.soft_matter import flatten
-from tomo_polysplat.fit.stopping import Clock, FitState, Watch
+from tomo_polysplat.fit.stopping import Clock, FitState, Watch, patience_of
 from tomo_polysplat.kernels.spatial_order import spatial_order
 from tomo_polysplat.model.density_control import relocate
 from tomo_polysplat.model.gaussians import Gaussians
@@ -243,7 +243,7 @@ def fit(
     """Fit Gaussians to rays.
 
     Stops after ``settings.passes`` over the views, at ``deadline`` (``time.perf_counter`` seconds), when the
-    held-out rays have not improved for ``settings.patience`` passes, when a callback returns True, or on
+    held-out rays have not improved for `patience_of` passes, when a callback returns True, or on
     KeyboardInterrupt; returns the Gaussians of the pass whose held-out rays fitted best. Where ``checkpoint``
     holds a snapshot, ``gaussians`` are its own and the fit goes on from there.
     """
@@ -255,7 +255,7 @@ def fit(
     fitter = _Fitter(gaussians, spacing, rays, scene, _hurried(settings, steps), batch, rng)
     # From now on: what compiling or recording the step took is no part of the run that the learning rates follow.
     clock = Clock(steps, deadline)
-    outcome, watch = FitOutcome(gaussians), Watch(settings)
+    outcome, watch = FitOutcome(gaussians), Watch(patience_of(settings, settings.passes))
     run = _Run(fitter, outcome, watch, clock, started, checkpoint)
     run.restore()
     try:

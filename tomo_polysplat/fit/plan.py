@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from tomo_polysplat.fit.stopping import patience_of
 from tomo_polysplat.fit.texture import tv_corners
 from tomo_polysplat.model.seed_samples import box_mean, widened
 from tomo_polysplat.physics.detector_blur import describe_blur
@@ -37,10 +38,12 @@ _FEWEST_SEEDS = 12
 _STEPS, _MOST_VIEWS, _MOST_VIEWS_PLANAR = 300, {"cpu": 8, "cuda": 4}, 8
 # Passes of a run that nobody has given a length.
 PASSES = 10.0
-# Steps of a small cloud cost little: with up to so many seeds in matter a run is longer by this factor, in steps and
-# passes, and as it was from 1.5 times as many seeds on. 32^3, 60 views, 300 steps of two views, 600 of one in as many
-# passes, 450 of two (dB without metal): pins 28.5, 28.4, 29.1; pancreas 35.2, 35.3, 35.5. Those of one are noisier.
-_LONGER, _SMALL_CLOUD = 1.5, 6000
+# Steps of a small cloud cost little: with fewer seeds in matter than the second number a run is longer, in steps and
+# passes, by up to the first. 32^3, 60 views, 300 steps of two views, 600 of one in as many passes, 450 of two (dB
+# without metal): pins 28.5, 28.4, 29.1; pancreas 35.2, 35.3, 35.5. Those of one are noisier. Slices gain more, and
+# larger ones too (128^2, twice the passes: steel wires 26.4 to 28.3, soft tissue 44.2 to 45.4), but not the fan-beam
+# slices (22 000 seeds, 1.5 times the passes: 39.6 to 39.6, 37.7 to 37.5): theirs go with the root.
+_LONGER, _LONGER_PLANAR = (1.5, 9000), (2.0, 36_000)
 # Voxels along an edge of the box that is smoothed. What a box seldom meets is smoothed by leaps, which upset the
 # optimiser's sense of scale (teeth, 128^3 voxels: 39.1, 39.7 and 40.2 dB with 32, 64 and 128).
 _TV_BOX, _TV_BOX_PLANAR = {"cpu": 48, "cuda": 128}, 256
@@ -113,8 +116,8 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     support = int((start > least).sum())
     spacing, finer, because = _seed_spacing(start, least, support, problem, settings, device)
     most = _MOST_VIEWS_PLANAR if problem.planar else _MOST_VIEWS[device]
-    seeds = math.inf if problem.planar else _cells(support, problem) / spacing**3
-    passes, views, reason = _length(problem.geometry.views, settings, most, seeds)
+    longer = _longer(_cells(support, problem) / spacing ** (2 if problem.planar else 3), problem.planar)
+    passes, views, reason = _length(problem.geometry.views, settings, most, longer)
     box = settings.tv_box or (_TV_BOX_PLANAR if problem.planar else _TV_BOX[device])
     soft = reference * problem.depth
     curves, needed = _curves(start, soft, problem.polychromatic, settings)
@@ -140,7 +143,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
         "texture": texture,
         "detector_blur": told,
         "passes": f"{passes:g} over the views at most, fewer where {settings.held_out:.1%} of the rays, held"
-        f" out of the fit, have not improved for {settings.patience}",
+        f" out of the fit, have not improved for {patience_of(settings, passes)}",
     }
     return plan
 
@@ -269,13 +272,20 @@ def _smoothed(box: int, start: np.ndarray | torch.Tensor, settings: Settings) ->
     return f"{where}: {'asked for' if settings.tv_box else 'what a step has time for'}"
 
 
-def _length(views: int, settings: Settings, most: int, seeds: float) -> tuple[float, int, str]:
+def _longer(seeds: float, planar: bool) -> float:
+    """How many times as long the run of a cloud of so many seeds may be."""
+    most, many = _LONGER_PLANAR if planar else _LONGER
+    ratio = many / max(1.0, seeds)
+    return round(min(most, max(1.0, math.sqrt(ratio) if planar else ratio)), 2)
+
+
+def _length(views: int, settings: Settings, most: int, longer: float) -> tuple[float, int, str]:
     """Passes, views of a step, and why so many of these: as many as leave enough steps."""
-    passes, longer = settings.passes or PASSES, 1.0
+    passes = settings.passes or PASSES
     together = max(1, min(views, most, round(passes * views / _STEPS)))
     # Not where views are so few that a step has one of them.
-    if not settings.passes and together > 1:
-        longer = min(_LONGER, max(1.0, _LONGER * _SMALL_CLOUD / max(1.0, seeds)))
+    if settings.passes or together == 1:
+        longer = 1.0
     passes *= longer
     if settings.views_per_step:
         return passes, min(views, settings.views_per_step), "asked for"

@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from tomo_polysplat.fit.stopping import patience_of
+
 if TYPE_CHECKING:
     from tomo_polysplat.fit.plan import Plan
     from tomo_polysplat.fit.problem import Problem
@@ -47,7 +49,7 @@ def alternatives(plan: Plan, problem: Problem, settings: Settings, gaussians: in
         "seed_spacing": f"{half:.2g}: {2**dims} times the Gaussians, twice the pairs",
         "support_level": f"0: up to {everywhere:.3g} Gaussians for {gaussians}, the empty space with them",
         "passes": f"{2 * plan.passes:g} for {plan.passes:g}: twice the time",
-        "patience": f"{settings.patience} passes without improvement end it sooner",
+        "patience": f"{patience_of(settings, plan.passes)} passes without improvement end it sooner",
         "tv_weight": "0: no smoothed box, which on a CPU takes about half of the time",
     }
     if plan.views_per_step > 1:
