@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from tomo_polysplat.model.gaussians import Gaussians
-from tomo_polysplat.render.metal_edges import tail_factors
 from tomo_polysplat.render.renderer import (
     VOXEL_CUTOFF,
     detector_views,
@@ -157,28 +156,3 @@ def test_no_gaussians_are_a_volume_of_zeros():
     for voxelise in (voxelise_gaussians, voxelise_means):
         volume = voxelise(gaussians, gaussians.weights(None), voxel_box(cube(5)), KERNEL)
         assert volume.shape == (1, 5, 5, 5) and not bool(volume.any())
-
-
-@pytest.mark.parametrize("shape", [(1, 9, 8), (2, 9, 8), (7, 9, 8), (2, 2, 2), (1, 1, 3)])
-def test_tails_of_metal_go_back_inside_it(shape):
-    metal, rest = torch.zeros(shape), torch.ones(shape)
-    centre = tuple(n // 2 for n in shape)
-    left = (centre[0], centre[1], centre[2] - 1)
-    metal[centre], metal[left] = 10.0, 0.5
-    moved = metal * tail_factors(metal, rest, 0.07)
-    assert float(moved[left]) == 0 and float(moved[centre]) == pytest.approx(10.5)
-    assert bool((tail_factors(metal, rest, 0.0) == 1).all())
-
-
-def test_a_tail_fills_what_the_fit_has_dug_for_it():
-    """The rays see the sum: a voxel whose soft matter makes room for a tail is soft matter."""
-    metal, rest = torch.zeros(5, 6, 7), torch.ones(5, 6, 7)
-    metal[2, 3, 3], metal[2, 3, 4], rest[2, 3, 4] = 10.0, 0.5, 0.7
-    volume = rest + metal * tail_factors(metal, rest, 0.07)
-    assert float(volume[2, 3, 4]) == pytest.approx(1.0)
-    assert float(volume.sum()) == pytest.approx(float((rest + metal).sum()))
-
-
-def test_what_is_no_tail_stays():
-    metal = torch.full((4, 5, 6), 2.0)
-    assert torch.allclose(tail_factors(metal, torch.ones_like(metal), 0.07), torch.ones_like(metal))

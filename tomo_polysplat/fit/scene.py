@@ -14,7 +14,7 @@ from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.detector_blur import blurred
 from tomo_polysplat.physics.quadrature import Quadrature
 from tomo_polysplat.physics.transmission import polychromatic_projection
-from tomo_polysplat.render.metal_edges import tail_factors
+from tomo_polysplat.render.metal_edges import tail_factors, tails
 from tomo_polysplat.render.renderer import project_gaussians, voxelise_gaussians, voxelise_means
 
 __all__ = ["FitScene"]
@@ -44,7 +44,7 @@ class FitScene:
     kernel : str
     cutoff : float
     metal_tail : float
-        Share of a neighbour's metal below which a voxel's metal is a tail; see ``render.metal_edges``.
+        Share of the metal around a voxel that some point of it has to reach; see ``render.metal_edges``.
     blurring : bool
         Whether rays are seen through the detector's blur; see ``physics.detector_blur``.
     tv_box : int
@@ -116,12 +116,14 @@ class FitScene:
     def _means(self, gaussians: Gaussians, weights: torch.Tensor) -> torch.Tensor:
         """Means over the voxels, with the tails of metal put back inside it."""
         metal = gaussians.group > 0
-        parts = []
-        for chosen in (~metal, metal):
-            index = chosen.nonzero()[:, 0]
-            parts.append(voxelise_means(gaussians.select(index), weights[:, index], self.box, self.kernel))
-        rest, inside = parts
-        return rest + inside * tail_factors(self._seen(inside), self._seen(rest), self.metal_tail)
+        chosen = [flag.nonzero()[:, 0] for flag in (~metal, metal)]
+        rest, inside = (
+            voxelise_means(gaussians.select(index), weights[:, index], self.box, self.kernel)
+            for index in chosen
+        )
+        seen, some = self._seen(inside), gaussians.select(chosen[1])
+        tail = tails(seen, some, self._output_weights(some), self.box, self.kernel, self.metal_tail)
+        return rest + inside * tail_factors(seen, self._seen(rest), tail)
 
     def _seen(self, densities: torch.Tensor) -> torch.Tensor:
         """(nz, ny, nx) attenuation at the effective energy, of (channels, nz, ny, nx) densities or of itself."""

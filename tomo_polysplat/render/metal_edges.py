@@ -6,17 +6,63 @@ from collections.abc import Callable
 
 import torch
 
-__all__ = ["tail_factors"]
+from tomo_polysplat.kernels.voxelise.box import VoxelBox
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.render.renderer import voxelise_peaks
 
+__all__ = ["tail_factors", "tails"]
+
+# Voxels about one whose largest metal is the level of the metal there: the next ones may all be at its surface.
+_AROUND = 2
 # Metal below this share of what else a voxel holds leaves it clean enough to tell what lies beside the metal.
 _CLEAN = 0.02
 
 
-def tail_factors(metal: torch.Tensor, rest: torch.Tensor, share: float) -> torch.Tensor:
+def tails(
+    metal: torch.Tensor,
+    gaussians: Gaussians,
+    weights: torch.Tensor,
+    box: VoxelBox,
+    kernel: str,
+    level: float,
+) -> torch.Tensor:
+    """Which voxels lie outside the metal and hold tails of its Gaussians.
+
+    The surface of a solid that is seen a little blurred lies where half of what it holds is reached; a voxel no
+    point of which reaches ``level`` times the metal around it lies outside.
+
+    Parameters
+    ----------
+    metal : (nz, ny, nx) tensor
+        Attenuation of the metal, means over the voxels of ``box``.
+    gaussians, weights, kernel
+        The metal's Gaussians and their (1, n) attenuation; see ``render.renderer``.
+    level : float
+        0: none.
+
+    Returns
+    -------
+    (nz, ny, nx) bool tensor
+    """
+    if not len(gaussians):
+        return torch.zeros_like(metal, dtype=torch.bool)
+    needed = level * _pooled(metal, _AROUND, torch.nn.functional.max_pool3d)
+    found = (metal > 0) & (metal < needed)
+    where = found.nonzero()
+    if not len(where):
+        return found
+    low, end = where.amin(dim=0).tolist(), (where.amax(dim=0) + 1).tolist()
+    z, y, x = (slice(*ends) for ends in zip(low, end))
+    shape = tuple(b - a for a, b in zip(low, end))
+    peaks = voxelise_peaks(gaussians, weights, box.part(tuple(low), shape), kernel)[0]
+    found[z, y, x] &= peaks < needed[z, y, x]
+    return found
+
+
+def tail_factors(metal: torch.Tensor, rest: torch.Tensor, tail: torch.Tensor) -> torch.Tensor:
     """What to multiply each voxel's metal by, so that faint rims move into the voxels they belong to.
 
-    A voxel that holds less than ``share`` of the largest metal among itself and its neighbours holds the tail of
-    a Gaussian, not metal; what it holds goes to those neighbours that are metal, in proportion to what they
+    What a voxel outside the metal holds goes to those neighbours that are metal, in proportion to what they
     hold. One percent of iron is as bright as water, so such tails would dominate the error of what surrounds
     metal. Where the fit has lowered the rest of a voxel to make room for a tail, as much of the tail stays as
     brings the voxel to the level of clean voxels nearby: the rays see only the sum.
@@ -25,20 +71,19 @@ def tail_factors(metal: torch.Tensor, rest: torch.Tensor, share: float) -> torch
     ----------
     metal, rest : (nz, ny, nx) tensor
         Attenuation of the metal alone, and of all else.
-    share : float
-        0 leaves everything as it is.
+    tail : (nz, ny, nx) bool tensor
+        Voxels that hold tails; see `tails`.
 
     Returns
     -------
     (nz, ny, nx) tensor
         The attenuation of the metal, summed over all voxels, is kept.
     """
-    if share <= 0 or not bool((metal > 0).any()):
+    if not bool(tail.any()):
         return torch.ones_like(metal)
-    tail = metal < share * _pooled(metal, 1, torch.nn.functional.max_pool3d)
     owner = _around(metal.masked_fill(tail, 0.0), 1)
-    # A tail without metal beside it has nowhere to go and stays.
-    tail &= owner > 0
+    # A tail without metal beside it that could own it has nowhere to go and stays.
+    tail = tail & (owner >= metal)
     clean = (metal <= _CLEAN * rest).to(metal.dtype)
     known = _around(clean, 2)
     level = torch.where(known > 0, _around(rest * clean, 2) / known.clamp(min=1), rest)

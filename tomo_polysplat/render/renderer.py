@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 
@@ -19,6 +21,7 @@ __all__ = [
     "voxel_box",
     "voxelise_gaussians",
     "voxelise_means",
+    "voxelise_peaks",
 ]
 
 # Where a volume's Gaussians end so that they hold the same mass as a projected one cut at 3 deviations,
@@ -26,6 +29,8 @@ __all__ = [
 VOXEL_CUTOFF = 3.33424
 # Samples a voxel and axis for thin Gaussians, at least and at most, and how many samples are held at once.
 _SAMPLES, _MOST_SAMPLES, _SLAB = 3, 24, 1 << 25
+# Samples a voxel and axis that tell how high the Gaussians are somewhere in it.
+_PEAK_SAMPLES = 5
 # Deviations from sample to sample. The mean of a Gaussian over such samples is right within
 # 2 exp(-2 pi^2 / 1.67^2) = 0.2 % wherever they fall (Poisson's summation formula).
 _SAMPLE_STEP = 5 / 3
@@ -90,13 +95,35 @@ def voxelise_means(gaussians: Gaussians, weights: torch.Tensor, box: VoxelBox, k
     if len(thin):
         some, heights = gaussians.select(thin), weights[:, thin]
         fine = _samples(box, float(some.log_scale.exp().amin()), planar=dims == 2)
-        depth = max(1, _SLAB // int(np.prod(fine) * box.shape[1] * box.shape[2]))
-        for low in range(0, box.shape[0], depth):
-            shape = (min(depth, box.shape[0] - low), *box.shape[1:])
-            samples = voxelise_gaussians(some, heights, box.part((low, 0, 0), shape).refined(fine), kernel)
-            blocks = [n for pair in zip(shape, fine) for n in pair]
-            volume[:, low : low + shape[0]] += samples.reshape(len(weights), *blocks).mean(dim=(2, 4, 6))
+        volume += _of_samples(some, heights, box, kernel, fine, torch.mean)
     return volume
+
+
+def voxelise_peaks(gaussians: Gaussians, weights: torch.Tensor, box: VoxelBox, kernel: str) -> torch.Tensor:
+    """(channels, nz, ny, nx) largest sums of the Gaussians among points in each voxel; not differentiable."""
+    fine = np.full(3, _PEAK_SAMPLES)
+    if gaussians.planar:
+        fine[0] = 1
+    return _of_samples(gaussians, weights, box, kernel, fine, torch.amax)
+
+
+def _of_samples(
+    gaussians: Gaussians,
+    weights: torch.Tensor,
+    box: VoxelBox,
+    kernel: str,
+    fine: np.ndarray,
+    what: Callable[..., torch.Tensor],
+) -> torch.Tensor:
+    """What is made, over each voxel, of the Gaussians at ``fine`` (z, y, x) points of it, slab by slab."""
+    depth = max(1, _SLAB // int(np.prod(fine) * box.shape[1] * box.shape[2]))
+    slabs = []
+    for low in range(0, box.shape[0], depth):
+        shape = (min(depth, box.shape[0] - low), *box.shape[1:])
+        samples = voxelise_gaussians(gaussians, weights, box.part((low, 0, 0), shape).refined(fine), kernel)
+        blocks = [n for pair in zip(shape, fine) for n in pair]
+        slabs.append(what(samples.reshape(len(weights), *blocks), dim=(2, 4, 6)))
+    return torch.cat(slabs, dim=1)
 
 
 def _samples(box: VoxelBox, thinnest: float, *, planar: bool) -> np.ndarray:
