@@ -113,6 +113,28 @@ def test_projections_on_the_host_give_the_same_steps():
 
 
 @pytest.mark.gpu
+def test_another_number_of_views_or_gaussians_compiles_nothing(monkeypatch):
+    """Which would take longer than many a pass over the views."""
+    import triton
+
+    from tomo_polysplat.kernels.step.triton_blur import _blurred_kernel
+
+    compiled = []
+    monkeypatch.setattr(
+        triton.knobs.runtime, "jit_post_compile_hook", lambda **about: compiled.append(about["repr"])
+    )
+    _blurred_kernel.device_caches.clear()
+    found = []
+    for count, batch in ((17, 2), (16, 1), (33, 3)):
+        compiled.clear()
+        problem = fit_problem("cone", True, "cuda", "triton", count=count)
+        step = graph_step(*problem[:-1], batch, problem[-1])
+        step(np.arange(batch), problem[-1], 0.0)
+        found.append(list(compiled))
+    assert found[0] and found[1:] == [[], []]
+
+
+@pytest.mark.gpu
 def test_a_graph_that_cannot_be_recorded_is_said_and_replaced(monkeypatch, caplog):
     problem = fit_problem("cone", True, "cuda", "triton")
     before = problem[0].copy()

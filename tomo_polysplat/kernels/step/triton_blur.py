@@ -59,8 +59,8 @@ def _sharp_kernel(
 @triton.jit(do_not_specialize=SIZES)
 def _blurred_kernel(
     sharp, slopes, blur, grad_blur, chosen, projections, totals, sums,
-    area, rows, columns, noise, held_out, corner,
-    HUBER: tl.constexpr, MANY: tl.constexpr, BLOCK: tl.constexpr,
+    area, rows, columns, many, noise, held_out, corner,
+    HUBER: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     k = tl.program_id(1).to(tl.int64)
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -77,8 +77,8 @@ def _blurred_kernel(
             predicted += along_v * along_u * beside
             by_variance += (slope_v * along_u + along_v * slope_u) * beside
     slope = ray_misfit(
-        predicted, projections, totals, chosen, sums, k, pixel, inside, area, noise, held_out, corner,
-        HUBER, MANY,
+        predicted, projections, totals, chosen, sums, k, pixel, inside, area, many, noise, held_out, corner,
+        HUBER,
     )  # fmt: skip
     slope = tl.where(inside, slope, 0.0)
     total = tl.sum((slope * by_variance).to(tl.float64), 0)
@@ -89,13 +89,13 @@ def _blurred_kernel(
 @triton.jit(do_not_specialize=SIZES)
 def _gather_kernel(
     raw, pixels, table, slopes, blur, log_weights, attenuation,
-    area, rows, columns, beyond, nodes, areal_scale,
-    CURVES: tl.constexpr, CONE: tl.constexpr, MANY: tl.constexpr, BLOCK: tl.constexpr,
+    area, rows, columns, beyond, many, nodes, areal_scale,
+    CURVES: tl.constexpr, CONE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     k = tl.program_id(1).to(tl.int64)
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = pixel < area
-    live = pixel < tl.where(k == MANY - 1, area + beyond, area)
+    live = pixel < tl.where(k == many - 1, area + beyond, area)
     row, column, variance = pixel // columns, pixel % columns, tl.load(blur)
     factor = pixel_factor(table, k, pixel, columns, CONE) * areal_scale
     at = k * area + tl.minimum(pixel, area - 1)
@@ -134,13 +134,13 @@ def blurred_misfit_gradient(splat: Splat, blur: torch.Tensor, grad_blur: torch.T
         )  # fmt: skip
         _blurred_kernel[splat.blocks()](
             sharp, slopes, blur, grad_blur, splat.chosen, measurement.projections, measurement.totals,
-            splat.sums, splat.area, views.rows, views.columns,
+            splat.sums, splat.area, views.rows, views.columns, len(views),
             measurement.noise, measurement.held_out, measurement.corner,
-            HUBER=measurement.corner > 0, MANY=len(views), BLOCK=PIXELS_A_PROGRAM, num_warps=4,
+            HUBER=measurement.corner > 0, BLOCK=PIXELS_A_PROGRAM, num_warps=4,
         )  # fmt: skip
         _gather_kernel[splat.blocks(splat.beyond)](
             splat.raw, pixels, splat.table, slopes, blur, log_weights, attenuation,
-            splat.area, views.rows, views.columns, splat.beyond, nodes, measurement.areal_scale,
-            CURVES=measurement.curves, CONE=views.cone, MANY=len(views), BLOCK=PIXELS_A_PROGRAM, num_warps=4,
+            splat.area, views.rows, views.columns, splat.beyond, len(views), nodes, measurement.areal_scale,
+            CURVES=measurement.curves, CONE=views.cone, BLOCK=PIXELS_A_PROGRAM, num_warps=4,
         )  # fmt: skip
     return pixels

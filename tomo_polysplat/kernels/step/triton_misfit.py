@@ -189,11 +189,11 @@ def sharp_projection(raw, at, factor, log_weights, attenuation, nodes, CURVES: t
 
 @triton.jit
 def ray_misfit(
-    predicted, projections, totals, chosen, sums, k, pixel, inside, area, noise, held_out, corner,
-    HUBER: tl.constexpr, MANY: tl.constexpr,
+    predicted, projections, totals, chosen, sums, k, pixel, inside, area, many, noise, held_out, corner,
+    HUBER: tl.constexpr,
 ):  # fmt: skip
     """Gradient of the misfit by the projection; what there is to read of it is added to ``sums``."""
-    view, slot = tl.load(chosen + k).to(tl.int64), tl.load(chosen + MANY + k).to(tl.int64)
+    view, slot = tl.load(chosen + k).to(tl.int64), tl.load(chosen + many + k).to(tl.int64)
     value = tl.load(projections + slot * area + pixel, mask=inside, other=float("nan"))
     usable = tl.abs(value) < float("inf")
     value = tl.where(usable, value, 0.0)
@@ -209,7 +209,7 @@ def ray_misfit(
         loss = tl.where(near, scaled * scaled / (2 * corner), scaled - 0.5 * corner)
         slope = tl.where(near, weight * scaled / corner, weight)
     total = tl.zeros([], tl.float32)
-    for j in tl.static_range(MANY):
+    for j in range(many):
         total += tl.load(totals + tl.load(chosen + j).to(tl.int64))
     by_total = 1.0 / tl.maximum(total, 1e-12)
     loss = tl.where(weight > 0, loss, 0.0)
@@ -232,21 +232,20 @@ def store_gradients(pixels, to, slope, d0, d1, d2, live, CURVES: tl.constexpr):
 @triton.jit(do_not_specialize=SIZES)
 def _misfit_kernel(
     raw, pixels, table, chosen, projections, totals, log_weights, attenuation, sums, largest,
-    area, columns, beyond, nodes, noise, held_out, corner, areal_scale,
-    CURVES: tl.constexpr, CONE: tl.constexpr, HUBER: tl.constexpr, MANY: tl.constexpr,
-    BLOCK: tl.constexpr,
+    area, columns, beyond, many, nodes, noise, held_out, corner, areal_scale,
+    CURVES: tl.constexpr, CONE: tl.constexpr, HUBER: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     k = tl.program_id(1).to(tl.int64)
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = pixel < area
-    live = pixel < tl.where(k == MANY - 1, area + beyond, area)
+    live = pixel < tl.where(k == many - 1, area + beyond, area)
     factor = pixel_factor(table, k, pixel, columns, CONE) * areal_scale
     at = k * area + tl.minimum(pixel, area - 1)
     most, predicted, d0, d1, d2 = sharp_projection(raw, at, factor, log_weights, attenuation, nodes, CURVES)
     tl.atomic_max(largest, tl.max(most, 0), sem="relaxed")
     slope = ray_misfit(
-        predicted, projections, totals, chosen, sums, k, pixel, inside, area, noise, held_out, corner,
-        HUBER, MANY,
+        predicted, projections, totals, chosen, sums, k, pixel, inside, area, many, noise, held_out, corner,
+        HUBER,
     )  # fmt: skip
     store_gradients(pixels, k * area + pixel, slope * factor, d0, d1, d2, live, CURVES)
 
@@ -259,9 +258,9 @@ def misfit_gradient(splat: Splat) -> torch.Tensor:
         _misfit_kernel[splat.blocks(splat.beyond)](
             splat.raw, pixels, splat.table, splat.chosen, measurement.projections, measurement.totals,
             log_weights, attenuation, splat.sums, splat.largest,
-            splat.area, splat.views.columns, splat.beyond, nodes,
+            splat.area, splat.views.columns, splat.beyond, len(splat.views), nodes,
             measurement.noise, measurement.held_out, measurement.corner, measurement.areal_scale,
             CURVES=measurement.curves, CONE=splat.views.cone, HUBER=measurement.corner > 0,
-            MANY=len(splat.views), BLOCK=PIXELS_A_PROGRAM, num_warps=4,
+            BLOCK=PIXELS_A_PROGRAM, num_warps=4,
         )  # fmt: skip
     return pixels
