@@ -69,6 +69,7 @@ class Settings:
     learning_rate_scale: float = 4e-2
     """Per step, relative."""
     learning_rate_rotation: float = 3e-3
+    """Per step, of the quaternion; up to seven times as much in a run of fewer than 900 steps."""
     learning_rate_attenuation: float = 1e-2
     learning_rate_material: float = 3e-3
     learning_rate_shared: float = 5e-3

@@ -81,6 +81,17 @@ def graph_step(*problem):
     return GraphStep(*problem)
 
 
+def test_gaussians_turn_from_the_second_step_on():
+    """What would turn a round one in the first is rounding."""
+    gaussians, *problem = fit_problem("cone", True, "cpu", "numba")
+    before, step = gaussians.copy(), EagerStep(gaussians, *problem[:-1])
+    step(np.array([0, 1]), problem[-1], 0.0)
+    assert torch.equal(gaussians.rotation, before.rotation)
+    assert not torch.equal(gaussians.position, before.position)
+    step(np.array([2, 3]), problem[-1], 0.5)
+    assert not torch.equal(gaussians.rotation, before.rotation)
+
+
 @pytest.mark.gpu
 @pytest.mark.parametrize(
     ("kind", "polychromatic", "changes"),

@@ -14,7 +14,7 @@ import torch
 from tomo_polysplat.fit.feed import feed
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.fit.step import EPSILON, held_out_mean, log_scale_bounds, new_moments, step_rates
+from tomo_polysplat.fit.step import EPSILON, held_out_mean, log_scale_bounds, new_moments, step_rates, turning
 from tomo_polysplat.kernels.project import triton_backward as rays_backward
 from tomo_polysplat.kernels.project import triton_forward as rays_forward
 from tomo_polysplat.kernels.project.triton_pull_back import pull_back as rays_pull_back
@@ -140,11 +140,12 @@ class FusedStep:
 
     def _next(self, views: np.ndarray, box: VoxelBox, share: float) -> np.ndarray:
         """What the control tensor must hold for the next step."""
+        turns = turning(self.done)
         self.done += 1
         self._unread += 1
         rate = self.settings.final_rate**share / (1 - FIRST_DECAY**self.done)
         root = math.sqrt(1 - SECOND_DECAY**self.done)
-        head = [rate, root, float(share >= self.settings.material_from), 0.0]
+        head = [rate, root, float(share >= self.settings.material_from), turns]
         slots = self.feed.place(views)
         return np.concatenate([head, box.first, box.spacing, views, slots, self._table[views].ravel()])
 

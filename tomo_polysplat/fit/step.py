@@ -26,6 +26,7 @@ __all__ = [
     "log_scale_bounds",
     "new_moments",
     "step_rates",
+    "turning",
 ]
 
 # Of Adam, so small that gradients of any unit give the same steps.
@@ -80,6 +81,14 @@ def step_rates(settings: Settings, spacing: float) -> dict[str, float]:
     }
 
 
+def turning(done: int) -> float:
+    """Whether Gaussians may turn after so many steps, as a factor: not in the first one.
+
+    Seeds are round, so what would turn them there is rounding, and Adam makes large steps of it.
+    """
+    return float(done > 0)
+
+
 def log_scale_bounds(
     scene: FitScene, spacing: float, planar: bool, settings: Settings
 ) -> tuple[float, float]:
@@ -112,6 +121,7 @@ class EagerStep:
         rates = step_rates(settings, spacing)
         groups = [{"params": [parameters[k].requires_grad_()], "lr": v, "rate": v} for k, v in rates.items()]
         self.optimiser = torch.optim.Adam(groups, eps=EPSILON, fused=True)
+        self._turns = self.optimiser.param_groups[list(rates).index("rotation")]
         self.moments = new_moments(parameters)
         for name, tensor in parameters.items():
             first, second = self.moments[name]
@@ -136,6 +146,7 @@ class EagerStep:
         """One step; see `Step`."""
         for group in self.optimiser.param_groups:
             group["lr"] = group["rate"] * self.settings.final_rate**share
+        self._turns["lr"] *= turning(self._done)
         chosen, measured, weight, aside = self.rays.batch(views)
         predicted, skipped = self.scene.projections(self.gaussians, chosen)
         fitted = misfit(predicted, measured, weight, self.settings)

@@ -114,10 +114,11 @@ def _update_kernel(
         rate = tl.load(rates + 1) * share
         p = _adam(log_scale, log_scale_1, log_scale_2, at, live, gradient, rate, root, epsilon)
         tl.store(log_scale + at, _kept(p, low, high), mask=live)
+    turning = tl.load(control + 3).to(tl.float32)
     for k in tl.static_range(4):
         at = n * 4 + k
         gradient = _both(grad_rotation, box_rotation, at, live)
-        rate = tl.load(rates + 2) * share
+        rate = tl.load(rates + 2) * share * turning
         p = _adam(rotation, rotation_1, rotation_2, at, live, gradient, rate, root, epsilon)
         tl.store(rotation + at, p, mask=live)
     height = tl.load(attenuation + n, mask=live, other=0.0)
@@ -181,8 +182,8 @@ def update(
     state : tuple of tensors
         Gradients of the shared numbers (groups,) and of the blur (1,), int64 and left at zero; pull (n,), to
         which the lengths of the gradients by position are added; rates (7,) in the order of the parameters;
-        control (3,) float64: the share of the rates over Adam's first bias correction, the root of its second
-        one, and whether the metals' shared numbers may move.
+        control (4,) float64: the share of the rates over Adam's first bias correction, the root of its second
+        one, whether the metals' shared numbers may move, and whether Gaussians may turn.
     bounds : Bounds
     blurring : bool
         Whether the blur is fitted.
