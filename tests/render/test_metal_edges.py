@@ -6,6 +6,7 @@ import torch
 
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.render import renderer
 from tomo_polysplat.render.metal_edges import tail_factors, tails
 from tomo_polysplat.render.renderer import voxelise_gaussians, voxelise_means, voxelise_peaks
 
@@ -114,3 +115,16 @@ def test_a_crumb_of_metal_does_not_get_what_is_more_than_itself():
     metal, rest = torch.zeros(5, 6, 7), torch.ones(5, 6, 7)
     metal[2, 3, 3], metal[2, 3, 4] = 0.1, 0.5
     assert bool((tail_factors(metal, rest, metal == 0.5) == 1).all())
+
+
+@pytest.mark.parametrize("planar", [True, False])
+@pytest.mark.parametrize("room", [1, 3000, 1 << 25])
+def test_samples_are_the_same_in_parts_of_any_size(planar, room, monkeypatch):
+    """From a row of voxels at a time to all of the volume."""
+    gaussians, where = block(planar, 3.0, 6.4), box(planar)
+    weights = gaussians.weights(None)
+    whole = [f(gaussians, weights, where, KERNEL) for f in (voxelise_peaks, voxelise_means)]
+    monkeypatch.setattr(renderer, "_SLAB", room)
+    parts = [f(gaussians, weights, where, KERNEL) for f in (voxelise_peaks, voxelise_means)]
+    for one, other in zip(whole, parts):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)

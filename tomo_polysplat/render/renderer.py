@@ -27,7 +27,7 @@ __all__ = [
 # Where a volume's Gaussians end so that they hold the same mass as a projected one cut at 3 deviations,
 # 1 - exp(-9/2) of the whole: the solution c of erf(c/sqrt 2) - sqrt(2/pi) c exp(-c^2/2) = 1 - exp(-9/2).
 VOXEL_CUTOFF = 3.33424
-# Samples a voxel and axis for thin Gaussians, at least and at most, and how many samples are held at once.
+# Samples a voxel and axis for thin Gaussians, at least and at most, and how many samples are held at once at most.
 _SAMPLES, _MOST_SAMPLES, _SLAB = 3, 24, 1 << 25
 # Samples a voxel and axis that tell how high the Gaussians are somewhere in it.
 _PEAK_SAMPLES = 5
@@ -84,8 +84,7 @@ def voxelise_means(gaussians: Gaussians, weights: torch.Tensor, box: VoxelBox, k
     """(channels, nz, ny, nx) means of the Gaussians over the voxels; not differentiable.
 
     Gaussians thinner than half a voxel would show or not show by where they lie between the voxel centres, so
-    these are sampled at several points a voxel, slab by slab of the part of the volume that they reach; along
-    the long edges of an oblong voxel at more.
+    these are sampled at several points a voxel, along the long edges of an oblong voxel at more.
     """
     dims = gaussians.log_scale.shape[1]
     edge = torch.as_tensor(box.spacing[:dims].copy(), dtype=torch.float32, device=weights.device)
@@ -115,15 +114,20 @@ def _of_samples(
     fine: np.ndarray,
     what: Callable[..., torch.Tensor],
 ) -> torch.Tensor:
-    """What is made, over each voxel, of the Gaussians at ``fine`` (z, y, x) points of it, slab by slab."""
-    depth = max(1, _SLAB // int(np.prod(fine) * box.shape[1] * box.shape[2]))
-    slabs = []
-    for low in range(0, box.shape[0], depth):
-        shape = (min(depth, box.shape[0] - low), *box.shape[1:])
-        samples = voxelise_gaussians(gaussians, weights, box.part((low, 0, 0), shape).refined(fine), kernel)
-        blocks = [n for pair in zip(shape, fine) for n in pair]
-        slabs.append(what(samples.reshape(len(weights), *blocks), dim=(2, 4, 6)))
-    return torch.cat(slabs, dim=1)
+    """What is made, over each voxel, of the Gaussians at ``fine`` (z, y, x) points of it, part by part."""
+    nz, ny, nx = box.shape
+    line = int(np.prod(fine)) * nx
+    rows = min(ny, max(1, _SLAB // line))
+    depth = max(1, _SLAB // (line * rows))
+    made = weights.new_empty((len(weights), nz, ny, nx))
+    for z in range(0, nz, depth):
+        for y in range(0, ny, rows):
+            shape = (min(depth, nz - z), min(rows, ny - y), nx)
+            samples = voxelise_gaussians(gaussians, weights, box.part((z, y, 0), shape).refined(fine), kernel)
+            blocks = [n for pair in zip(shape, fine) for n in pair]
+            part = what(samples.reshape(len(weights), *blocks), dim=(2, 4, 6))
+            made[:, z : z + shape[0], y : y + shape[1]] = part
+    return made
 
 
 def _samples(box: VoxelBox, thinnest: float, *, planar: bool) -> np.ndarray:
