@@ -111,6 +111,13 @@ def test_a_tail_fills_what_the_fit_has_dug_for_it():
     assert float(volume.sum()) == pytest.approx(float((rest + metal).sum()))
 
 
+def test_what_is_no_tail_stays():
+    metal, gaussians = torch.full((4, 5, 6), 2.0), block(False, 3.0, 7.0)
+    where = VoxelBox(np.zeros(3), np.full(3, VOXEL), (4, 5, 6))
+    tail = tails(metal, gaussians, gaussians.weights(None), where, KERNEL, 0.5)
+    assert torch.allclose(tail_factors(metal, torch.ones_like(metal), tail), torch.ones_like(metal))
+
+
 def test_a_crumb_of_metal_does_not_get_what_is_more_than_itself():
     metal, rest = torch.zeros(5, 6, 7), torch.ones(5, 6, 7)
     metal[2, 3, 3], metal[2, 3, 4] = 0.1, 0.5

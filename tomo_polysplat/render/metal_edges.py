@@ -44,7 +44,7 @@ def tails(
     -------
     (nz, ny, nx) bool tensor
     """
-    if not len(gaussians):
+    if not (level and len(gaussians)):
         return torch.zeros_like(metal, dtype=torch.bool)
     needed = level * _pooled(metal, _AROUND, torch.nn.functional.max_pool3d)
     found = (metal > 0) & (metal < needed)

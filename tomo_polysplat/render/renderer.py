@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
@@ -94,7 +94,8 @@ def voxelise_means(gaussians: Gaussians, weights: torch.Tensor, box: VoxelBox, k
     if len(thin):
         some, heights = gaussians.select(thin), weights[:, thin]
         fine = _samples(box, float(some.log_scale.exp().amin()), planar=dims == 2)
-        volume += _of_samples(some, heights, box, kernel, fine, torch.mean)
+        for where, means in _of_samples(some, heights, box, kernel, fine, torch.mean):
+            volume[where] += means
     return volume
 
 
@@ -103,7 +104,10 @@ def voxelise_peaks(gaussians: Gaussians, weights: torch.Tensor, box: VoxelBox, k
     fine = np.full(3, _PEAK_SAMPLES)
     if gaussians.planar:
         fine[0] = 1
-    return _of_samples(gaussians, weights, box, kernel, fine, torch.amax)
+    volume = weights.new_empty((len(weights), *box.shape))
+    for where, peaks in _of_samples(gaussians, weights, box, kernel, fine, torch.amax):
+        volume[where] = peaks
+    return volume
 
 
 def _of_samples(
@@ -113,21 +117,19 @@ def _of_samples(
     kernel: str,
     fine: np.ndarray,
     what: Callable[..., torch.Tensor],
-) -> torch.Tensor:
-    """What is made, over each voxel, of the Gaussians at ``fine`` (z, y, x) points of it, part by part."""
+) -> Iterator[tuple[tuple[slice, ...], torch.Tensor]]:
+    """Part by part of the volume, where it lies and what is made of the ``fine`` (z, y, x) points of each voxel."""
     nz, ny, nx = box.shape
     line = int(np.prod(fine)) * nx
     rows = min(ny, max(1, _SLAB // line))
     depth = max(1, _SLAB // (line * rows))
-    made = weights.new_empty((len(weights), nz, ny, nx))
     for z in range(0, nz, depth):
         for y in range(0, ny, rows):
             shape = (min(depth, nz - z), min(rows, ny - y), nx)
             samples = voxelise_gaussians(gaussians, weights, box.part((z, y, 0), shape).refined(fine), kernel)
             blocks = [n for pair in zip(shape, fine) for n in pair]
-            part = what(samples.reshape(len(weights), *blocks), dim=(2, 4, 6))
-            made[:, z : z + shape[0], y : y + shape[1]] = part
-    return made
+            where = (slice(None), slice(z, z + shape[0]), slice(y, y + shape[1]))
+            yield where, what(samples.reshape(len(weights), *blocks), dim=(2, 4, 6))
 
 
 def _samples(box: VoxelBox, thinnest: float, *, planar: bool) -> np.ndarray:
