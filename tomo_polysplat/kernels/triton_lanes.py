@@ -12,9 +12,20 @@ import torch
 import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
-__all__ = ["SUMS", "add_four", "adds_four", "half_sums", "lane_set", "load_four", "lowest_lane", "store_four"]
+__all__ = [
+    "SUMS",
+    "add_four",
+    "add_halves",
+    "adds_four",
+    "lane_set",
+    "load_four",
+    "lowest_lane",
+    "store_four",
+    "store_sums",
+    "two_lowest",
+]
 
-SUMS = tl.constexpr(16)  # tensors that half_sums takes
+SUMS = tl.constexpr(16)  # tensors that store_sums takes
 # The only switch Triton has; it is read once, when the kernels are defined.
 _INTERPRETED = tl.constexpr(os.environ.get("TRITON_INTERPRET", "0") == "1")
 
@@ -70,49 +81,60 @@ def add_four(at, a, b, c, d, live, AT_ONCE: tl.constexpr):
 
 
 def _butterfly() -> str:
-    """PTX that adds up 16 numbers over each half of a warp: lane l gets the sum of number l % 16.
+    """PTX that adds up 16 numbers over each four neighbouring lanes: lane l gets the sums of numbers 4 (l % 4) on.
 
     In every step a lane hands half of its numbers to its partner and takes the partner's share of the other
-    half, so that 15 exchanges do what 64 would do one number at a time.
+    half, so that 12 exchanges do what 32 would do one number at a time.
     """
     registers = ", ".join(f"v{k}" for k in range(SUMS.value))
     lines = [
         f"{{ .reg .pred p; .reg .b32 lane, bit; .reg .f32 give, keep, {registers}; mov.u32 lane, %laneid;"
     ]
-    lines += [f"mov.f32 v{k}, ${k + 1};" for k in range(SUMS.value)]
-    for half in (8, 4, 2, 1):
-        lines.append(f"and.b32 bit, lane, {half}; setp.ne.u32 p, bit, 0;")
+    lines += [f"mov.f32 v{k}, ${k + 4};" for k in range(SUMS.value)]
+    for half, partner in ((8, 2), (4, 1)):
+        lines.append(f"and.b32 bit, lane, {partner}; setp.ne.u32 p, bit, 0;")
         for k in range(half):
             lines.append(f"selp.f32 give, v{k}, v{k + half}, p; selp.f32 keep, v{k + half}, v{k}, p;")
-            lines.append(f"shfl.sync.bfly.b32 give, give, {half}, 31, -1; add.f32 v{k}, keep, give;")
-    return " ".join([*lines, "mov.f32 $0, v0; }"])
+            lines.append(f"shfl.sync.bfly.b32 give, give, {partner}, 31, -1; add.f32 v{k}, keep, give;")
+    return " ".join([*lines, *(f"mov.f32 ${k}, v{k};" for k in range(4)), "}"])
 
 
 _BUTTERFLY = tl.constexpr(_butterfly())
-_BUTTERFLY_TYPES = tl.constexpr("=f" + ",f" * SUMS.value)
+_BUTTERFLY_TYPES = tl.constexpr(",".join(["=f"] * 4 + ["f"] * SUMS.value))
 
 
 @triton.jit
-def _half_sums(lane, which, total, k: tl.constexpr, value):
-    return tl.where(
-        (lane % 16 == k) & (lane // 16 == which), tl.sum(tl.where(lane // 16 == which, value, 0.0)), total
-    )
+def store_sums(at, live, lane, v0, v1, v2, v3, v4, v5, v6, v7, v8, v9, v10, v11, v12, v13, v14, v15):
+    """Store at ``at``, where ``live``, the 16 numbers summed over four neighbouring lanes of a one-warp program.
 
-
-@triton.jit
-def half_sums(lane, v0, v1, v2, v3, v4, v5, v6, v7, v8, v9, v10, v11, v12, v13, v14, v15):
-    """In lane l of a one-warp program, the sum of tensor l % 16 of these over the lane's half of the warp."""
+    The four lanes have one ``at``, 16-byte aligned.
+    """
     if _INTERPRETED:
         values = (v0, v1, v2, v3, v4, v5, v6, v7, v8, v9, v10, v11, v12, v13, v14, v15)
-        total = tl.zeros_like(v0)
         for k in tl.static_range(16):
-            for which in tl.static_range(2):
-                total = _half_sums(lane, which, total, k, values[k])
-        return total
+            total = tl.sum(tl.reshape(values[k], (8, 4)), 1)[:, None]
+            total = tl.reshape(tl.broadcast_to(total, (8, 4)), (32,))
+            tl.store(at + k, total, mask=live & (lane % 4 == 0))
+    else:
+        s0, s1, s2, s3 = tl.inline_asm_elementwise(
+            _BUTTERFLY, _BUTTERFLY_TYPES,
+            [v0, v1, v2, v3, v4, v5, v6, v7, v8, v9, v10, v11, v12, v13, v14, v15],
+            dtype=(tl.float32, tl.float32, tl.float32, tl.float32), is_pure=False, pack=1,
+        )  # fmt: skip
+        store_four(at + 4 * (lane % 4), s0, s1, s2, s3, live)
+
+
+@triton.jit
+def add_halves(a, b):
+    """In the lower half of a one-warp program's lanes the sums of both halves of ``a``, in the upper those of ``b``."""
+    if _INTERPRETED:
+        sum_a, sum_b = tl.sum(tl.reshape(a, (2, 16)), 0)[None, :], tl.sum(tl.reshape(b, (2, 16)), 0)[None, :]
+        return tl.reshape(tl.where(tl.arange(0, 2)[:, None] == 0, sum_a, sum_b), (32,))
     return tl.inline_asm_elementwise(
-        _BUTTERFLY, _BUTTERFLY_TYPES,
-        [v0, v1, v2, v3, v4, v5, v6, v7, v8, v9, v10, v11, v12, v13, v14, v15],
-        dtype=tl.float32, is_pure=False, pack=1,
+        "{ .reg .pred p; .reg .b32 lane; .reg .f32 give, keep; mov.u32 lane, %laneid; setp.gt.u32 p, lane, 15;"
+        " selp.f32 give, $1, $2, p; selp.f32 keep, $2, $1, p;"
+        " shfl.sync.bfly.b32 give, give, 16, 31, -1; add.f32 $0, keep, give; }",
+        "=f,f,f", [a, b], dtype=tl.float32, is_pure=False, pack=1,
     )  # fmt: skip
 
 
@@ -127,3 +149,15 @@ def lowest_lane(lanes):
     """The lowest bit set in ``lanes``: the exponent of that power of two as a float."""
     power = (lanes & -lanes).to(tl.float32)
     return ((power.to(tl.int32, bitcast=True) >> 23) & 255) - 127
+
+
+@triton.jit
+def two_lowest(lanes, upper, cut):
+    """The lowest bit of ``lanes`` for half of a warp, the next for the ``upper`` half, and the bits left.
+
+    With each comes ``cut``; where there is no second, the upper half has the first again, and -1 for a cut,
+    so that it adds nothing.
+    """
+    rest = lanes & (lanes - 1)
+    which = tl.where(upper & (rest != 0), lowest_lane(rest), lowest_lane(lanes))
+    return which, tl.where(upper & (rest == 0), -1.0, cut), rest & (rest - 1)

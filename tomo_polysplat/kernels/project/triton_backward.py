@@ -1,6 +1,6 @@
 """The adjoint of the projection on CUDA: every Gaussian gathers the gradients of its pixels, without atomics.
 
-Half a warp sums over the pixels of a Gaussian in a view; triton_pull_back.py goes on from these sums.
+Four lanes sum over the pixels of a Gaussian in a view; triton_pull_back.py goes on from these sums.
 """
 
 from __future__ import annotations
@@ -11,50 +11,46 @@ import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.kernels.project.triton_image import spread
 from tomo_polysplat.kernels.project.triton_setup import RECORD, SLACK
-from tomo_polysplat.kernels.triton_lanes import SUMS, half_sums, load_four
+from tomo_polysplat.kernels.triton_lanes import SUMS, load_four, store_sums
 from tomo_polysplat.kernels.triton_maths import HALF_LOG2E, SIZES, on_device
 from tomo_polysplat.kernels.views import DetectorViews
 
 __all__ = ["BLOCK", "beyond", "sum_moments"]
 
-BLOCK = (8, 2)  # rows and columns of the lanes that walk along the rows of a footprint
-_PLANAR_BLOCK = (1, 16)
-_RUN = 4  # times two neighbours handled by one warp: more programs cost more to start than to run
+BLOCK = (2, 2)  # rows and columns of the four lanes that walk along the rows of a footprint
+_PLANAR_BLOCK = (1, 4)
+_RUN = 2  # times eight neighbours handled by one warp: more programs cost more to start than to run
 _TINY = tl.constexpr(1e-20)
 _TWO_LN2 = tl.constexpr(1 / HALF_LOG2E)
 
 
 @triton.jit
-def _row_ends(i, first, high, yc, ry, xc, m, hx, columns, BLOCK_H: tl.constexpr):
-    """First column of the rows ``i`` of the outlines, where they end, and how many columns the widest has."""
-    by_ry = 1.0 / ry
-    offset = i.to(tl.float32) - yc
+def _row_ends(offset, known, by_ry, ry, xc, m, hx, columns):
+    """First column of the rows at ``offset`` from their outlines' middles, and where they end: -1 if not ``known``."""
     u = offset * by_ry
     half = hx * tl.sqrt(tl.maximum(1.0 - u * u, 0.0))
     middle = xc + m * offset
     start = tl.math.ceil(tl.minimum(tl.maximum(middle - half, 0.0), columns + 0.0))
-    stop = tl.where(i <= high, tl.minimum(middle + half, columns - 0.5), -1.0)
-    # The row nearest to the middle is the widest.
-    top = first.to(tl.float32)
-    u = (tl.minimum(tl.maximum(yc, top), top + (BLOCK_H - 1)) - yc) * by_ry
-    wide = tl.minimum(2 * hx * tl.sqrt(tl.maximum(1.0 - u * u, 0.0)), columns - 1.0)
-    return start, stop, tl.max(tl.where(first <= high, wide, 0.0).to(tl.int32), 0) + 1
+    return start, tl.where(known, tl.minimum(middle + half, columns - 0.5), -1.0)
 
 
 @triton.jit(do_not_specialize=SIZES)
-def _moments_kernel(
+def _pixel_moments_kernel(
     record, grad, moments, count, rows, columns,
     CHANNELS: tl.constexpr, CONE: tl.constexpr, BLOCK_H: tl.constexpr, BLOCK_W: tl.constexpr,
     RUN: tl.constexpr, SPREAD: tl.constexpr,
 ):  # fmt: skip
     view = tl.program_id(1).to(tl.int64)
+    record += view * count * RECORD
+    moments += view * count * SUMS
+    grad += view * rows * columns * SPREAD
     lane = tl.arange(0, 32)
-    down, across = lane % 16 // BLOCK_W, lane % BLOCK_W
+    down, across = lane % 4 // BLOCK_W, lane % BLOCK_W
     zero = tl.zeros([32], tl.float32)
     lxx, lxy, lyy = zero, zero, zero
-    for pair in range(tl.program_id(0) * RUN, tl.minimum((count + 1) // 2, tl.program_id(0) * RUN + RUN)):
-        n = 2 * pair + lane // 16
-        at = record + (view * count + tl.minimum(n, count - 1)) * RECORD
+    for turn in range(RUN):
+        n = (tl.program_id(0) * RUN + turn) * 8 + lane // 4
+        at = record + tl.minimum(n, count - 1).to(tl.int64) * RECORD
         column0, row0, r11, r12 = load_four(at)
         r22, yc, ry, xc = load_four(at + 4)
         m, hx, lx, ly = load_four(at + 8)
@@ -67,22 +63,28 @@ def _moments_kernel(
         # The outlines' slack is for finding tiles; a pixel counts here where it counts in the image.
         hx -= SLACK
         # A Gaussian off the detector has no rows, from a pixel that exists all the same.
-        low = tl.math.ceil(tl.minimum(tl.maximum(yc - ry, 0.0), rows - 1.0)).to(tl.int32)
-        high = tl.math.floor(tl.minimum(tl.maximum(yc + ry, -1.0), rows - 1.0)).to(tl.int32)
-        high = tl.where(ry > 0, high, -1)
-        ry = tl.maximum(ry - SLACK, _TINY)
-        for first in range(0, tl.max(high - low, 0) + 1, BLOCK_H):
-            i = low + first + down
-            start, stop, width = _row_ends(i, low + first, high, yc, ry, xc, m, hx, columns, BLOCK_H)
-            y = i.to(tl.float32) - row0
+        low = tl.math.ceil(tl.minimum(tl.maximum(yc - ry, 0.0), rows - 1.0))
+        high = tl.math.floor(tl.minimum(tl.maximum(yc + ry, -1.0), rows - 1.0))
+        high = tl.where((ry > 0) & (n < count), high, -1.0)
+        by_ry = 1.0 / tl.maximum(ry - SLACK, _TINY)
+        i = low.to(tl.int32) + down
+        offset = (low - yc) + down.to(tl.float32)
+        last = high - yc
+        for _first in range(0, tl.max((high - low + 1.0).to(tl.int32), 0), BLOCK_H):
+            start, stop = _row_ends(offset, offset <= last + 0.5, by_ry, ry, xc, m, hx, columns)
+            width = tl.max((stop - start + 1.0).to(tl.int32), 0)
+            y = offset + (yc - row0)
             u = r22 * y
             uu = u * u
             # Lanes past their row's end read the pixels that follow, zeros or finite numbers.
             stop -= column0
-            line = (view * rows + tl.minimum(i, rows - 1)) * columns + start.to(tl.int32)
-            pixel = grad + (line + across) * SPREAD
+            pixel = (
+                grad + (tl.minimum(i, rows - 1) * columns + start.to(tl.int32) + across).to(tl.int64) * SPREAD
+            )
             x = (start - column0) + across.to(tl.float32)
             l0, l1, shift = 1.0 + y * (ly + lyy * y), lx + lxy * y, r12 * y
+            i += BLOCK_H
+            offset += BLOCK_H
             h0, h1, k0, k1 = zero, zero, zero, zero
             for _walked in range(0, width, BLOCK_W):
                 if CHANNELS == 1:
@@ -140,8 +142,10 @@ def _moments_kernel(
         s = h_sum - _TWO_LN2 * k
         st, su = ht - _TWO_LN2 * kt, hu - _TWO_LN2 * ku
         stt, stu, suu = htt - _TWO_LN2 * ktt, htu - _TWO_LN2 * ktu, huu - _TWO_LN2 * kuu
-        total = half_sums(lane, ht, hu, htt, htu, huu, s, st, su, stt, stu, suu, c0, c1, c2, c3, zero)
-        tl.store(moments + (view * count + n) * SUMS + lane % 16, total, mask=n < count)
+        store_sums(
+            moments + n.to(tl.int64) * SUMS, n < count, lane,
+            ht, hu, htt, htu, huu, s, st, su, stt, stu, suu, c0, c1, c2, c3, zero,
+        )  # fmt: skip
 
 
 def beyond(views: DetectorViews) -> int:
@@ -160,7 +164,7 @@ def sum_moments(record, pixels: torch.Tensor, channels: int, views: DetectorView
     moments = record.new_empty((many, count, SUMS.value))
     block = _PLANAR_BLOCK if views.rows == 1 else BLOCK
     with on_device(record):
-        _moments_kernel[(triton.cdiv(count, 2 * _RUN), many)](
+        _pixel_moments_kernel[(triton.cdiv(count, 8 * _RUN), many)](
             record, pixels, moments, count, views.rows, views.columns, CHANNELS=channels, CONE=views.cone,
             BLOCK_H=block[0], BLOCK_W=block[1], RUN=_RUN, SPREAD=spread(channels), num_warps=1, num_stages=1,
         )  # fmt: skip

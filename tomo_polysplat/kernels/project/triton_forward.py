@@ -1,9 +1,9 @@
 """The projection on CUDA: neighbours in the list are summed tile by tile and added to the image.
 
 A warp holds the outlines of GROUP neighbours, one to a lane. For every tile of their common window it finds
-those that reach the tile, sums them in registers, and adds the sum to the image atomically: one addition for
-many Gaussians. Additions meet in any order, so the image repeats to rounding (about 1e-7), and to the bit only
-where they are made exact.
+those that reach the tile, sums them in registers, each half of the warp every other one, and adds the sum to
+the image atomically: one addition for many Gaussians. Additions meet in any order, so the image repeats to
+rounding (about 1e-7), and to the bit only where they are made exact.
 The windows are small when Gaussians near in the list are near in space.
 """
 
@@ -15,14 +15,21 @@ import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.kernels.project.triton_image import spread
 from tomo_polysplat.kernels.project.triton_setup import RECORD
-from tomo_polysplat.kernels.triton_lanes import add_four, adds_four, lane_set, load_four, lowest_lane
+from tomo_polysplat.kernels.triton_lanes import (
+    add_four,
+    add_halves,
+    adds_four,
+    lane_set,
+    load_four,
+    two_lowest,
+)
 from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, SIZES, grain, grained, on_device
 from tomo_polysplat.kernels.views import DetectorViews
 
-__all__ = ["TILE", "splat"]
+__all__ = ["splat"]
 
-TILE = (16, 8)  # rows and columns
-_PLANAR_TILE = (1, 64)
+_TILE_ROWS = 8  # and as many columns: half a warp has four pixels a lane
+_HALF = tl.constexpr(16)
 _PROGRAMS = 1 << 15  # enough to fill the device; the windows of fewer groups are each shared out
 _MOST_PARTS = 16
 _FAR = tl.constexpr(1e30)
@@ -39,108 +46,134 @@ def _outlines(record, group, count, GROUP: tl.constexpr):
 
 
 @triton.jit
-def _reaches(yc, ry, xc, m, hx, ahead, left, right, top, bottom):
-    """Whether the outlines, within the rows of a tile, reach its columns."""
+def _columns(yc, by_ry, ry, xc, m, hx, ahead, top, bottom, columns):
+    """First and last column that the outlines reach between two rows; none (last < first) where they do not."""
     low, high = tl.maximum(top - yc, -ry), tl.minimum(bottom - yc, ry)
     y_right, y_left = tl.minimum(tl.maximum(ahead, low), high), tl.minimum(tl.maximum(-ahead, low), high)
-    u_right, u_left = y_right / ry, y_left / ry
-    x_right = xc + m * y_right + hx * tl.sqrt(tl.maximum(1.0 - u_right * u_right, 0.0))
-    x_left = xc + m * y_left - hx * tl.sqrt(tl.maximum(1.0 - u_left * u_left, 0.0))
-    return (low <= high) & (x_right >= left) & (x_left <= right)
+    u_right, u_left = y_right * by_ry, y_left * by_ry
+    right = xc + m * y_right + hx * tl.sqrt(tl.maximum(1.0 - u_right * u_right, 0.0))
+    left = xc + m * y_left - hx * tl.sqrt(tl.maximum(1.0 - u_left * u_left, 0.0))
+    there = (low <= high) & (ry > 0)
+    left = tl.where(there, tl.minimum(tl.maximum(left, 0.0), columns + 0.0), columns + 0.0)
+    right = tl.where(there, tl.minimum(tl.maximum(right, -1.0), columns - 1.0), -1.0)
+    return tl.math.ceil(left).to(tl.int32), tl.math.floor(right).to(tl.int32)
+
+
+@triton.jit
+def _value(x, uu, r11, shift, l0, l1, lxx, cut, CONE: tl.constexpr):
+    """What Gaussians add at column x of a row."""
+    t = r11 * x + shift
+    q = t * t + uu
+    if CONE:
+        root = tl.math.rsqrt(l0 + x * (l1 + lxx * x))
+        q *= root * root
+        return tl.where(q <= cut, tl.exp2(-1.0 * q) * root, 0.0)
+    return tl.where(q <= cut, tl.exp2(-1.0 * q), 0.0)
 
 
 @triton.jit
 def _sum_tile(
-    record,
-    found,
-    left,
-    top,
-    cut,
-    CHANNELS: tl.constexpr,
-    CONE: tl.constexpr,
-    H: tl.constexpr,
-    W: tl.constexpr,
+    record, found, upper, column, row, cut, CHANNELS: tl.constexpr, CONE: tl.constexpr, STEP: tl.constexpr
 ):
-    """Sums of the Gaussians ``found`` over a tile, (columns, rows): so a lane has pixels of one row."""
-    column = left.to(tl.float32) + tl.arange(0, W).to(tl.float32)[:, None]
-    row = top.to(tl.float32) + tl.arange(0, H).to(tl.float32)[None, :]
-    sum0 = tl.zeros([W, H], tl.float32)
-    sum1, sum2, sum3 = sum0, sum0, sum0
+    """Sums of the Gaussians ``found`` at a row of every lane, from ``column`` on and STEP columns apart.
+
+    Both halves of the warp have the same four pixels and every other Gaussian. In the end the lower half has
+    the sums of the first and the third pixel, by channel, and the ``upper`` half those of the second and fourth.
+    """
+    zero = tl.zeros([32], tl.float32)
+    a0, a1, a2, a3, b0, b1, b2, b3 = zero, zero, zero, zero, zero, zero, zero, zero
+    c0, c1, c2, c3, d0, d1, d2, d3 = zero, zero, zero, zero, zero, zero, zero, zero
+    lx, ly, lxx, lxy, lyy = zero, zero, zero, zero, zero
     while found != 0:
-        at = record + lowest_lane(found).to(tl.int64) * RECORD
-        found &= found - 1
+        which, limit, found = two_lowest(found, upper, cut)
+        at = record + which * RECORD
         column0, row0, r11, r12 = load_four(at)
         r22, _, _, _ = load_four(at + 4)
         w0, w1, w2, w3 = load_four(at + 16)
-        x, y = column - column0, row - row0
-        u = r22 * y
-        t = r11 * x + r12 * y
-        q = t * t + u * u
         if CONE:
             _, _, lx, ly = load_four(at + 8)
             lxx, lxy, lyy, _ = load_four(at + 12)
-            length = (1.0 + y * (ly + lyy * y)) + x * ((lx + lxy * y) + lxx * x)
-            root = tl.math.rsqrt(length)
-            q *= root * root
-            value = tl.where(q <= cut, tl.exp2(-1.0 * q) * root, 0.0)
-        else:
-            value = tl.where(q <= cut, tl.exp2(-1.0 * q), 0.0)
-        sum0 += w0 * value
+        x, y = column - column0, row - row0
+        u = r22 * y
+        uu, shift = u * u, r12 * y
+        l0, l1 = 1.0 + y * (ly + lyy * y), lx + lxy * y
+        a = _value(x, uu, r11, shift, l0, l1, lxx, limit, CONE)
+        b = _value(x + STEP, uu, r11, shift, l0, l1, lxx, limit, CONE)
+        c = _value(x + 2 * STEP, uu, r11, shift, l0, l1, lxx, limit, CONE)
+        d = _value(x + 3 * STEP, uu, r11, shift, l0, l1, lxx, limit, CONE)
+        a0, b0, c0, d0 = a0 + w0 * a, b0 + w0 * b, c0 + w0 * c, d0 + w0 * d
         if CHANNELS > 1:
-            sum1 += w1 * value
+            a1, b1, c1, d1 = a1 + w1 * a, b1 + w1 * b, c1 + w1 * c, d1 + w1 * d
         if CHANNELS > 2:
-            sum2 += w2 * value
+            a2, b2, c2, d2 = a2 + w2 * a, b2 + w2 * b, c2 + w2 * c, d2 + w2 * d
         if CHANNELS > 3:
-            sum3 += w3 * value
-    return sum0, sum1, sum2, sum3
+            a3, b3, c3, d3 = a3 + w3 * a, b3 + w3 * b, c3 + w3 * c, d3 + w3 * d
+    a0, c0 = add_halves(a0, b0), add_halves(c0, d0)
+    if CHANNELS > 1:
+        a1, c1 = add_halves(a1, b1), add_halves(c1, d1)
+    if CHANNELS > 2:
+        a2, c2 = add_halves(a2, b2), add_halves(c2, d2)
+    if CHANNELS > 3:
+        a3, c3 = add_halves(a3, b3), add_halves(c3, d3)
+    return a0, a1, a2, a3, c0, c1, c2, c3
+
+
+@triton.jit
+def _add_pixel(
+    image, i, j, rows, columns, v0, v1, v2, v3, shift,
+    CHANNELS: tl.constexpr, AT_ONCE: tl.constexpr, GRAINED: tl.constexpr,
+):  # fmt: skip
+    if GRAINED:
+        v0, v1, v2, v3 = grained(v0, shift), grained(v1, shift), grained(v2, shift), grained(v3, shift)
+    pixel = (i * columns + j).to(tl.int64)
+    inside = (i < rows) & (j < columns)
+    if CHANNELS == 1:
+        tl.atomic_add(image + pixel, v0, mask=inside & (v0 != 0), sem="relaxed")
+    else:
+        inside &= (v0 != 0) | (v1 != 0) | (v2 != 0) | (v3 != 0)
+        add_four(image + 4 * pixel, v0, v1, v2, v3, inside, AT_ONCE)
 
 
 @triton.jit(do_not_specialize=SIZES)
-def _splat_kernel(
+def _splat_pixels_kernel(
     record, image, largest, count, rows, columns, parts, cut,
-    CHANNELS: tl.constexpr, CONE: tl.constexpr, TILE_H: tl.constexpr, TILE_W: tl.constexpr,
-    GROUP: tl.constexpr, AT_ONCE: tl.constexpr, GRAINED: tl.constexpr,
+    CHANNELS: tl.constexpr, CONE: tl.constexpr, ROWS: tl.constexpr,
+    GROUP: tl.constexpr, AT_ONCE: tl.constexpr, GRAINED: tl.constexpr, SPREAD: tl.constexpr,
 ):  # fmt: skip
     shift = grain(largest, GRAINED)
     group, part = tl.program_id(0) // parts, tl.program_id(0) % parts
     view = tl.program_id(1).to(tl.int64)
     record += view * count * RECORD
+    image += view * rows * columns * SPREAD
     yc, ry, xc, m, hx = _outlines(record, group, count, GROUP)
     record += group.to(tl.int64) * GROUP * RECORD
-    reach = tl.sqrt(m * m * ry * ry + hx * hx)
+    by_ry = 1.0 / ry
     # The outline's rightmost point lies ``ahead`` rows below the centre and its leftmost as many above.
-    ahead = m * ry * ry / reach
+    ahead = m * ry * ry / tl.sqrt(m * m * ry * ry + hx * hx)
     seen = ry > 0
-    x_low = tl.maximum(tl.min(tl.where(seen, xc - reach, _FAR), 0), 0.0)
-    x_high = tl.minimum(tl.max(tl.where(seen, xc + reach, -_FAR), 0), columns - 1.0)
     y_low = tl.maximum(tl.min(tl.where(seen, yc - ry, _FAR), 0), 0.0)
     y_high = tl.minimum(tl.max(tl.where(seen, yc + ry, -_FAR), 0), rows - 1.0)
-    if (x_low <= x_high) & (y_low <= y_high):
-        # From an even column: two pixels of four channels fill one sector of memory.
-        left0, top0 = x_low.to(tl.int32) // 2 * 2, y_low.to(tl.int32)
-        across = (x_high.to(tl.int32) - left0) // TILE_W + 1
-        tiles = ((y_high.to(tl.int32) - top0) // TILE_H + 1) * across
-        for tile in range(part, tiles, parts):
-            down = tile // across
-            left, top = left0 + (tile - down * across) * TILE_W, top0 + down * TILE_H
-            x0, y0 = left.to(tl.float32), top.to(tl.float32)
-            hit = _reaches(yc, ry, xc, m, hx, ahead, x0, x0 + (TILE_W - 1), y0, y0 + (TILE_H - 1))
-            found = lane_set(hit & seen, tl.arange(0, GROUP))
-            if found != 0:
-                sum0, sum1, sum2, sum3 = _sum_tile(
-                    record, found, left, top, cut, CHANNELS, CONE, TILE_H, TILE_W
-                )
-                if GRAINED:
-                    sum0, sum1 = grained(sum0, shift), grained(sum1, shift)
-                    sum2, sum3 = grained(sum2, shift), grained(sum3, shift)
-                j, i = left + tl.arange(0, TILE_W)[:, None], top + tl.arange(0, TILE_H)[None, :]
-                pixel = (view * rows + i) * columns + j
-                inside = (i < rows) & (j < columns)
-                if CHANNELS == 1:
-                    tl.atomic_add(image + pixel, sum0, mask=inside & (sum0 != 0), sem="relaxed")
-                else:
-                    inside &= (sum0 != 0) | (sum1 != 0) | (sum2 != 0) | (sum3 != 0)
-                    add_four(image + 4 * pixel, sum0, sum1, sum2, sum3, inside, AT_ONCE)
+    lane = tl.arange(0, 32)
+    STEP: tl.constexpr = _HALF // ROWS
+    COLUMNS: tl.constexpr = 4 * STEP
+    upper, down, across = lane >= _HALF, lane % _HALF // STEP, lane % STEP
+    if y_low <= y_high:
+        top0 = y_low.to(tl.int32)
+        for top in range(top0 + part * ROWS, y_high.to(tl.int32) + 1, parts * ROWS):
+            y0 = top + 0.0
+            first, last = _columns(yc, by_ry, ry, xc, m, hx, ahead, y0, y0 + (ROWS - 1), columns)
+            # From an even column: two pixels of four channels fill one sector of memory.
+            for left in range(tl.min(first, 0) // 2 * 2, tl.max(last, 0) + 1, COLUMNS):
+                found = lane_set((first < left + COLUMNS) & (last >= left) & (first <= last), lane)
+                if found != 0:
+                    i, j = top + down, left + across
+                    a0, a1, a2, a3, c0, c1, c2, c3 = _sum_tile(
+                        record, found, upper, j.to(tl.float32), i.to(tl.float32), cut, CHANNELS, CONE, STEP
+                    )
+                    j += tl.where(upper, STEP, 0)
+                    _add_pixel(image, i, j, rows, columns, a0, a1, a2, a3, shift, CHANNELS, AT_ONCE, GRAINED)
+                    j += 2 * STEP
+                    _add_pixel(image, i, j, rows, columns, c0, c1, c2, c3, shift, CHANNELS, AT_ONCE, GRAINED)
 
 
 def splat(
@@ -157,12 +190,12 @@ def splat(
         return image
     groups = triton.cdiv(count, GROUP)
     parts = triton.next_power_of_2(max(1, min(_MOST_PARTS, _PROGRAMS // (groups * many))))
-    tile = _PLANAR_TILE if views.rows == 1 else TILE
     with on_device(record):
-        _splat_kernel[(groups * parts, many)](
+        _splat_pixels_kernel[(groups * parts, many)](
             record, image, record if largest is None else largest, count, views.rows, views.columns,
             parts, cutoff * cutoff * HALF_LOG2E,
-            CHANNELS=channels, CONE=views.cone, TILE_H=tile[0], TILE_W=tile[1], GROUP=GROUP,
-            AT_ONCE=adds_four(record.device), GRAINED=largest is not None, num_warps=1, num_stages=1,
+            CHANNELS=channels, CONE=views.cone, ROWS=1 if views.rows == 1 else _TILE_ROWS,
+            GROUP=GROUP, AT_ONCE=adds_four(record.device), GRAINED=largest is not None, SPREAD=spread(channels),
+            num_warps=1, num_stages=1,
         )  # fmt: skip
     return image

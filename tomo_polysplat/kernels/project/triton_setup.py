@@ -29,7 +29,7 @@ RECORD = tl.constexpr(20)
 VIEW = tl.constexpr(21)  # origin, inverse and matrix of a view, row by row
 ROOT = tl.constexpr(HALF_LOG2E**0.5)
 SLACK = tl.constexpr(0.01)  # of a pixel, on the outline: rounding must not cut what q still includes
-_BLOCK = 128
+_BLOCK = 32
 
 
 @triton.jit
@@ -210,6 +210,6 @@ def footprints(
         with on_device(position):
             _footprint_kernel[(triton.cdiv(count, _BLOCK), many)](
                 position, scale, rotation, weight, table, record, skipped, count, views.rows, views.columns,
-                cutoff, CHANNELS=len(weight), CONE=views.cone, PLANAR=views.planar, BLOCK=_BLOCK, num_warps=4,
+                cutoff, CHANNELS=len(weight), CONE=views.cone, PLANAR=views.planar, BLOCK=_BLOCK, num_warps=1,
             )  # fmt: skip
     return record

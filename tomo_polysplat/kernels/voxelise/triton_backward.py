@@ -1,6 +1,6 @@
 """The adjoint of voxelising on CUDA: every Gaussian gathers the gradients of its voxels, without atomics.
 
-Half a warp sums over the voxels of a Gaussian (``moments``); a second kernel, with one lane a Gaussian, takes
+Four lanes walk along the lines of an ellipsoid (``moments``); a second kernel, with one lane a Gaussian, takes
 these sums back to position, scale and rotation.
 """
 
@@ -10,83 +10,82 @@ import torch
 import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
-from tomo_polysplat.kernels.triton_lanes import SUMS, half_sums, load_four
+from tomo_polysplat.kernels.triton_lanes import SUMS, load_four, store_sums
 from tomo_polysplat.kernels.triton_maths import HALF_LOG2E, SIZES, dot, on_device, whitening_adjoint
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.kernels.voxelise.triton_setup import RECORD, ROOT, scaled_whitening, triangle
 
-__all__ = ["BLOCK", "pull_back", "sum_moments"]
+__all__ = ["pull_back", "sum_moments"]
 
-BLOCK = (8, 2)  # lines and columns of the lanes that walk along the lines of an ellipsoid
-_RUN = 4  # times two neighbours handled by one warp: their voxels overlap, so they stay in the cache
 _GAUSSIANS = 64
 
 
 @triton.jit
-def _indices(centre, half, length):
-    """First index and number of indices within ``half`` of ``centre``."""
-    low = tl.math.ceil(tl.minimum(tl.maximum(centre - half, 0.0), length + 0.0)).to(tl.int32)
-    high = tl.math.floor(tl.minimum(tl.maximum(centre + half, -1.0), length - 1.0)).to(tl.int32)
-    return low, tl.maximum(high - low + 1, 0)
+def _range(middle, half, length):
+    """First index within ``half`` of ``middle`` and where the indices end, both as floats."""
+    first = tl.math.ceil(tl.minimum(tl.maximum(middle - half, 0.0), length + 0.0))
+    return first, tl.minimum(middle + half, length - 0.5)
+
+
+@triton.jit
+def _longest(first, last):
+    """How many indices the longest of the ranges has."""
+    return tl.max((last - first + 1.0).to(tl.int32), 0)
 
 
 @triton.jit(do_not_specialize=SIZES)
-def _moments_kernel(
-    record, grad, moments, count, nz, ny, nx, stride, cut,
-    CHANNELS: tl.constexpr, BLOCK_H: tl.constexpr, BLOCK_W: tl.constexpr, RUN: tl.constexpr,
-):  # fmt: skip
+def _voxel_moments_kernel(record, grad, moments, count, nz, ny, nx, stride, cut, CHANNELS: tl.constexpr):
     lane = tl.arange(0, 32)
-    down, across = lane % 16 // BLOCK_W, lane % BLOCK_W
+    n = tl.program_id(0) * 8 + lane // 4
+    at = record + tl.minimum(n, count - 1).to(tl.int64) * RECORD
+    xc, yc, zc, r11 = load_four(at)
+    r12, r13, r22, r23 = load_four(at + 4)
+    r33, half_x, half_y, half_z = load_four(at + 8)
+    w0, w1, w2, w3 = load_four(at + 12)
     zero = tl.zeros([32], tl.float32)
-    for pair in range(tl.program_id(0) * RUN, tl.minimum((count + 1) // 2, tl.program_id(0) * RUN + RUN)):
-        n = 2 * pair + lane // 16
-        at = record + tl.minimum(n, count - 1).to(tl.int64) * RECORD
-        xc, yc, zc, r11 = load_four(at)
-        r12, r13, r22, r23 = load_four(at + 4)
-        r33, half_x, half_y, half_z = load_four(at + 8)
-        w0, w1, w2, w3 = load_four(at + 12)
-        ht, hu, hv, htt, htu = zero, zero, zero, zero, zero
-        htv, huu, huv, hvv = zero, zero, zero, zero
-        c0, c1, c2, c3 = zero, zero, zero, zero
-        first_y, rows = _indices(yc, half_y, ny)
-        first_z, slices = _indices(zc, half_z, nz)
-        _, columns = _indices(xc, half_x, nx)
-        lines, rows = tl.where(columns > 0, rows * slices, 0), tl.maximum(rows, 1)
-        for first in range(0, tl.max(lines, 0), BLOCK_H):
-            line = first + down
-            known = line < lines
-            slab = line // rows
-            iy, iz = first_y + line - slab * rows, first_z + slab
-            y, z = iy.to(tl.float32) - yc, iz.to(tl.float32) - zc
-            shift, up, out = r12 * y + r13 * z, r22 * y + r23 * z, r33 * z
+    ht, hu, hv, htt, htu = zero, zero, zero, zero, zero
+    htv, huu, huv, hvv = zero, zero, zero, zero
+    c0, c1, c2, c3 = zero, zero, zero, zero
+    by_r11, by_r22 = 1.0 / r11, 1.0 / r22
+    near = (xc + half_x >= 0) & (xc - half_x <= nx - 1) & (yc + half_y >= 0) & (yc - half_y <= ny - 1)
+    z_first, z_last = _range(zc, half_z, nz)
+    z_last = tl.where(near & (n < count), z_last, -1.0)
+    for slab in range(_longest(z_first, z_last)):
+        # The ellipsoid's slab is an ellipse, its line a chord of that.
+        iz = z_first + slab
+        z = iz - zc
+        out = r33 * z
+        rest = cut - out * out
+        y_first, y_last = _range(yc - r23 * z * by_r22, tl.sqrt(tl.maximum(rest, 0.0)) * by_r22, ny)
+        y_last = tl.where((iz <= z_last) & (rest >= 0), y_last, -1.0)
+        lines = tl.minimum(iz, nz - 1.0).to(tl.int64) * ny
+        for turn in range(0, _longest(y_first, y_last), 4):
+            iy = y_first + (turn + lane % 4)
+            y = iy - yc
+            shift, up = r12 * y + r13 * z, r22 * y + r23 * z
             rest = up * up + out * out
-            spread = tl.sqrt(tl.maximum(cut - rest, 0.0)) / r11 + 0.01
-            start = tl.minimum(tl.maximum(xc - shift / r11 - spread, 0.0), nx + 0.0)
-            start = tl.math.ceil(start).to(tl.int32)
-            wide = tl.where(known & (rest <= cut), tl.minimum(2 * spread, nx - 1.0), -1.0)
-            widest = tl.max(wide, 0)
-            at_line = grad + (iz.to(tl.int64) * ny + iy) * nx
+            first, last = _range(xc - shift * by_r11, tl.sqrt(tl.maximum(cut - rest, 0.0)) * by_r11, nx)
+            last = tl.where(iy <= y_last, last, -1.0)
+            voxel = grad + ((lines + tl.minimum(iy, ny - 1.0).to(tl.int32)) * nx + first.to(tl.int32))
+            x = first - xc
             h0, h1 = zero, zero
-            for step in range(0, tl.math.floor(widest).to(tl.int32) + 1, BLOCK_W):
-                j = start + (step + across)
-                inside = (j < nx) & known
-                x = j.to(tl.float32) - xc
+            for _walked in range(_longest(first, last)):
+                inside = x <= last - xc
                 t = r11 * x + shift
-                minus = -rest - t * t
-                value = tl.where(minus >= -cut, tl.exp2(minus), 0.0)
-                g = tl.load(at_line + j, mask=inside, other=0.0)
+                value = tl.where(inside, tl.exp2(-1.0 * (t * t + rest)), 0.0)
+                g = tl.load(voxel, mask=inside, other=0.0)
                 total = w0 * g
                 c0 += g * value
                 if CHANNELS > 1:
-                    g = tl.load(at_line + stride + j, mask=inside, other=0.0)
+                    g = tl.load(voxel + stride, mask=inside, other=0.0)
                     total += w1 * g
                     c1 += g * value
                 if CHANNELS > 2:
-                    g = tl.load(at_line + stride + stride + j, mask=inside, other=0.0)
+                    g = tl.load(voxel + stride + stride, mask=inside, other=0.0)
                     total += w2 * g
                     c2 += g * value
                 if CHANNELS > 3:
-                    g = tl.load(at_line + stride + stride + stride + j, mask=inside, other=0.0)
+                    g = tl.load(voxel + stride + stride + stride, mask=inside, other=0.0)
                     total += w3 * g
                     c3 += g * value
                 h = total * value
@@ -94,6 +93,8 @@ def _moments_kernel(
                 h0 += h
                 h1 += along
                 htt += along * t
+                x += 1.0
+                voxel += 1
             ht += h1
             hu += h0 * up
             hv += h0 * out
@@ -102,8 +103,10 @@ def _moments_kernel(
             huu += h0 * (up * up)
             huv += h0 * (up * out)
             hvv += h0 * (out * out)
-        total = half_sums(lane, ht, hu, hv, htt, htu, htv, huu, huv, hvv, zero, zero, zero, c0, c1, c2, c3)
-        tl.store(moments + n.to(tl.int64) * SUMS + lane % 16, total, mask=n < count)
+    store_sums(
+        moments + n.to(tl.int64) * SUMS, n < count, lane,
+        ht, hu, hv, htt, htu, htv, huu, huv, hvv, zero, zero, zero, c0, c1, c2, c3,
+    )  # fmt: skip
 
 
 def sum_moments(record, grad_volume: torch.Tensor, box: VoxelBox, cutoff: float) -> torch.Tensor:
@@ -115,9 +118,9 @@ def sum_moments(record, grad_volume: torch.Tensor, box: VoxelBox, cutoff: float)
     moments = record.new_empty((len(record), SUMS.value))
     grad = grad_volume.contiguous()
     with on_device(record):
-        _moments_kernel[(triton.cdiv(len(record), 2 * _RUN),)](
+        _voxel_moments_kernel[(triton.cdiv(len(record), 8),)](
             record, grad, moments, len(record), *box.shape, grad.stride(0), cutoff * cutoff * HALF_LOG2E,
-            CHANNELS=len(grad), BLOCK_H=BLOCK[0], BLOCK_W=BLOCK[1], RUN=_RUN, num_warps=1, num_stages=1,
+            CHANNELS=len(grad), num_warps=1, num_stages=1,
         )  # fmt: skip
     return moments
 

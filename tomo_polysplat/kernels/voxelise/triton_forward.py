@@ -10,16 +10,17 @@ import torch
 import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
-from tomo_polysplat.kernels.triton_lanes import lane_set, load_four, lowest_lane
-from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, SIZES, dot, grain, grained, on_device
+from tomo_polysplat.kernels.triton_lanes import add_halves, lane_set, load_four, two_lowest
+from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, SIZES, grain, grained, on_device
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.kernels.voxelise.triton_setup import RECORD
 
-__all__ = ["BRICK", "splat"]
+__all__ = ["splat"]
 
-BRICK = (4, 8, 8)  # slices, rows and columns
+_SLICES = 4  # of a brick; with as many columns, and rows so that half a warp has a line a lane
 _PROGRAMS = 1 << 15  # enough to fill the device; the windows of fewer groups are each shared out
 _MOST_PARTS = 16
+_HALF = tl.constexpr(16)
 _NOWHERE = tl.constexpr(-1e30)
 
 
@@ -32,53 +33,97 @@ def _window(centre, half, live, length):
 
 
 @triton.jit
-def _reaches(x, y, z, r11, r12, r13, r22, r23, r33, cut, W: tl.constexpr, H: tl.constexpr, D: tl.constexpr):
-    """Whether ellipsoids can meet the brick whose centre lies at (x, y, z) from theirs.
+def _columns(
+    xc, yc, zc, r11, r12, r13, r22, r23, r33, half_x, live, y, z, nx, cut, H: tl.constexpr, D: tl.constexpr
+):
+    """First and last column that ellipsoids can reach along a beam of H x D lines around (y, z); or none.
 
-    Seen along the line from the ellipsoid's centre to the brick's, in units where the ellipsoid is a ball of
-    radius sqrt(cut), they do not when the ball ends before the brick begins.
+    Each term of q is least, and the middle of a line farthest to either side, somewhere in the beam: what is
+    bounded term by term holds the ellipsoid's part of the beam, with little to spare where that is thin.
     """
-    d0, d1, d2 = dot(r11, r12, r13, x, y, z), r22 * y + r23 * z, r33 * z
-    square = dot(d0, d1, d2, d0, d1, d2)
-    half = tl.abs(r11 * d0) * ((W - 1) / 2) + tl.abs(r12 * d0 + r22 * d1) * ((H - 1) / 2)
-    half += tl.abs(dot(r13, r23, r33, d0, d1, d2)) * ((D - 1) / 2)
+    dy, dz, high, deep = y - yc, z - zc, (H - 1) / 2, (D - 1) / 2
+    out = tl.maximum(r33 * (tl.abs(dz) - deep), 0.0)
+    up = tl.maximum(tl.abs(r22 * dy + r23 * dz) - (r22 * high + tl.abs(r23) * deep), 0.0)
     # A hundredth more than the cut: rounding must not lose a voxel.
-    return square - half <= 1.01 * tl.sqrt(cut * square)
+    rest = 1.01 * cut - (up * up + out * out)
+    half = (tl.sqrt(tl.maximum(rest, 0.0)) + tl.abs(r12) * high + tl.abs(r13) * deep) / r11
+    middle = xc - (r12 * dy + r13 * dz) / r11
+    left, right = tl.maximum(middle - half, xc - half_x), tl.minimum(middle + half, xc + half_x)
+    there = live & (rest >= 0)
+    left = tl.where(there, tl.minimum(tl.maximum(left, 0.0), nx + 0.0), nx + 0.0)
+    right = tl.where(there, tl.minimum(tl.maximum(right, -1.0), nx - 1.0), -1.0)
+    return tl.math.ceil(left).to(tl.int32), tl.math.floor(right).to(tl.int32)
 
 
 @triton.jit
-def _sum_brick(record, found, x, y, z, cut, CHANNELS: tl.constexpr):
-    """Sums of the Gaussians ``found`` over a brick, (columns, lines): so a lane has voxels of one line."""
-    sum0 = tl.zeros_like(x + y)
-    sum1, sum2, sum3 = sum0, sum0, sum0
+def _value(x, r11, shift, rest, cut):
+    t = r11 * x + shift
+    q = t * t + rest
+    return tl.where(q <= cut, tl.exp2(-1.0 * q), 0.0)
+
+
+@triton.jit
+def _sum_brick(record, found, upper, x, y, z, cut, CHANNELS: tl.constexpr):
+    """Sums of the Gaussians ``found`` at a line of every lane, at four columns from ``x`` on.
+
+    Halves of the warp share out Gaussians and in the end columns as in the projection.
+    """
+    zero = tl.zeros([32], tl.float32)
+    a0, a1, a2, a3, b0, b1, b2, b3 = zero, zero, zero, zero, zero, zero, zero, zero
+    c0, c1, c2, c3, d0, d1, d2, d3 = zero, zero, zero, zero, zero, zero, zero, zero
     while found != 0:
-        at = record + lowest_lane(found) * RECORD
-        found &= found - 1
+        which, limit, found = two_lowest(found, upper, cut)
+        at = record + which * RECORD
         cx, cy, cz, r11 = load_four(at)
         r12, r13, r22, r23 = load_four(at + 4)
         r33, _, _, _ = load_four(at + 8)
         w0, w1, w2, w3 = load_four(at + 12)
         dx, dy, dz = x - cx, y - cy, z - cz
         up, out = r22 * dy + r23 * dz, r33 * dz
-        t = r11 * dx + (r12 * dy + r13 * dz)
-        q = t * t + (up * up + out * out)
-        value = tl.where(q <= cut, tl.exp2(-1.0 * q), 0.0)
-        sum0 += w0 * value
+        shift, rest = r12 * dy + r13 * dz, up * up + out * out
+        a, b = _value(dx, r11, shift, rest, limit), _value(dx + 1.0, r11, shift, rest, limit)
+        c, d = _value(dx + 2.0, r11, shift, rest, limit), _value(dx + 3.0, r11, shift, rest, limit)
+        a0, b0, c0, d0 = a0 + w0 * a, b0 + w0 * b, c0 + w0 * c, d0 + w0 * d
         if CHANNELS > 1:
-            sum1 += w1 * value
+            a1, b1, c1, d1 = a1 + w1 * a, b1 + w1 * b, c1 + w1 * c, d1 + w1 * d
         if CHANNELS > 2:
-            sum2 += w2 * value
+            a2, b2, c2, d2 = a2 + w2 * a, b2 + w2 * b, c2 + w2 * c, d2 + w2 * d
         if CHANNELS > 3:
-            sum3 += w3 * value
-    return sum0, sum1, sum2, sum3
+            a3, b3, c3, d3 = a3 + w3 * a, b3 + w3 * b, c3 + w3 * c, d3 + w3 * d
+    a0, c0 = add_halves(a0, b0), add_halves(c0, d0)
+    if CHANNELS > 1:
+        a1, c1 = add_halves(a1, b1), add_halves(c1, d1)
+    if CHANNELS > 2:
+        a2, c2 = add_halves(a2, b2), add_halves(c2, d2)
+    if CHANNELS > 3:
+        a3, c3 = add_halves(a3, b3), add_halves(c3, d3)
+    return a0, a1, a2, a3, c0, c1, c2, c3
+
+
+@triton.jit
+def _add(at, sum_, shift, inside, GRAINED: tl.constexpr):
+    if GRAINED:
+        sum_ = grained(sum_, shift)
+    tl.atomic_add(at, sum_, mask=inside & (sum_ != 0), sem="relaxed")
+
+
+@triton.jit
+def _add_voxel(at, stride, inside, v0, v1, v2, v3, shift, CHANNELS: tl.constexpr, GRAINED: tl.constexpr):
+    _add(at, v0, shift, inside, GRAINED)
+    if CHANNELS > 1:
+        _add(at + stride, v1, shift, inside, GRAINED)
+    if CHANNELS > 2:
+        _add(at + stride + stride, v2, shift, inside, GRAINED)
+    if CHANNELS > 3:
+        _add(at + stride + stride + stride, v3, shift, inside, GRAINED)
 
 
 @triton.jit(do_not_specialize=SIZES)
-def _splat_kernel(
+def _splat_voxels_kernel(
     record, volume, largest, count, nz, ny, nx, stride, parts, cut,
-    CHANNELS: tl.constexpr, D: tl.constexpr, H: tl.constexpr, W: tl.constexpr,
-    GROUP: tl.constexpr, GRAINED: tl.constexpr,
+    CHANNELS: tl.constexpr, D: tl.constexpr, GROUP: tl.constexpr, GRAINED: tl.constexpr,
 ):  # fmt: skip
+    H: tl.constexpr = _HALF // D
     shift = grain(largest, GRAINED)
     group, part, lane = tl.program_id(0) // parts, tl.program_id(0) % parts, tl.arange(0, GROUP)
     n = group * GROUP + lane
@@ -86,40 +131,34 @@ def _splat_kernel(
     cx, cy, cz, r11 = load_four(at)
     r12, r13, r22, r23 = load_four(at + 4)
     r33, half_x, half_y, half_z = load_four(at + 8)
-    live = n < count
-    x0, x1 = _window(cx, half_x, live, nx)
+    live = (n < count) & (cx + half_x >= 0) & (cx - half_x <= nx - 1)
     y0, y1 = _window(cy, half_y, live, ny)
     z0, z1 = _window(cz, half_z, live, nz)
-    if (x0 <= x1) & (y0 <= y1) & (z0 <= z1):
+    if (y0 <= y1) & (z0 <= z1):
         record += group.to(tl.int64) * GROUP * RECORD
-        x0 = x0 // 8 * 8  # eight voxels fill a sector of memory
-        across, down = (x1 - x0) // W + 1, (y1 - y0) // H + 1
-        line = tl.arange(0, D * H)[None, :]
-        for brick in range(part, across * down * ((z1 - z0) // D + 1), parts):
-            slab = brick // across
-            left, top, front = x0 + brick % across * W, y0 + slab % down * H, z0 + slab // down * D
-            x, y, z = left + (W - 1) / 2 - cx, top + (H - 1) / 2 - cy, front + (D - 1) / 2 - cz
-            found = lane_set(live & _reaches(x, y, z, r11, r12, r13, r22, r23, r33, cut, W, H, D), lane)
-            if found != 0:
-                ix, iy, iz = left + tl.arange(0, W)[:, None], top + line % H, front + line // H
-                sum0, sum1, sum2, sum3 = _sum_brick(
-                    record, found, ix.to(tl.float32), iy.to(tl.float32), iz.to(tl.float32), cut, CHANNELS
-                )
-                if GRAINED:
-                    sum0, sum1 = grained(sum0, shift), grained(sum1, shift)
-                    sum2, sum3 = grained(sum2, shift), grained(sum3, shift)
-                inside = (ix < nx) & (iy < ny) & (iz < nz)
-                voxel = volume + ((iz.to(tl.int64) * ny + iy) * nx + ix)
-                tl.atomic_add(voxel, sum0, mask=inside & (sum0 != 0), sem="relaxed")
-                if CHANNELS > 1:
-                    voxel += stride
-                    tl.atomic_add(voxel, sum1, mask=inside & (sum1 != 0), sem="relaxed")
-                if CHANNELS > 2:
-                    voxel += stride
-                    tl.atomic_add(voxel, sum2, mask=inside & (sum2 != 0), sem="relaxed")
-                if CHANNELS > 3:
-                    voxel += stride
-                    tl.atomic_add(voxel, sum3, mask=inside & (sum3 != 0), sem="relaxed")
+        upper, row, slab = lane >= _HALF, lane % _HALF % H, lane % _HALF // H
+        down = (y1 - y0) // H + 1
+        for beam in range(part, down * ((z1 - z0) // D + 1), parts):
+            top, front = y0 + beam % down * H, z0 + beam // down * D
+            first, last = _columns(
+                cx, cy, cz, r11, r12, r13, r22, r23, r33, half_x, live,
+                top + (H - 1) / 2, front + (D - 1) / 2, nx, cut, H, D,
+            )  # fmt: skip
+            iy, iz = top + row, front + slab
+            line = volume + (iz.to(tl.int64) * ny + iy) * nx
+            # From a column that four divides: four voxels fill half a sector of memory.
+            for left in range(tl.min(first, 0) // 4 * 4, tl.max(last, 0) + 1, 4):
+                found = lane_set((first < left + 4) & (last >= left) & (first <= last), lane)
+                if found != 0:
+                    a0, a1, a2, a3, c0, c1, c2, c3 = _sum_brick(
+                        record, found, upper, left + 0.0, iy.to(tl.float32), iz.to(tl.float32), cut, CHANNELS
+                    )
+                    ix = left + upper.to(tl.int32)
+                    inside = (ix < nx) & (iy < ny) & (iz < nz)
+                    _add_voxel(line + ix, stride, inside, a0, a1, a2, a3, shift, CHANNELS, GRAINED)
+                    ix += 2
+                    inside &= ix < nx
+                    _add_voxel(line + ix, stride, inside, c0, c1, c2, c3, shift, CHANNELS, GRAINED)
 
 
 def splat(
@@ -133,9 +172,9 @@ def splat(
     groups = triton.cdiv(count, GROUP)
     parts = triton.next_power_of_2(max(1, min(_MOST_PARTS, _PROGRAMS // groups)))
     with on_device(record):
-        _splat_kernel[(groups * parts,)](
+        _splat_voxels_kernel[(groups * parts,)](
             record, volume, record if largest is None else largest, count, *box.shape, volume.stride(0),
-            parts, cutoff * cutoff * HALF_LOG2E, CHANNELS=channels, D=BRICK[0], H=BRICK[1], W=BRICK[2],
+            parts, cutoff * cutoff * HALF_LOG2E, CHANNELS=channels, D=1 if box.shape[0] == 1 else _SLICES,
             GROUP=GROUP, GRAINED=largest is not None, num_warps=1, num_stages=1,
         )  # fmt: skip
     return volume
