@@ -36,14 +36,13 @@ def initial_volume_on(
     projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid
 ) -> tuple[torch.Tensor, dict[str, Any]]:
     """As `initial_volume` for projections on a device, where the volume is, too."""
-    volume = None
-    if projections.is_cuda and _method(geometry, grid)[0]:
-        volume = fdk_on_gpu(projections, geometry, grid)
+    fits, reason = _method(geometry, grid)
+    volume = fdk_on_gpu(projections, geometry, grid) if projections.is_cuda and fits else None
     if volume is None:
         device = projections.device
         found, done = initial_volume(projections.cpu().numpy(), geometry, grid, device=device.type)
         return torch.from_numpy(np.ascontiguousarray(found)).to(device), done
-    reason, invalid = _method(geometry, grid)[1], int((~torch.isfinite(projections)).sum())
+    invalid = int((~torch.isfinite(projections)).sum())
     _log.info("Start from FDK: %s; %d invalid pixels.", reason, invalid)
     beyond, near = _beyond_sources(geometry, grid)
     if beyond is not None:
