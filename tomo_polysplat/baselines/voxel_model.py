@@ -42,6 +42,10 @@ class VoxelModel:
         """With copies of what is fitted."""
         return replace(self, relative=self.relative.detach().clone(), own=self.own.detach().clone())
 
+    def finite(self) -> bool:
+        """Whether what is fitted is finite."""
+        return all(bool(torch.isfinite(tensor).all()) for tensor in (self.relative, self.own))
+
     def weights(self, curve: torch.Tensor) -> torch.Tensor:
         """(3, nz, ny, nx) densities of the soft, middle and dense curve.
 

@@ -18,7 +18,7 @@ from tomo_polysplat.fit.loss import misfit, total_variation
 from tomo_polysplat.fit.noise import photons_per_ray
 from tomo_polysplat.fit.plan import PASSES
 from tomo_polysplat.fit.rays import Rays
-from tomo_polysplat.fit.stopping import FitState, patience_of
+from tomo_polysplat.fit.stopping import FitState, Watch, patience_of
 from tomo_polysplat.fit.texture import tv_corners
 from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.quadrature import fit_quadrature
@@ -37,9 +37,7 @@ __all__ = ["voxel_poly"]
 
 VIEWS_PER_STEP = 4
 RATE_ATTENUATION, RATE_MATERIAL = 3e-2, 3e-3  # per step of Adam, falling like those of the Gaussians
-# As in the fit of Gaussians: the spectral nodes serve P up to this, and held-out rays whose error falls by less
-# than this share in a pass have stopped improving.
-_LARGEST_PROJECTION, _IMPROVEMENT = 15.0, 2e-3
+_LARGEST_PROJECTION = 15.0  # up to which the spectral nodes serve, as in the fit of Gaussians
 
 
 def voxel_poly(
@@ -150,17 +148,17 @@ class _Fit:
         callbacks: Sequence[Callable[[FitState], Any]],
     ) -> VoxelModel:
         """The model of the pass whose held-out rays fitted best."""
-        begun, step, lowest, waited = time.perf_counter(), 0, math.inf, 0
+        begun, step = time.perf_counter(), 0
         groups = _interleaved(len(self.rays.views))
         passes = self.settings.passes or PASSES
-        steps, patience = math.ceil(passes * len(groups)), patience_of(self.settings, passes)
-        best = self.model.copy()
+        steps = math.ceil(passes * len(groups))
+        watch: Watch[VoxelModel] = Watch(patience_of(self.settings, passes))
 
         def share() -> float:
             used = 0.0 if deadline is None else (time.perf_counter() - begun) / max(deadline - begun, 1e-9)
             return max(step / steps, used)
 
-        while share() < 1 and waited < patience:
+        while share() < 1:
             errors = []
             for group in rng.permutation(len(groups)):
                 if share() >= 1:
@@ -170,14 +168,12 @@ class _Fit:
             if not errors:
                 break
             loss, held_out = torch.stack(errors).mean(dim=0).tolist()
-            waited = 0 if held_out < (1 - _IMPROVEMENT) * lowest else waited + 1
-            if held_out <= lowest:
-                lowest, best = held_out, self.model.copy()
             seconds = time.perf_counter() - started
             state = FitState(seconds, step, 0, loss, held_out, share(), lambda: self.volume(self.model))
-            if any([callback(state) is True for callback in callbacks]) or not math.isfinite(loss):
+            ended = bool(watch.judge(state, self.model))
+            if any([callback(state) is True for callback in callbacks]) or ended:
                 break
-        return best
+        return watch.best or self.model
 
     def _step(self, views: np.ndarray, share: float) -> torch.Tensor:
         """One step of Adam; misfit of the fitted and of the held-out rays."""

@@ -48,14 +48,14 @@ def stopping(history: Sequence[Mapping[str, Any]], settings: Mapping[str, Any]) 
     """
     if len(history) < 2:
         return None
-    watch = Watch(patience_of(make_settings(changes=settings), len(history)))
+    watch: Watch[_Pass] = Watch(patience_of(make_settings(changes=settings), len(history)))
     stops = len(history)
     for number, point in enumerate(history, start=1):
         held_out = math.nan if point["held_out"] is None else point["held_out"]
         state = FitState(
             point["seconds"], point["iteration"], 0, point["loss"], held_out, 0.0, lambda: np.empty(0)
         )
-        if watch.judge(state, _Pass(number)):  # type: ignore[arg-type]
+        if watch.judge(state, _Pass(number)):
             stops = number
             break
     psnr = np.array([point["psnr"] for point in history])

@@ -32,7 +32,7 @@ __all__ = ["Checkpoint", "Snapshot"]
 
 logger = logging.getLogger(__name__)
 
-FORMAT = 6
+FORMAT = 7
 # Writing takes at most this share of the time.
 _LARGEST_SHARE = 0.05
 _PARTS = tuple(field.name for field in fields(Gaussians))
@@ -255,9 +255,11 @@ def _require_numbers(numbers: dict[str, Any]) -> None:
         numbers["lowest"]
     ):
         raise TypeError("finite times")
-    largest = numbers["largest"]
+    largest, recent = numbers["largest"], numbers["recent"]
     if not isinstance(largest, list) or len(largest) not in (0, 2) or not all(map(math.isfinite, largest)):
         raise TypeError("the largest sums")
+    if not isinstance(recent, list) or not all(map(math.isfinite, recent)):
+        raise TypeError("the latest errors")
     if not isinstance(numbers["history"], list) or not isinstance(numbers["reason"], str):
         raise TypeError("a history and a reason")
     try:

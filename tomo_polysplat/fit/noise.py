@@ -35,7 +35,8 @@ def photons_per_ray(projections: np.ndarray | torch.Tensor) -> float:
     if projections.shape[2] < 5:
         return float("inf")
     step = max(1, len(projections) // _VIEWS)
-    some = torch.as_tensor(projections[::step]).double()
+    some = projections[::step]
+    some = torch.from_numpy(some.astype(np.float64)) if isinstance(some, np.ndarray) else some.double()
     difference = (some[..., 3:-1] - 2 * some[..., 2:-2] + some[..., 1:-3]).abs()
     # The pixels beside the three: binned by its own value, a pixel's noise would be sorted away.
     middle = 0.5 * (some[..., 4:] + some[..., :-4])

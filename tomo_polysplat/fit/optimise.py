@@ -166,7 +166,7 @@ class _Run:
 
     fitter: _Fitter
     outcome: FitOutcome
-    watch: Watch
+    watch: Watch[Gaussians]
     clock: Clock
     started: float
     checkpoint: Checkpoint | None
@@ -184,6 +184,7 @@ class _Run:
             "begun": clock.begun - self.started,
             "lowest": watch.lowest,
             "waited": watch.waited,
+            "recent": watch.recent,
             "history": outcome.history,
             "skipped_pairs": outcome.skipped_pairs,
             "reason": outcome.reason,
@@ -198,6 +199,7 @@ class _Run:
         self.fitter.restore(kept)
         self.clock.done, self.clock.begun = numbers["steps"], self.started + numbers["begun"]
         self.watch.lowest, self.watch.waited = numbers["lowest"], numbers["waited"]
+        self.watch.recent = numbers["recent"]
         if kept.best is not None:
             self.watch.best = kept.best.to(gaussians.position.device)
         self.outcome.history, self.outcome.reason = numbers["history"], numbers["reason"]
@@ -248,7 +250,7 @@ def fit(
 
     Stops after ``settings.passes`` over the views, at ``deadline`` (``time.perf_counter`` seconds), when the
     held-out rays have not improved for `patience_of` passes, when a callback returns True, or on
-    KeyboardInterrupt; returns the Gaussians of the pass whose held-out rays fitted best. Where ``checkpoint``
+    KeyboardInterrupt; returns the Gaussians that `Watch` holds for the best. Where ``checkpoint``
     holds a snapshot, ``gaussians`` are its own and the fit goes on from there.
     """
     if not len(gaussians):
@@ -259,7 +261,8 @@ def fit(
     fitter = _Fitter(gaussians, spacing, rays, scene, _hurried(settings, steps), batch, rng)
     # From now on: what compiling or recording the step took is no part of the run that the learning rates follow.
     clock = Clock(steps, deadline)
-    outcome, watch = FitOutcome(gaussians), Watch(patience_of(settings, settings.passes))
+    outcome = FitOutcome(gaussians)
+    watch: Watch[Gaussians] = Watch(patience_of(settings, settings.passes))
     run = _Run(fitter, outcome, watch, clock, started, checkpoint)
     run.restore()
     try:

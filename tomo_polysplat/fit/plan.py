@@ -116,7 +116,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     support = int((start > least).sum())
     spacing, finer, because = _seed_spacing(start, least, support, problem, settings, device)
     most = _MOST_VIEWS_PLANAR if problem.planar else _MOST_VIEWS[device]
-    longer = _longer(_cells(support, problem) / spacing ** (2 if problem.planar else 3), problem.planar)
+    longer = _longer(_cells(support, problem) / spacing**problem.dimensions, problem.planar)
     passes, views, reason = _length(problem.geometry.views, settings, most, longer)
     box = settings.tv_box or (_TV_BOX_PLANAR if problem.planar else _TV_BOX[device])
     soft = reference * problem.depth
@@ -218,10 +218,9 @@ def _seed_spacing(
     """
     if settings.seed_spacing:
         return settings.seed_spacing, 0.0, "asked for"
-    dims = 2 if problem.planar else 3
     most, limit = _most_gaussians(start, least, problem, settings, device)
     finest, because = finest_spacing(problem)
-    crowded = (_cells(support, problem) / most) ** (1 / dims)
+    crowded = (_cells(support, problem) / most) ** (1 / problem.dimensions)
     if crowded <= finest:
         return finest, 0.0, because
     because = f"at most {most} Gaussians{limit} over {support} voxels of support"
@@ -232,8 +231,7 @@ def _seed_spacing(
 
 def _cells(voxels: int, problem: Problem) -> float:
     """So many voxels in cubes, or squares, of their shortest edge."""
-    dims = 2 if problem.planar else 3
-    return voxels * float(np.prod(problem.grid.voxel_size[:dims] / problem.voxel))
+    return voxels * float(np.prod(problem.grid.voxel_size[: problem.dimensions] / problem.voxel))
 
 
 def _most_gaussians(
@@ -257,7 +255,7 @@ def finest_spacing(problem: Problem) -> tuple[float, str]:
     """
     width, height = problem.geometry.pixel_size_at(problem.grid.centre)
     pixel = (width if problem.planar else math.sqrt(width * height)) / problem.voxel
-    edge = float((problem.grid.extent / problem.voxel)[: 2 if problem.planar else 3].max())
+    edge = float((problem.grid.extent / problem.voxel)[: problem.dimensions].max())
     if pixel > 1.0:
         return 1.3 * pixel, "1.3 detector pixels at the object"
     few = max(1.3 * pixel, edge / _FEWEST_SEEDS)

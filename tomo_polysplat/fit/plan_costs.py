@@ -41,7 +41,7 @@ def alternatives(plan: Plan, problem: Problem, settings: Settings, gaussians: in
     gaussians : int
         That the plan seeds.
     """
-    dims = 2 if problem.planar else 3
+    dims = problem.dimensions
     volume = math.prod(float(n) for n in (problem.grid.extent / problem.voxel)[:dims])
     everywhere = volume / plan.spacing**dims
     half = plan.spacing / 2

@@ -131,9 +131,14 @@ class Problem:
         return self.spectrum is not None
 
     @property
+    def dimensions(self) -> int:
+        """In which Gaussians extend: 2 in a planar problem, else 3."""
+        return 2 if self.planar else 3
+
+    @property
     def voxel(self) -> float:
         """Shortest edge of a voxel, in the solver's coordinates."""
-        return float(self.grid.voxel_size[: 2 if self.planar else 3].min())
+        return float(self.grid.voxel_size[: self.dimensions].min())
 
     def under(self, spectrum: Spectrum, scatter: float) -> Problem:
         """The same measurements under other physics; copies of them on devices serve both."""

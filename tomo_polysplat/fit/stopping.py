@@ -6,15 +6,19 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 
-__all__ = ["Clock", "FitState", "Watch", "patience_of"]
+__all__ = ["Clock", "FitState", "Fitted", "Watch", "patience_of"]
 
+_Fitted = TypeVar("_Fitted", bound="Fitted")
+
+# The few held-out rays of one pass may fit well by chance, and a state long before the end would be kept: 35 runs on
+# 24^3 to 128^2 voxels missed 0.16 dB in the mean and 2.8 at most of their best pass, with means of four 0.05 and 0.6.
+_AVERAGED = 4
 # A held-out error that falls by less than this share in a pass over the views has stopped falling.
 _IMPROVEMENT = 2e-3
 # Share of a run's passes, and passes at least, without improvement that end it. While the learning rates are high the
@@ -85,28 +89,43 @@ def patience_of(settings: Settings, passes: float) -> int:
     return settings.patience or max(_LEAST_PATIENCE, math.ceil(_PATIENCE * passes))
 
 
-class Watch:
-    """Keeps the best state and says when to stop: after ``patience`` passes without improvement."""
+class Fitted(Protocol):
+    """What is fitted: Gaussians, or the voxels that they are compared with."""
+
+    def copy(self: _Fitted) -> _Fitted:
+        """Which later steps leave alone."""
+
+    def finite(self) -> bool:
+        """Whether every parameter is a finite number."""
+
+
+class Watch(Generic[_Fitted]):
+    """Keeps the best state and says when to stop: after ``patience`` passes without improvement.
+
+    The best is that after which the held-out error, in the mean of its pass and the three before, is lowest.
+    """
 
     def __init__(self, patience: int) -> None:
         self.patience = patience
-        self.best: Gaussians | None = None
+        self.best: _Fitted | None = None
+        self.recent: list[float] = []
         self.lowest = math.inf
         self.waited = 0
 
-    def judge(self, state: FitState, gaussians: Gaussians) -> str:
+    def judge(self, state: FitState, fitted: _Fitted) -> str:
         """The reason to stop, or nothing."""
-        if not (math.isfinite(state.loss) and gaussians.finite()):
+        if not (math.isfinite(state.loss) and fitted.finite()):
             if self.best is None:
                 raise FloatingPointError(
                     "the fit diverged in its first pass; see the log for rays out of range"
                 )
             return "the fit stopped being finite"
         held_out = math.isfinite(state.held_out)
-        score = state.held_out if held_out else state.loss
+        self.recent = [*self.recent, state.held_out if held_out else state.loss][-_AVERAGED:]
+        score = sum(self.recent) / len(self.recent)
         self.waited = 0 if score < (1 - _IMPROVEMENT) * self.lowest else self.waited + 1
         if score <= self.lowest:
-            self.lowest, self.best = score, gaussians.copy()
+            self.lowest, self.best = score, fitted.copy()
         if held_out and self.waited >= self.patience:
             return f"the held-out rays had not improved for {self.waited} passes"
         return ""

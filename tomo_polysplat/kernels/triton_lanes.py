@@ -20,6 +20,7 @@ __all__ = [
     "lane_set",
     "load_four",
     "lowest_lane",
+    "share_out",
     "store_four",
     "store_sums",
     "two_lowest",
@@ -136,6 +137,21 @@ def add_halves(a, b):
         " shfl.sync.bfly.b32 give, give, 16, 31, -1; add.f32 $0, keep, give; }",
         "=f,f,f", [a, b], dtype=tl.float32, is_pure=False, pack=1,
     )  # fmt: skip
+
+
+@triton.jit
+def share_out(
+    a0, b0, c0, d0, a1, b1, c1, d1, a2, b2, c2, d2, a3, b3, c3, d3, CHANNELS: tl.constexpr
+):  # fmt: skip
+    """`add_halves` of a and b, then of c and d, by channel: which half of the warp goes on with which of four sums."""
+    a0, c0 = add_halves(a0, b0), add_halves(c0, d0)
+    if CHANNELS > 1:
+        a1, c1 = add_halves(a1, b1), add_halves(c1, d1)
+    if CHANNELS > 2:
+        a2, c2 = add_halves(a2, b2), add_halves(c2, d2)
+    if CHANNELS > 3:
+        a3, c3 = add_halves(a3, b3), add_halves(c3, d3)
+    return a0, a1, a2, a3, c0, c1, c2, c3
 
 
 @triton.jit

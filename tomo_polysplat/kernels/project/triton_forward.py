@@ -17,10 +17,10 @@ from tomo_polysplat.kernels.project.triton_image import spread
 from tomo_polysplat.kernels.project.triton_setup import RECORD
 from tomo_polysplat.kernels.triton_lanes import (
     add_four,
-    add_halves,
     adds_four,
     lane_set,
     load_four,
+    share_out,
     two_lowest,
 )
 from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, SIZES, grain, grained, on_device
@@ -108,14 +108,7 @@ def _sum_tile(
             a2, b2, c2, d2 = a2 + w2 * a, b2 + w2 * b, c2 + w2 * c, d2 + w2 * d
         if CHANNELS > 3:
             a3, b3, c3, d3 = a3 + w3 * a, b3 + w3 * b, c3 + w3 * c, d3 + w3 * d
-    a0, c0 = add_halves(a0, b0), add_halves(c0, d0)
-    if CHANNELS > 1:
-        a1, c1 = add_halves(a1, b1), add_halves(c1, d1)
-    if CHANNELS > 2:
-        a2, c2 = add_halves(a2, b2), add_halves(c2, d2)
-    if CHANNELS > 3:
-        a3, c3 = add_halves(a3, b3), add_halves(c3, d3)
-    return a0, a1, a2, a3, c0, c1, c2, c3
+    return share_out(a0, b0, c0, d0, a1, b1, c1, d1, a2, b2, c2, d2, a3, b3, c3, d3, CHANNELS)
 
 
 @triton.jit
