@@ -109,7 +109,7 @@ class Settings:
     patience: int = 0
     """Passes over the views without improvement of the held-out rays that end the run; 0: four in ten, at least 4."""
     metal_tail: float = 0.5
-    """A voxel no point of which reaches this share of the metal around it holds a tail, which the metal gets back."""
+    """A voxel no point of which is near this share of the metal around it holds a tail, which the metal gets back."""
     cutoff: float = 3.0
     """Standard deviations at which a projected Gaussian ends."""
     curves: int = 0

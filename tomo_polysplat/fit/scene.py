@@ -44,7 +44,7 @@ class FitScene:
     kernel : str
     cutoff : float
     metal_tail : float
-        Share of the metal around a voxel that some point of it has to reach; see ``render.metal_edges``.
+        Share of the metal around a voxel that some point of it has to come near to; see ``render.metal_edges``.
     blurring : bool
         Whether rays are seen through the detector's blur; see ``physics.detector_blur``.
     tv_box : int
