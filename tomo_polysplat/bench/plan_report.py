@@ -12,7 +12,7 @@ from tomo_polysplat.bench.recon_report import machine
 from tomo_polysplat.bench.runs import without_figures
 from tomo_polysplat.bench.tables import markdown_table
 from tomo_polysplat.files import replacing
-from tomo_polysplat.report.style import ACCENT, INK, QUIET
+from tomo_polysplat.report.style import ACCENT, INK, QUIET, plain_log
 
 __all__ = ["as_markdown", "write_figure"]
 
@@ -93,7 +93,8 @@ def write_figure(path: Path, record: Mapping[str, Any]) -> None:
         if entry["rule"] is not None:
             axis.axvline(entry["rule"]["keeps"], color=INK, linewidth=0.8, label="kept by the rule")
             axis.set_title(f"{entry['scan']}: {entry['rule']['missed_db']:.2f} dB missed", fontsize=9)
-        axis.set(xlabel="pass over the views", yscale="log")
+        axis.set(xlabel="pass over the views")
+        plain_log(axis.yaxis)
         axis.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("error over its smallest")
     panels[0].legend(frameon=False, fontsize=8)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from tomo_polysplat.bench.methods import METHODS
 from tomo_polysplat.bench.runs import without_figures
 from tomo_polysplat.files import replacing
-from tomo_polysplat.report.style import ACCENT, OURS, QUIET
+from tomo_polysplat.report.style import ACCENT, OURS, QUIET, plain_log
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -87,7 +87,8 @@ def error_figure(record: Mapping[str, Any], scene: str, size: int) -> Figure:
                 course = [(p["seconds"], p[key]) for p in curve["history"]]
                 # Small dots, as a course of a single pass has no line.
                 axis.plot(*zip(*course), color=colour(name, record), marker=".", markersize=4)
-        axis.set(xscale="log", xlabel="seconds, from projections to volume", ylabel=f"PSNR {label} (dB)")
+        axis.set(xlabel="seconds, from projections to volume", ylabel=f"PSNR {label} (dB)")
+        plain_log(axis.xaxis)
         dress(axis)
     if axis.lines:
         axis.legend(frameon=False, fontsize=8)
@@ -110,10 +111,11 @@ def _size_figure(folder: Path, record: Mapping[str, Any], scene: str) -> Path:
             if run["size"] not in best or run["psnr"] > best[run["size"]]["psnr"]:
                 best[run["size"]] = run
         _plot(axis, name, [(size, best[size]["seconds"]) for size in sorted(best)], record, "o", "-")
-    axis.set(xscale="log", yscale="log", xlabel="voxels per edge", ylabel="seconds of the run of least error")
+    axis.set(xscale="log", xlabel="voxels per edge", ylabel="seconds of the run of least error")
+    plain_log(axis.yaxis)
     sizes = sorted({run["size"] for run in here})
     axis.set_xticks(sizes, [str(size) for size in sizes])
-    axis.minorticks_off()
+    axis.set_xticks([], minor=True)
     dress(axis)
     figure.legend(loc="outside right center", frameon=False, fontsize=8)
     figure.suptitle(f"{scene}; {machine(record)}", fontsize=10)

@@ -14,7 +14,7 @@ from tomo_polysplat.checks import fail, require_shape
 from tomo_polysplat.files import replacing
 from tomo_polysplat.report import table as tables
 from tomo_polysplat.report.slices import Plane, display_window, planes_through
-from tomo_polysplat.report.style import ACCENT, INK, OURS, QUIET, full_name
+from tomo_polysplat.report.style import ACCENT, INK, OURS, QUIET, full_name, plain_log
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -177,7 +177,7 @@ def history_figure(history: Sequence[Mapping[str, Any]]) -> Figure:
     if axis.lines:
         axis.legend(frameon=False)
         if all(np.all(np.asarray(line.get_ydata()) > 0) for line in axis.lines):
-            axis.set_yscale("log")
+            plain_log(axis.yaxis)
     else:
         axis.text(0.5, 0.5, "no history was recorded", ha="center", transform=axis.transAxes, color=QUIET)
     return figure
