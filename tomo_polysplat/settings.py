@@ -100,6 +100,8 @@ class Settings:
     their logarithm, so that edges and texture stay. 0 leaves it to the plan; with 1000 all count in full."""
     tv_box: int = 0
     """Edge in voxels of the random box whose total variation is taken; 0 leaves it to the plan."""
+    tv_every: int = 0
+    """In every how many steps it is taken, and counts as many times; 0 leaves it to the plan."""
     relocated: float = 0.03
     """Largest share of the Gaussians that, once a pass, moves from where it holds nothing to where it is wanted."""
     relocate_until: float = 0.5

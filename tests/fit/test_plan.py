@@ -250,10 +250,19 @@ def test_few_voxels_get_more_seeds_than_voxels(planar):
         assert ("few voxels" in chosen.reasons["seed_spacing_voxels"]) == (pixel < 1)
 
 
-@pytest.mark.parametrize(("edge", "words"), [(0, "all of the volume: what"), (5, "a box of 5 voxels")])
+@pytest.mark.parametrize(
+    ("edge", "words"), [(0, "all of the volume, in one step of 2: what"), (5, "a box of 5 voxels")]
+)
 def test_what_is_smoothed_is_told(edge, words):
     of = problem(size=12)
     assert words in plan(of, ball(of, WATER), tv_box=edge).reasons["smoothed_box"]
+
+
+def test_a_cpu_smooths_volumes_every_other_step():
+    of, flat = problem(size=12), problem(size=12, planar=True)
+    assert plan(of, ball(of, WATER)).tv_every == 2
+    assert plan(of, ball(of, WATER), device="cuda").tv_every == plan(flat, ball(flat, WATER)).tv_every == 1
+    assert plan(of, ball(of, WATER), tv_every=3).tv_every == 3
 
 
 @pytest.mark.parametrize("passes", [1.0, 60.0, 90.0, 10_000.0])

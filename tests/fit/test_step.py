@@ -39,6 +39,26 @@ def test_the_cpu_steps_through_autograd():
     assert "numba" in why_eager(problem[3], problem[4])
 
 
+def test_the_cpu_smooths_every_other_step_twice_as_much():
+    ends = []
+    for every, weights in ((2, (0.3, 0.3)), (1, (0.6, 0.0))):
+        gaussians, *problem = fit_problem("cone", True, "cpu", "numba", tv_weight=0.3)
+        problem[2] = replace(problem[2], tv_every=every)
+        step = EagerStep(gaussians, *problem[:-1])
+        for k, weight in enumerate(weights):
+            step.settings = replace(problem[3], tv_weight=weight)
+            step(np.array([k, 4 - k]), problem[-1], 0.0)
+        ends.append(gaussians.copy().parameters())
+    for name in ends[0]:
+        torch.testing.assert_close(ends[0][name], ends[1][name], msg=name)
+
+
+def test_a_recorded_step_always_smooths():
+    scene, settings = fit_problem("cone", True, "cpu", "triton")[3:5]
+    assert not why_eager(scene, settings)
+    assert "smooth" in why_eager(replace(scene, tv_every=2), settings)
+
+
 def test_no_material_number_falls_below_what_the_curves_allow():
     gaussians, *problem, box = fit_problem("cone", True, "cpu", "numba")
     gaussians.own_material.fill_(-0.1)

@@ -211,8 +211,8 @@ def _content(about: np.ndarray) -> dict[str, Any]:
 
 def _plan(parts: dict[str, Any]) -> Plan:
     plan = Plan(**parts)
-    above_zero = min(plan.reference, plan.spacing, plan.views_per_step, plan.tv_box) > 0
-    whole = isinstance(plan.views_per_step, int) and isinstance(plan.tv_box, int)
+    above_zero = min(plan.reference, plan.spacing, plan.views_per_step, plan.tv_box, plan.tv_every) > 0
+    whole = all(isinstance(n, int) for n in (plan.views_per_step, plan.tv_box, plan.tv_every))
     corners = len(plan.tv_corners) == 2 and all(
         isinstance(corner, (int, float)) and corner >= 0 for corner in plan.tv_corners
     )

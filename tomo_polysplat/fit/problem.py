@@ -219,6 +219,7 @@ class Problem:
             plan.tv_box,
             plan.tv_corners,
             closed,
+            plan.tv_every,
         )
 
     def _primary(self, device: torch.device) -> torch.Tensor:

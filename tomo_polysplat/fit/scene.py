@@ -54,6 +54,8 @@ class FitScene:
         one of the two is bone-like or denser.
     closed : bool
         Whether all matter lies within the voxels, so that no Gaussian may leave them; see ``fit.inside``.
+    tv_every : int
+        In every how many steps that total variation is taken, and counts as many times.
     """
 
     box: VoxelBox
@@ -69,6 +71,7 @@ class FitScene:
     tv_box: int
     tv_corners: tuple[float, float]
     closed: bool = False
+    tv_every: int = 1
 
     def projections(self, gaussians: Gaussians, views: DetectorViews) -> tuple[torch.Tensor, int]:
         """(views, rows, columns) predicted -log(I/I0), and the pairs skipped at the source plane."""

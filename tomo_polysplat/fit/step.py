@@ -186,8 +186,9 @@ class EagerStep:
         """What is added to the misfit: total variation, and the dissimilarity of the projections if asked for."""
         settings = self.settings
         total: torch.Tensor | float = 0.0
-        if settings.tv_weight:
-            total = total + settings.tv_weight * roughness(self.gaussians, self.scene, settings, box)
+        if settings.tv_weight and self._done % self.scene.tv_every == 0:
+            weight_now = self.scene.tv_every * settings.tv_weight
+            total = total + weight_now * roughness(self.gaussians, self.scene, settings, box)
         if settings.ssim_weight:
             total = total + settings.ssim_weight * dissimilarity(predicted, measured, weight)
         return total
