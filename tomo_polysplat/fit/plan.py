@@ -47,8 +47,8 @@ _LONGER, _LONGER_PLANAR = (1.5, 9000), (2.0, 36_000)
 # Voxels along an edge of the box that is smoothed. What a box seldom meets is smoothed by leaps, which upset the
 # optimiser's sense of scale (teeth, 128^3 voxels: 39.1, 39.7 and 40.2 dB with 32, 64 and 128).
 _TV_BOX, _TV_BOX_PLANAR = {"cpu": 48, "cuda": 128}, 256
-# On a CPU voxels take 40 % of a step. Smoothed at every other step, twice as much, volumes are the same (twelve scans of
-# 32^3 to 64^3: -0.03 dB without metal and 0.0 everywhere in the mean, -0.17 at most) in 10 to 30 % less time. In
+# On a CPU voxels take 40 % of a step. Smoothed at every other step, twice as much, volumes are the same (twelve scans
+# of 32^3 to 64^3: -0.03 dB without metal and 0.0 everywhere in the mean, -0.17 at most) in 10 to 30 % less time. In
 # slices, where they take less, a casting of 128^2 lost 0.1 dB, and on a GPU a step is one recording.
 _TV_EVERY = {"cpu": 2, "cuda": 1}
 # Gaussians that a laptop and a GPU fit in a time people wait for.
