@@ -18,6 +18,7 @@ _RANGES: dict[str, dict[str, Any]] = {
     "blur": {"at_least": 0.0, "at_most": 0.6},
     "held_out": {"at_least": 0.0, "at_most": 0.5},
     "finer_seeds": {"at_least": 0.0, "at_most": 0.9},
+    "metal_tail": {"at_least": 0.0, "at_most": 0.8},
 }
 
 
@@ -111,7 +112,7 @@ class Settings:
     patience: int = 0
     """Passes over the views without improvement of the held-out rays that end the run; 0: four in ten, at least 4."""
     metal_tail: float = 0.5
-    """A voxel no point of which is near this share of the metal around it holds a tail, which the metal gets back."""
+    """A voxel no point of which reaches about this share of the metal around it holds a tail, which that gets back."""
     cutoff: float = 3.0
     """Standard deviations at which a projected Gaussian ends."""
     curves: int = 0

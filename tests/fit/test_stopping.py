@@ -96,6 +96,16 @@ def test_without_held_out_rays_the_loss_is_watched_and_nothing_ends_early():
     assert best(watch) == 3
 
 
+def test_a_pass_that_met_no_held_out_ray_says_nothing():
+    """As the last one of a time budget may: the fitted rays' misfit is another quantity, and mostly the smaller."""
+    watch = Watch(3)
+    assert judge(watch, [(0.2, 0.3), (0.19, 0.28), (0.18, 0.285), (0.01, math.nan)]) == [""] * 4
+    assert best(watch) == 2 and watch.waited == 0
+    watch = Watch(3)
+    judge(watch, [(0.1, math.nan), (0.1, 0.3), (0.1, 0.4)])
+    assert best(watch) == 1
+
+
 def test_a_loss_that_is_no_number_ends_the_run_with_what_was_best():
     watch = Watch(4)
     assert "finite" in judge(watch, [2.0, 1.0, (math.nan, math.nan)])[-1]

@@ -45,9 +45,11 @@ def test_spatial_order_keeps_neighbours_together():
     groups = position[order].reshape(64, 32, 3)
     # 64 groups of a unit cube in cells of side 1/4 each.
     assert (groups.amax(1) - groups.amin(1)).mean() < 0.35
-    # No leap between any two that follow each other, in a cube of eight cells along an edge.
+    # No leap between any two that follow each other, in a cube and in planes of eight cells along an edge.
     grid = torch.cartesian_prod(*[torch.arange(8.0)] * 3)
-    assert ((grid[spatial_order(grid)].diff(dim=0)).abs().sum(1) == 1).all()
+    for cells in (grid, *(grid[grid[:, k] == 3] for k in range(3))):
+        assert (cells[spatial_order(cells)].diff(dim=0).abs().sum(1) == 1).all()
+    assert spatial_order(torch.ones(5, 3)).tolist() == [0, 1, 2, 3, 4]
     assert spatial_order(position[:0]).tolist() == []
     assert spatial_order(position[:1]).tolist() == [0]
 

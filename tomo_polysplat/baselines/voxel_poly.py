@@ -18,6 +18,7 @@ from tomo_polysplat.fit.loss import misfit, total_variation
 from tomo_polysplat.fit.noise import photons_per_ray
 from tomo_polysplat.fit.plan import PASSES
 from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.step import held_out_mean
 from tomo_polysplat.fit.stopping import FitState, Watch, patience_of
 from tomo_polysplat.fit.texture import tv_corners
 from tomo_polysplat.physics.materials import Materials
@@ -78,7 +79,12 @@ def voxel_poly(
     Returns
     -------
     (nz, ny, nx) float32
-        Attenuation in 1/unit at the effective energy, of the pass whose held-out rays fitted best.
+        Attenuation in 1/unit at the effective energy, of the state that the stopping rule keeps.
+
+    Raises
+    ------
+    FloatingPointError
+        If the fit diverges in its first pass.
     """
     started = time.perf_counter()
     chosen = settings if isinstance(settings, Settings) else make_settings(changes=dict(settings or {}))
@@ -147,7 +153,7 @@ class _Fit:
         deadline: float | None,
         callbacks: Sequence[Callable[[FitState], Any]],
     ) -> VoxelModel:
-        """The model of the pass whose held-out rays fitted best."""
+        """The model that the stopping rule keeps; see ``fit.stopping.Watch``."""
         begun, step = time.perf_counter(), 0
         groups = _interleaved(len(self.rays.views))
         passes = self.settings.passes or PASSES
@@ -167,16 +173,17 @@ class _Fit:
                 step += 1
             if not errors:
                 break
-            loss, held_out = torch.stack(errors).mean(dim=0).tolist()
+            loss, aside, weight = torch.stack(errors).sum(dim=0).tolist()
+            loss, held_out = loss / len(errors), held_out_mean(aside, weight)
             seconds = time.perf_counter() - started
             state = FitState(seconds, step, 0, loss, held_out, share(), lambda: self.volume(self.model))
             ended = bool(watch.judge(state, self.model))
             if any([callback(state) is True for callback in callbacks]) or ended:
                 break
-        return watch.best or self.model
+        return watch.best or self.model.copy()
 
     def _step(self, views: np.ndarray, share: float) -> torch.Tensor:
-        """One step of Adam; misfit of the fitted and of the held-out rays."""
+        """One step of Adam; misfit of the fitted rays, of the held-out ones times their weight, and this."""
         for group in self.optimiser.param_groups:
             group["lr"] = group["rate"] * self.settings.final_rate**share
         _, measured, weight, aside = self.rays.batch(views)
@@ -192,7 +199,9 @@ class _Fit:
         self.optimiser.step()
         self.model.hold()
         with torch.no_grad():
-            return torch.stack([fitted.detach(), misfit(predicted, measured, aside, self.settings)])
+            weight = aside.sum()
+            held_out = misfit(predicted, measured, aside, self.settings) * weight
+            return torch.stack([fitted.detach(), held_out, weight])
 
     def _output(self, weights: torch.Tensor) -> torch.Tensor:
         """(nz, ny, nx) attenuation at the effective energy in soft references."""

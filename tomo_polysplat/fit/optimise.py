@@ -185,6 +185,7 @@ class _Run:
             "lowest": watch.lowest,
             "waited": watch.waited,
             "recent": watch.recent,
+            "by_held_out": watch.by_held_out,
             "history": outcome.history,
             "skipped_pairs": outcome.skipped_pairs,
             "reason": outcome.reason,
@@ -199,7 +200,7 @@ class _Run:
         self.fitter.restore(kept)
         self.clock.done, self.clock.begun = numbers["steps"], self.started + numbers["begun"]
         self.watch.lowest, self.watch.waited = numbers["lowest"], numbers["waited"]
-        self.watch.recent = numbers["recent"]
+        self.watch.recent, self.watch.by_held_out = numbers["recent"], numbers["by_held_out"]
         if kept.best is not None:
             self.watch.best = kept.best.to(gaussians.position.device)
         self.outcome.history, self.outcome.reason = numbers["history"], numbers["reason"]

@@ -102,13 +102,16 @@ class Fitted(Protocol):
 class Watch(Generic[_Fitted]):
     """Keeps the best state and says when to stop: after ``patience`` passes without improvement.
 
-    The best is that after which the held-out error, in the mean of its pass and the three before, is lowest.
+    The best state is the one after the pass at which the mean held-out error of that pass and the three before is
+    lowest. Where no ray is held out, the misfit of the fitted ones takes its place; a pass that met none of those
+    that are says nothing.
     """
 
     def __init__(self, patience: int) -> None:
         self.patience = patience
         self.best: _Fitted | None = None
         self.recent: list[float] = []
+        self.by_held_out = False
         self.lowest = math.inf
         self.waited = 0
 
@@ -120,12 +123,16 @@ class Watch(Generic[_Fitted]):
                     "the fit diverged in its first pass; see the log for rays out of range"
                 )
             return "the fit stopped being finite"
-        held_out = math.isfinite(state.held_out)
-        self.recent = [*self.recent, state.held_out if held_out else state.loss][-_AVERAGED:]
+        if math.isfinite(state.held_out) and not self.by_held_out:
+            self.by_held_out, self.recent, self.lowest = True, [], math.inf
+        error = state.held_out if self.by_held_out else state.loss
+        if math.isnan(error):
+            return ""
+        self.recent = [*self.recent, error][-_AVERAGED:]
         score = sum(self.recent) / len(self.recent)
         self.waited = 0 if score < (1 - _IMPROVEMENT) * self.lowest else self.waited + 1
         if score <= self.lowest:
             self.lowest, self.best = score, fitted.copy()
-        if held_out and self.waited >= self.patience:
+        if self.by_held_out and self.waited >= self.patience:
             return f"the held-out rays had not improved for {self.waited} passes"
         return ""

@@ -20,30 +20,32 @@ def spatial_order(position: torch.Tensor) -> torch.Tensor:
     if not len(position):
         return torch.zeros(0, dtype=torch.int64, device=position.device)
     point = position.detach()
-    lower, upper = point.amin(0), point.amax(0)
-    cells = (point - lower) / (upper - lower).amax().clamp_min(torch.finfo(point.dtype).tiny)
+    extent = point.amax(0) - point.amin(0)
+    cells = (point - point.amin(0)) / extent.amax().clamp_min(torch.finfo(point.dtype).tiny)
+    # Of the curve through a cube little lies in one plane, and that with leaps: a plane has a curve of its own.
+    cells = cells[:, extent > 0] if bool((extent > 0).any()) else cells
     return torch.argsort(_along_curve((cells * (2**_BITS - 1)).nan_to_num(0.0).long()), stable=True)
 
 
 def _along_curve(cell: torch.Tensor) -> torch.Tensor:
-    """Where cells (n, 3) lie on the Hilbert curve; by J. Skilling, AIP Conf. Proc. 707 (2004) 381.
+    """Where cells (n, axes) lie on the Hilbert curve; by J. Skilling, AIP Conf. Proc. 707 (2004) 381.
 
-    From the coarsest bit to the finest each octant of the cube is turned and mirrored into the one that the
-    curve passes first, x taking the other axes' places. The Gray code of what is left counts the octants.
+    From the coarsest bit to the finest each part of the cube is turned and mirrored into the one that the
+    curve passes first, the first axis taking the others' places. The Gray code of what is left counts the parts.
     """
     axes = list(cell.unbind(1))
     for bit in range(_BITS - 1, 0, -1):
         finer = (1 << bit) - 1
-        for k in range(3):
+        for k in range(len(axes)):
             far = (axes[k] >> bit & 1).bool()
             exchanged = torch.where(far, 0, (axes[0] ^ axes[k]) & finer)
             axes[k] = axes[k] ^ exchanged
             axes[0] = axes[0] ^ torch.where(far, finer, exchanged if k else 0)
-    axes[1] = axes[1] ^ axes[0]
-    axes[2] = axes[2] ^ axes[1]
+    for k in range(1, len(axes)):
+        axes[k] = axes[k] ^ axes[k - 1]
     flips = torch.zeros_like(axes[0])
     for bit in range(_BITS - 1, 0, -1):
-        flips ^= torch.where((axes[2] >> bit & 1).bool(), (1 << bit) - 1, 0)
+        flips ^= torch.where((axes[-1] >> bit & 1).bool(), (1 << bit) - 1, 0)
     place = torch.zeros_like(flips)
     for bit in range(_BITS - 1, -1, -1):
         for axis in axes:

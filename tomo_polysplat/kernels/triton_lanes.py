@@ -143,7 +143,7 @@ def add_halves(a, b):
 def share_out(
     a0, b0, c0, d0, a1, b1, c1, d1, a2, b2, c2, d2, a3, b3, c3, d3, CHANNELS: tl.constexpr
 ):  # fmt: skip
-    """`add_halves` of a and b, then of c and d, by channel: which half of the warp goes on with which of four sums."""
+    """Sums over both halves of the warp, by channel; the lower half keeps a's and c's, the upper b's and d's."""
     a0, c0 = add_halves(a0, b0), add_halves(c0, d0)
     if CHANNELS > 1:
         a1, c1 = add_halves(a1, b1), add_halves(c1, d1)

@@ -68,7 +68,7 @@ def tails(
 def tail_factors(metal: torch.Tensor, rest: torch.Tensor, tail: torch.Tensor) -> torch.Tensor:
     """What to multiply each voxel's metal by, so that faint rims move into the voxels they belong to.
 
-    What is tail goes to those neighbours that hold metal which is none, in proportion to that. One percent of
+    What is tail goes to the metal that is none in the voxel itself and beside it, in proportion to that. One percent of
     iron is as bright as water, so such tails would dominate the error of what surrounds metal. Where the fit has
     lowered the rest of a voxel to make room for a tail, as much of the tail stays as brings the voxel to the level
     of clean voxels nearby: the rays see only the sum.

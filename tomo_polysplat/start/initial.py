@@ -36,8 +36,10 @@ def initial_volume_on(
     projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid
 ) -> tuple[torch.Tensor, dict[str, Any]]:
     """As `initial_volume` for projections on a device, where the volume is, too."""
-    fits, reason = _method(geometry, grid)
-    volume = fdk_on_gpu(projections, geometry, grid) if projections.is_cuda and fits else None
+    volume, reason = None, ""
+    if projections.is_cuda:
+        fits, reason = _method(geometry, grid)
+        volume = fdk_on_gpu(projections, geometry, grid) if fits else None
     if volume is None:
         device = projections.device
         found, done = initial_volume(projections.cpu().numpy(), geometry, grid, device=device.type)

@@ -28,7 +28,7 @@ from tomo_polysplat.kernels.views import DetectorViews
 
 __all__ = ["splat"]
 
-_TILE_ROWS = 8  # and as many columns: half a warp has four pixels a lane
+_TILE_ROWS = 8  # and as many columns, or 64 of a single row: half a warp has four pixels a lane
 _HALF = tl.constexpr(16)
 _PROGRAMS = 1 << 15  # enough to fill the device; the windows of fewer groups are each shared out
 _MOST_PARTS = 16
@@ -150,13 +150,16 @@ def _splat_pixels_kernel(
     STEP: tl.constexpr = _HALF // ROWS
     COLUMNS: tl.constexpr = 4 * STEP
     upper, down, across = lane >= _HALF, lane % _HALF // STEP, lane % STEP
+    # The parts of a window are every so many rows of tiles, or tiles where there is one row.
+    below, down_by, beside, along_by = part * ROWS, parts * ROWS, 0, COLUMNS
+    if ROWS == 1:
+        below, down_by, beside, along_by = 0, 1, part * COLUMNS, parts * COLUMNS
     if y_low <= y_high:
-        top0 = y_low.to(tl.int32)
-        for top in range(top0 + part * ROWS, y_high.to(tl.int32) + 1, parts * ROWS):
+        for top in range(y_low.to(tl.int32) + below, y_high.to(tl.int32) + 1, down_by):
             y0 = top + 0.0
             first, last = _columns(yc, by_ry, ry, xc, m, hx, ahead, y0, y0 + (ROWS - 1), columns)
             # From an even column: two pixels of four channels fill one sector of memory.
-            for left in range(tl.min(first, 0) // 2 * 2, tl.max(last, 0) + 1, COLUMNS):
+            for left in range(tl.min(first, 0) // 2 * 2 + beside, tl.max(last, 0) + 1, along_by):
                 found = lane_set((first < left + COLUMNS) & (last >= left) & (first <= last), lane)
                 if found != 0:
                     i, j = top + down, left + across

@@ -18,6 +18,7 @@ from tomo_polysplat.kernels.voxelise.triton_setup import RECORD, ROOT, scaled_wh
 __all__ = ["pull_back", "sum_moments"]
 
 _GAUSSIANS = 64
+_FAR = tl.constexpr(1 << 22)
 
 
 @triton.jit
@@ -47,7 +48,14 @@ def _voxel_moments_kernel(record, grad, moments, count, nz, ny, nx, stride, cut,
     htv, huu, huv, hvv = zero, zero, zero, zero
     c0, c1, c2, c3 = zero, zero, zero, zero
     by_r11, by_r22 = 1.0 / r11, 1.0 / r22
-    near = (xc + half_x >= 0) & (xc - half_x <= nx - 1) & (yc + half_y >= 0) & (yc - half_y <= ny - 1)
+    # So far away x could not count voxels, and no Gaussian of a fit is.
+    near = (
+        (tl.abs(xc) < _FAR)
+        & (xc + half_x >= 0)
+        & (xc - half_x <= nx - 1)
+        & (yc + half_y >= 0)
+        & (yc - half_y <= ny - 1)
+    )
     z_first, z_last = _range(zc, half_z, nz)
     z_last = tl.where(near & (n < count), z_last, -1.0)
     for slab in range(_longest(z_first, z_last)):

@@ -38,8 +38,8 @@ def _columns(
 ):
     """First and last column that ellipsoids can reach along a beam of H x D lines around (y, z); or none.
 
-    Each term of q is least, and the middle of a line farthest to either side, somewhere in the beam: what is
-    bounded term by term holds the ellipsoid's part of the beam, with little to spare where that is thin.
+    From the least that each of q's other terms, and the farthest that the middle of a line, comes to in the beam:
+    never too narrow.
     """
     dy, dz, high, deep = y - yc, z - zc, (H - 1) / 2, (D - 1) / 2
     out = tl.maximum(r33 * (tl.abs(dz) - deep), 0.0)
