@@ -106,6 +106,15 @@ def test_a_pass_that_met_no_held_out_ray_says_nothing():
     assert best(watch) == 1
 
 
+def test_a_history_tells_all_but_the_best_state():
+    errors = [(0.5, math.nan), (0.4, 0.6), (0.3, 0.5), (0.2, math.nan), (0.2, 0.9), (0.1, 0.8)]
+    whole, resumed = Watch(9), Watch(9)
+    judge(whole, errors)
+    records = [{"loss": loss, "held_out": None if math.isnan(aside) else aside} for loss, aside in errors]
+    resumed.recall(records, whole.best)
+    assert vars(resumed) == vars(whole)
+
+
 def test_a_loss_that_is_no_number_ends_the_run_with_what_was_best():
     watch = Watch(4)
     assert "finite" in judge(watch, [2.0, 1.0, (math.nan, math.nan)])[-1]

@@ -248,22 +248,19 @@ def _snapshot(arrays: dict[str, np.ndarray], numbers: dict[str, Any], views: int
 
 
 def _require_numbers(numbers: dict[str, Any]) -> None:
-    counts = ("steps", "steps_made", "waited", "skipped_pairs", "relocated")
+    counts = ("steps", "steps_made", "skipped_pairs", "relocated")
     if any(not isinstance(numbers[name], int) or numbers[name] < 0 for name in counts):
         raise TypeError(f"whole numbers for {', '.join(counts)}")
-    if any(not math.isfinite(numbers[name]) for name in ("seconds", "begun")) or math.isnan(
-        numbers["lowest"]
-    ):
+    if any(not math.isfinite(numbers[name]) for name in ("seconds", "begun")):
         raise TypeError("finite times")
-    largest, recent = numbers["largest"], numbers["recent"]
+    largest, history = numbers["largest"], numbers["history"]
     if not isinstance(largest, list) or len(largest) not in (0, 2) or not all(map(math.isfinite, largest)):
         raise TypeError("the largest sums")
-    if not isinstance(recent, list) or not all(map(math.isfinite, recent)):
-        raise TypeError("the latest errors")
-    if not isinstance(numbers["by_held_out"], bool):
-        raise TypeError("whose errors they are")
-    if not isinstance(numbers["history"], list) or not isinstance(numbers["reason"], str):
+    if not isinstance(history, list) or not isinstance(numbers["reason"], str):
         raise TypeError("a history and a reason")
+    for entry in history:
+        if not (isinstance(entry["loss"], float) and isinstance(entry["held_out"], (float, type(None)))):
+            raise TypeError("errors of every pass")
     try:
         np.random.default_rng().bit_generator.state = numbers["random"]
     except ValueError as error:

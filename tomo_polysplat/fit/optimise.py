@@ -177,15 +177,11 @@ class _Run:
             self.checkpoint.offer(lambda: self.fitter.snapshot(self.watch.best, self._numbers()), now=now)
 
     def _numbers(self) -> dict[str, Any]:
-        outcome, watch, clock = self.outcome, self.watch, self.clock
+        outcome, clock = self.outcome, self.clock
         return {
             "steps": clock.done,
             "seconds": time.perf_counter() - self.started,
             "begun": clock.begun - self.started,
-            "lowest": watch.lowest,
-            "waited": watch.waited,
-            "recent": watch.recent,
-            "by_held_out": watch.by_held_out,
             "history": outcome.history,
             "skipped_pairs": outcome.skipped_pairs,
             "reason": outcome.reason,
@@ -199,10 +195,8 @@ class _Run:
         numbers, gaussians = kept.numbers, self.fitter.gaussians
         self.fitter.restore(kept)
         self.clock.done, self.clock.begun = numbers["steps"], self.started + numbers["begun"]
-        self.watch.lowest, self.watch.waited = numbers["lowest"], numbers["waited"]
-        self.watch.recent, self.watch.by_held_out = numbers["recent"], numbers["by_held_out"]
-        if kept.best is not None:
-            self.watch.best = kept.best.to(gaussians.position.device)
+        best = None if kept.best is None else kept.best.to(gaussians.position.device)
+        self.watch.recall(numbers["history"], best)
         self.outcome.history, self.outcome.reason = numbers["history"], numbers["reason"]
         self.outcome.skipped_pairs = numbers["skipped_pairs"]
         self.outcome.relocated = self.fitter.relocated

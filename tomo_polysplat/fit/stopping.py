@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -123,16 +123,28 @@ class Watch(Generic[_Fitted]):
                     "the fit diverged in its first pass; see the log for rays out of range"
                 )
             return "the fit stopped being finite"
-        if math.isfinite(state.held_out) and not self.by_held_out:
-            self.by_held_out, self.recent, self.lowest = True, [], math.inf
-        error = state.held_out if self.by_held_out else state.loss
-        if math.isnan(error):
-            return ""
-        self.recent = [*self.recent, error][-_AVERAGED:]
-        score = sum(self.recent) / len(self.recent)
-        self.waited = 0 if score < (1 - _IMPROVEMENT) * self.lowest else self.waited + 1
-        if score <= self.lowest:
-            self.lowest, self.best = score, fitted.copy()
+        if self._note(state.loss, state.held_out):
+            self.best = fitted.copy()
         if self.by_held_out and self.waited >= self.patience:
             return f"the held-out rays had not improved for {self.waited} passes"
         return ""
+
+    def recall(self, history: Sequence[Mapping[str, Any]], best: _Fitted | None) -> None:
+        """Go on after the passes of a ``history``, of whose states ``best`` was kept."""
+        for entry in history:
+            self._note(entry["loss"], math.nan if entry["held_out"] is None else entry["held_out"])
+        self.best = best
+
+    def _note(self, loss: float, held_out: float) -> bool:
+        """Whether the state after a pass of these errors is the best so far."""
+        if math.isfinite(held_out) and not self.by_held_out:
+            self.by_held_out, self.recent, self.lowest = True, [], math.inf
+        error = held_out if self.by_held_out else loss
+        if math.isnan(error):
+            return False
+        self.recent = [*self.recent, error][-_AVERAGED:]
+        score = sum(self.recent) / len(self.recent)
+        self.waited = 0 if score < (1 - _IMPROVEMENT) * self.lowest else self.waited + 1
+        best = score <= self.lowest
+        self.lowest = min(score, self.lowest)
+        return best
