@@ -14,8 +14,8 @@ def spatial_order(position: torch.Tensor) -> torch.Tensor:
 
     The CUDA kernels look for Gaussians by groups of neighbours in the list, so a model kept in this order
     runs fast; sort it again whenever Gaussians are added or have moved far. Cells that follow each other on
-    the curve share a face. On a Z-order curve some are far apart, and the groups that straddle such a leap
-    take longer than all others together.
+    the curve share a face. On a Z-order curve some are far apart, and the window of a group that straddles
+    such a leap is up to sixty times as large.
     """
     if not len(position):
         return torch.zeros(0, dtype=torch.int64, device=position.device)
