@@ -13,7 +13,7 @@ __all__ = ["PRESETS", "Settings", "make_settings"]
 # Of those that are not any number from 0 on. Material numbers reach a little below the first curve.
 _RANGES: dict[str, dict[str, Any]] = {
     **dict.fromkeys(("soft_u", "bone_u", "metal_u"), {"at_least": -0.1, "at_most": 1.0}),
-    **dict.fromkeys(("seed_width", "smallest_scale", "largest_scale", "cutoff"), {"above": 0.0}),
+    **dict.fromkeys(("seed_width", "largest_scale", "cutoff"), {"above": 0.0}),
     **dict.fromkeys(("model_error", "huber_corner", "final_rate"), {"above": 0.0}),
     "blur": {"at_least": 0.0, "at_most": 0.6},
     "held_out": {"at_least": 0.0, "at_most": 0.5},
@@ -47,8 +47,8 @@ class Settings:
     wider along it, where Gaussians are fewer than the detector could tell apart; 0: all seeds are round."""
     support_level: float = 0.1
     """Where the start is below this share of the soft reference in a seed's cell and those around it, there is none."""
-    smallest_scale: float = 0.2
-    """Smallest standard deviation in voxels, or in seed spacings where seeds are closer."""
+    smallest_scale: float = 0.0
+    """Smallest standard deviation in voxels, or in seed spacings where seeds are closer; 0 leaves it to the plan."""
     largest_scale: float = 8.0
     """Largest standard deviation in seed spacings."""
     bone_level: float = 2.2

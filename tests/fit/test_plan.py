@@ -129,6 +129,15 @@ def test_the_number_of_seeds_keeps_its_bound_for_any_voxels(stretch):
     assert "100 Gaussians" in chosen.reasons["seed_spacing_voxels"]
 
 
+def test_gaussians_may_be_thinner_where_they_are_few():
+    of, flat = problem(32), problem(32, planar=True)
+    assert plan(of, ball(of, 0.2)).smallest_scale == 0.2
+    few = plan(of, ball(of, 0.2), max_gaussians=500)
+    assert few.smallest_scale == 0.1 and "few" in few.reasons["smallest_scale"]
+    assert plan(flat, ball(flat, 0.2), max_gaussians=50).smallest_scale == 0.2
+    assert plan(of, ball(of, 0.2), max_gaussians=500, smallest_scale=0.35).smallest_scale == 0.35
+
+
 def test_seeds_are_uneven_only_where_they_are_too_few():
     of = problem(32)
     start = ball(of, 0.2)

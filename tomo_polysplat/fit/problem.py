@@ -220,6 +220,7 @@ class Problem:
             plan.tv_corners,
             closed,
             plan.tv_every,
+            plan.smallest_scale,
         )
 
     def _primary(self, device: torch.device) -> torch.Tensor:

@@ -56,6 +56,8 @@ class FitScene:
         Whether all matter lies within the voxels, so that no Gaussian may leave them; see ``fit.inside``.
     tv_every : int
         In every how many steps that total variation is taken, and counts as many times.
+    smallest_scale : float
+        Smallest deviation of a Gaussian, in voxels, or in spacings of the seeds where these are closer.
     """
 
     box: VoxelBox
@@ -72,6 +74,7 @@ class FitScene:
     tv_corners: tuple[float, float]
     closed: bool = False
     tv_every: int = 1
+    smallest_scale: float = 0.2
 
     def projections(self, gaussians: Gaussians, views: DetectorViews) -> tuple[torch.Tensor, int]:
         """(views, rows, columns) predicted -log(I/I0), and the pairs skipped at the source plane."""

@@ -95,7 +95,7 @@ def log_scale_bounds(
     """Smallest and largest logarithm of a Gaussian's deviation."""
     voxel = float(scene.box.spacing[: 2 if planar else 3].min())
     # Seeds closer than the voxels are there to show what is inside these.
-    return math.log(settings.smallest_scale * min(voxel, spacing)), math.log(settings.largest_scale * spacing)
+    return math.log(scene.smallest_scale * min(voxel, spacing)), math.log(settings.largest_scale * spacing)
 
 
 def new_moments(parameters: dict[str, torch.Tensor]) -> Moments:
