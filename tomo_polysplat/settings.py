@@ -45,6 +45,9 @@ class Settings:
     seed_edge: float = 0.2
     """Variation of the start over a spacing, in soft references, that makes a seed half as thick across the edge, and
     wider along it, where Gaussians are fewer than the detector could tell apart; 0: all seeds are round."""
+    edges: str = "auto"
+    """"sharp" makes all seeds thin across edges, "blurred" none thinner than the detector could tell apart; "auto"
+    finds out by two short fits which of the two an object has."""
     support_level: float = 0.1
     """Where the start is below this share of the soft reference in a seed's cell and those around it, there is none."""
     smallest_scale: float = 0.0
@@ -124,6 +127,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         require_choice("settings['loss']", self.loss, ("huber", "weighted-l1", "l1"))
+        require_choice("settings['edges']", self.edges, ("auto", "sharp", "blurred"))
         require_choice("settings['kernel']", self.kernel, ("auto", "triton", "numba", "reference"))
         for field in fields(self):
             name, value = f"settings[{field.name!r}]", getattr(self, field.name)

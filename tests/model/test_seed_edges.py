@@ -83,3 +83,14 @@ def test_the_unit_of_length_does_not_matter():
     steep = small[1][:, 0] < math.log(0.95)
     torch.testing.assert_close(small[1], large[1])
     torch.testing.assert_close(small[0][steep], large[0][steep])
+
+
+def test_where_edges_are_sharp_seeds_are_thin_however_close_but_not_at_metal():
+    grid, points, height = plane((13, 11, 15), (0.1, 0.1, 0.1), np.array([1.0, 0.0, 0.0]))
+    _, change = shapes((grid, points, height), 0.05, finest=0.0)
+    assert (
+        float(change[:, 0].min()) < -0.2 and float(shapes((grid, points, height), 0.05)[1].abs().max()) == 0
+    )
+    _, change = shapes((grid, points, height * 40), 0.05, finest=0.0)
+    metal = height.reshape(-1) * 40 > Settings().metal_level
+    assert bool(change.isfinite().all()) and float(change[metal].abs().max()) == 0

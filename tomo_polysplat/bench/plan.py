@@ -125,6 +125,8 @@ def variants(scan: PlanScan, views_per_step: int) -> list[Variant]:
         Variant("u free everywhere", free),
         Variant("empty space seeded", empty),
         Variant("no blur" if scan.metal else "a blur", blur),
+        Variant("edges taken for blurred", {"edges": "blurred"}),
+        Variant("edges taken for sharp", {"edges": "sharp"}),
         Variant("smoothed at every step", {"tv_every": 1}),
         Variant("1 view a step", {"views_per_step": 1}),
         Variant("8 views a step", {"views_per_step": 8}),

@@ -16,6 +16,7 @@ from tomo_polysplat.fit.plan import Plan, make_plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.sharpness import edges_are_sharp
 from tomo_polysplat.fit.stopping import FitState
 from tomo_polysplat.kernels.device import pick_device
 from tomo_polysplat.model.gaussians import Gaussians
@@ -108,6 +109,9 @@ def _first_state(problem: Problem, wishes: Wishes, saved: Checkpoint | None) -> 
     plan = make_plan(start, problem, settings, device.type)
     settings, agent = settings_for_agent(start, plan.reference, problem, settings, device, wishes.options())
     plan.reasons |= {"start": why, **agent}
+    plan.sharp, plan.reasons["edges"] = edges_are_sharp(
+        start, plan, problem, settings, device, wishes.options()
+    )
     gaussians = problem.seeds(start, plan, settings, device)
     if saved is not None:
         saved.plan = plan

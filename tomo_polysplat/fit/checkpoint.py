@@ -217,7 +217,7 @@ def _plan(parts: dict[str, Any]) -> Plan:
     corners = len(plan.tv_corners) == 2 and all(
         isinstance(corner, (int, float)) and corner >= 0 for corner in plan.tv_corners
     )
-    choices = plan.curves in (1, 3) and isinstance(plan.blurred, bool)
+    choices = plan.curves in (1, 3) and isinstance(plan.blurred, bool) and isinstance(plan.sharp, bool)
     if not (above_zero and whole and corners and choices and isinstance(plan.reasons, dict)):
         raise TypeError(f"a plan, got {parts}")
     soft, dense = plan.tv_corners

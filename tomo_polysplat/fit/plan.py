@@ -92,6 +92,8 @@ class Plan:
         one of the two is bone-like or denser.
     curves : int
         Material curves of the model: three, or the first alone, as for a monochromatic one.
+    sharp : bool
+        Whether seeds are thin across edges however close they are; `fit.sharpness` tells it by short fits.
     blurred : bool
         Whether rays are seen through the detector's blur; see ``physics.detector_blur``.
     reasons : dict
@@ -109,6 +111,7 @@ class Plan:
     tv_corners: tuple[float, float]
     curves: int
     blurred: bool
+    sharp: bool = False
     reasons: dict[str, Any] = field(default_factory=dict)
 
 

@@ -262,6 +262,7 @@ class Problem:
         spacing = plan.spacing * self.voxel
         # A spacing that was asked for is nobody's lack of Gaussians, which thin ones make up for.
         finest = math.inf if settings.seed_spacing else finest_spacing(self)[0] * self.voxel
+        finest = 0.0 if plan.sharp else finest
         several = plan.curves > 1
         gaussians = seed_gaussians(
             relative, self.grid, spacing, settings, several, self.planar, device, plan.finer, finest

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from tomo_polysplat.fit.optimise import fit
-from tomo_polysplat.fit.plan import make_plan
+from tomo_polysplat.fit.optimise import FitOutcome, fit
+from tomo_polysplat.fit.plan import Plan, make_plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
@@ -20,7 +20,7 @@ from tomo_polysplat.render.renderer import project_gaussians
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.levels import mass_level
 
-__all__ = ["ShortFit", "main_density", "short_fit"]
+__all__ = ["ShortFit", "fitted_shortly", "main_density", "short_fit"]
 
 _PASSES = 2.0
 # A scan of few views is not seen in fewer steps.
@@ -102,13 +102,40 @@ def short_fit(
     # The soft matter stays what it was said to be: calibration asks what else could explain the rays.
     short = replace(settings, passes=min(passes, plan.passes), soft_gain=0.0)
     scene, rays = problem.scene(plan, short, device), problem.rays(plan, short, device)
+    seeds = problem.seeds(start, plan, short, device)
+    outcome = fitted_shortly(seeds, plan, problem, scene, rays, short, seed, budget)
+    with torch.no_grad():
+        density = scene.volume(outcome.gaussians).cpu().numpy() * plan.reference
+        sample = _sample(outcome.gaussians, scene, rays, seed)
+    errors = [entry["held_out"] or entry["loss"] for entry in outcome.history] or [np.inf]
+    main = main_density(density, settings.metal_level * plan.reference)
+    return ShortFit(fitted, float(min(errors)), main, *sample)
+
+
+def fitted_shortly(
+    seeds: Gaussians,
+    plan: Plan,
+    problem: Problem,
+    scene: FitScene,
+    rays: Rays,
+    settings: Settings,
+    seed: int,
+    budget: float | None,
+) -> FitOutcome:
+    """Seeds fitted for the settings' passes, or for ``budget`` seconds.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        After Ctrl-C: what was fitted so far is no result.
+    """
     started = time.perf_counter()
     outcome = fit(
-        problem.seeds(start, plan, short, device),
+        seeds,
         plan.spacing * problem.voxel,
         rays,
         scene,
-        short,
+        settings,
         views_per_step=plan.views_per_step,
         rng=np.random.default_rng(seed),
         started=started,
@@ -116,13 +143,8 @@ def short_fit(
         volume=lambda gaussians: scene.volume(gaussians).cpu().numpy(),
     )
     if outcome.reason == "interrupted":
-        raise KeyboardInterrupt("interrupted during the calibration: there is no result yet")
-    with torch.no_grad():
-        density = scene.volume(outcome.gaussians).cpu().numpy() * plan.reference
-        sample = _sample(outcome.gaussians, scene, rays, seed)
-    errors = [entry["held_out"] or entry["loss"] for entry in outcome.history] or [np.inf]
-    main = main_density(density, settings.metal_level * plan.reference)
-    return ShortFit(fitted, float(min(errors)), main, *sample)
+        raise KeyboardInterrupt("interrupted during a short fit: there is no result yet")
+    return outcome
 
 
 def main_density(density: np.ndarray, metal: float = math.inf) -> float:

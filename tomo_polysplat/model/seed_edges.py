@@ -46,7 +46,8 @@ def edge_shapes(
         ``seed_edge`` is the variation of the start over a seed's size that makes it half as thick; 0: all are round.
     finest : float
         Distance, in the grid's unit, of seeds as close as the detector could tell apart. No seed gets thinner than
-        those would be: the scan may be no sharper (fan-beam slices whose edges are blurred lose 1.7 dB otherwise).
+        those would be: the scan may be no sharper (fan-beam slices whose edges are blurred lose 1.7 dB otherwise). 0
+        where edges are known to be sharp.
     dims : int
         2 or 3.
 
@@ -72,7 +73,7 @@ def edge_shapes(
     direction = torch.where(direction[:, :1] < 0, -direction, direction)
     rotation[:, 0] = 1 + direction[:, 0]
     rotation[:, 2], rotation[:, 3] = -direction[:, 2], direction[:, 1]
-    thinnest = (finest / size).clamp(_THINNEST, 1.0)
+    thinnest = (finest / size.clamp(min=torch.finfo(size.dtype).tiny)).clamp(_THINNEST, 1.0)
     thinner = torch.maximum(half / (half + steepness * size), thinnest).log()
     change[:, 0] = thinner
     change[:, 1:] = -thinner[:, None] / (dims - 1)
