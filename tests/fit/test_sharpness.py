@@ -77,7 +77,8 @@ def test_sharp_edges_come_out_sharper():
         ({"edges": "blurred"}, "asked for"),
         ({"seed_edge": 0.0}, "asked for"),
         ({"seed_spacing": 1.5}, "asked for"),
-        ({"max_gaussians": 300}, "too few"),
+        ({"max_gaussians": 90}, "far from each other"),
+        ({"passes": 5.0}, "so few passes"),
     ],
 )
 def test_nobody_asks_the_rays_where_it_is_known(changed, because):
