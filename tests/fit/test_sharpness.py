@@ -86,6 +86,12 @@ def test_nobody_asks_the_rays_where_it_is_known(changed, because):
     assert sharp == (changed == {"edges": "sharp"}) and because in why
 
 
+def test_an_empty_scan_has_no_edges(caplog):
+    projections, *rest = walls(0.0, views=41, size=9)
+    (sharp, why), _ = told((0 * projections, *rest))
+    assert not sharp and "empty" in why and not caplog.records
+
+
 def test_few_views_and_little_time_do_not_tell():
     assert "fewer than" in told(walls(0.0, views=39, size=9))[0][1]
     sharp, why = told(walls(0.0, views=41, size=9), budget=1e-6)[0]

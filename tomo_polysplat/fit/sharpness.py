@@ -88,6 +88,8 @@ def edges_are_sharp(
         # Plans of their own, as the seeds are written down there.
         own = replace(plan, sharp=sharp, reasons=dict(plan.reasons))
         seeds = problem.seeds(start, own, short, device)
+        if not len(seeds):
+            return False, "there are no seeds: the start volume is empty"
         outcome = fitted_shortly(seeds, own, problem, scene, rays, short, options["seed"], budget)
         if outcome.reason.startswith("the time budget"):
             return False, "round seeds: the time budget is too short to tell how sharp edges are"
