@@ -13,7 +13,7 @@ from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, to_astra
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.joseph import JosephProjector
 
-SIZE, FINER = 21, 3
+SIZE, FINER = 31, 3
 OPTIONS = {"seed": 0, "time_budget": None}
 
 
@@ -61,7 +61,9 @@ def test_sharp_edges_come_out_sharper():
     rays = np.ascontiguousarray(projections.swapaxes(0, 1))
 
     def result(edges):
-        return reconstruct(rays, proj_geom, vol_geom, unit="cm", settings={"edges": edges}, progress=False)
+        return reconstruct(
+            rays, proj_geom, vol_geom, unit="cm", settings={"edges": edges, "passes": 6}, progress=False
+        )
 
     found, same, other = (result(edges) for edges in ("auto", "sharp", "blurred"))
     np.testing.assert_allclose(found.volume, same.volume, atol=1e-5)
@@ -77,22 +79,23 @@ def test_sharp_edges_come_out_sharper():
         ({"edges": "blurred"}, "asked for"),
         ({"seed_edge": 0.0}, "asked for"),
         ({"seed_spacing": 1.5}, "asked for"),
-        ({"max_gaussians": 90}, "far from each other"),
+        ({"max_gaussians": 900}, "far from each other"),
         ({"passes": 5.0}, "so few passes"),
     ],
 )
 def test_nobody_asks_the_rays_where_it_is_known(changed, because):
-    (sharp, why), _ = told(walls(0.0, views=41, size=9), **changed)
+    (sharp, why), _ = told(walls(0.0, views=41), **changed)
     assert sharp == (changed == {"edges": "sharp"}) and because in why
 
 
 def test_an_empty_scan_has_no_edges(caplog):
-    projections, *rest = walls(0.0, views=41, size=9)
+    projections, *rest = walls(0.0, views=41)
     (sharp, why), _ = told((0 * projections, *rest))
     assert not sharp and "empty" in why and not caplog.records
 
 
-def test_few_views_and_little_time_do_not_tell():
-    assert "fewer than" in told(walls(0.0, views=39, size=9))[0][1]
-    sharp, why = told(walls(0.0, views=41, size=9), budget=1e-6)[0]
+def test_few_views_few_voxels_and_little_time_do_not_tell():
+    assert "fewer than 40 views" in told(walls(0.0, views=39))[0][1]
+    assert "fewer than 30 voxels" in told(walls(0.0, views=41, size=29))[0][1]
+    sharp, why = told(walls(0.0, views=41), budget=1e-6)[0]
     assert not sharp and "too short" in why
