@@ -37,7 +37,7 @@ _SHARP = 0.96
 # and in 1.8 passes to 0.67 to 0.81.
 _FEWEST_VIEWS = 72
 # Seeds so many times as far apart as the detector could tell are thin as it is, and gain less by being thinner than
-# the short fits cost (teeth of 64^3 and 96^3, 1.1 and 1.3 times as far: 0.9 and 1.7 dB; six scenes of 256^3: 0.1 dB).
+# the short fits cost (teeth of 64^3 and 96^3, 1.0 and 1.3 times as far: 0.9 and 1.7 dB; six scenes of 256^3: 0.1 dB).
 _FARTHEST = 1.35
 # Fewer voxels along the longest edge show no edge so sharp that it would pay (24^3 and 28^3: -0.2 to 0.0 dB by thin
 # seeds, though the rays are fitted better).
@@ -123,7 +123,7 @@ def _judged(of_round: float, of_thin: float) -> tuple[bool, str]:
     share = of_thin / of_round if of_round else 1.0
     sharp = share < _SHARP
     kind = "sharp, and seeds thin across them" if sharp else "not sharp enough for thin seeds"
-    reason = f"{kind}: after a short fit these leave {share:.2f} of the misfit that round ones leave"
+    reason = f"{kind}: after a short fit these leave {share:.2f} of the misfit that others leave"
     logger.info("Edges are %s", reason)
     return sharp, reason
 
