@@ -33,8 +33,6 @@ _DIVISIONS = 2
 # Steps of a short fit. A start nearer to what the rays say fits better at first (iodine, 120 steps: 0.0145 against the
 # agent's 0.0148); from here on the physics tells (0.0091 against 0.0076).
 _STEPS = 240
-# Of the seconds that a reconstruction may take, the share for each short fit.
-_SHARE_OF_BUDGET = 0.1
 
 
 def settings_for_agent(
@@ -74,14 +72,12 @@ def settings_for_agent(
         replace(settings, bone_u=0.0, metal_u=1.0, metal_level=level, metal_rim=settings.bone_level)
         for level in levels
     ]
-    budget = options["time_budget"] and _SHARE_OF_BUDGET * options["time_budget"]
     # Judged by the fitted rays, as few are held out, with as many parameters each time: the level of metal, which
     # differs, would otherwise decide on the blur as well.
     alike: dict[str, Any] = {"held_out": 0.0, "blur": 0.0, "learning_rate_blur": 0.0}
+    seed, seconds = options["seed"], options["time_budget"]
     misfits = [
-        short_fit(
-            problem, start, {}, replace(choice, **alike), device, options["seed"], budget, _STEPS
-        ).held_out
+        short_fit(problem, start, {}, replace(choice, **alike), device, seed, seconds, _STEPS).held_out
         for choice in choices
     ]
     best = choices[int(np.argmin(misfits))]

@@ -32,8 +32,6 @@ logger = logging.getLogger(__name__)
 _ROUNDS = 2
 # Steps of a short fit that tells a density: it is 0.7 to 1.5 % low after 120 (teeth, pins, lung), 0.3 to 0.5 after 240.
 _STEPS_FOR_DENSITY = 240
-# Share of a time budget that one short fit may take.
-_SHARE_OF_BUDGET = 0.1
 # Scatter below this share of the open beam, and densities closer than this, are left as they are.
 _LEAST_SCATTER, _LEAST_CHANGE = 2e-3, 0.02
 # Held-out errors of two fits of the same scan differ by up to 2 % by chance.
@@ -141,10 +139,9 @@ def calibrated(
     steps = {} if wanted.soft_density is None else {"fewest_steps": _STEPS_FOR_DENSITY}
 
     def trial(fitted: Mapping[str, float]) -> ShortFit:
-        budget = None if time_budget is None else _SHARE_OF_BUDGET * time_budget
         physics = with_fitted(problem, fitted)
         start, _ = physics.start_volume(device, settings.metal_level)
-        return short_fit(physics, start, dict(fitted), settings, device, seed, budget, **steps)
+        return short_fit(physics, start, dict(fitted), settings, device, seed, time_budget, **steps)
 
     first = best = trial({})
     trials, accepted, why = [first], {}, []

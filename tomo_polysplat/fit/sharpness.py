@@ -20,7 +20,7 @@ from tomo_polysplat.fit.plan import Plan, finest_spacing
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.fit.short_fit import fitted_shortly
+from tomo_polysplat.fit.short_fit import batches_around, fitted_shortly
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.initial import FEW_VIEWS
@@ -44,10 +44,6 @@ _FARTHEST = 1.35
 _FEWEST_VOXELS = 30
 # A run of fewer passes, as of the fast preset, is in a hurry.
 _FEWEST_PASSES = 6.0
-# Views that the misfit is taken from.
-_VIEWS = 24
-# Of the seconds that a reconstruction may take, the share for each of the two.
-_SHARE_OF_BUDGET = 0.1
 
 
 def edges_are_sharp(
@@ -82,7 +78,6 @@ def edges_are_sharp(
     why_not = _why_not(plan, problem, settings)
     if why_not:
         return False, why_not
-    budget = options["time_budget"] and _SHARE_OF_BUDGET * options["time_budget"]
     passes = max(1.0, _FEWEST_VIEWS / problem.geometry.views)
     short = replace(settings, passes=passes, soft_gain=0.0, tv_weight=0.0)
     scene, rays = problem.scene(plan, short, device), problem.rays(plan, short, device)
@@ -93,7 +88,9 @@ def edges_are_sharp(
         seeds = problem.seeds(start, own, short, device)
         if not len(seeds):
             return False, "there are no seeds: the start volume is empty"
-        outcome = fitted_shortly(seeds, own, problem, scene, rays, short, options["seed"], budget)
+        outcome = fitted_shortly(
+            seeds, own, problem, scene, rays, short, options["seed"], options["time_budget"]
+        )
         if outcome.reason.startswith("the time budget"):
             return False, "round seeds: the time budget is too short to tell how sharp edges are"
         misfits.append(_misfit(outcome.gaussians, scene, rays, short))
@@ -130,11 +127,9 @@ def _judged(of_round: float, of_thin: float) -> tuple[bool, str]:
 
 @torch.no_grad()
 def _misfit(gaussians: Gaussians, scene: FitScene, rays: Rays, settings: Settings) -> float:
-    """Mean misfit of the fitted rays of some views, as many all around."""
-    chosen = np.unique(np.linspace(0, len(rays.views) - 1, _VIEWS).astype(int))
+    """Mean misfit of the fitted rays of some views."""
     misfits = []
-    for view in chosen:
-        views, measured, weight, _ = rays.batch(np.array([view]))
+    for views, measured, weight, _ in batches_around(rays):
         predicted, _ = scene.projections(gaussians, views)
         misfits.append(float(misfit(predicted, measured, weight, settings)))
     return float(np.mean(misfits))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,16 +16,19 @@ from tomo_polysplat.fit.plan import Plan, make_plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.render.renderer import project_gaussians
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.levels import mass_level
 
-__all__ = ["ShortFit", "fitted_shortly", "main_density", "short_fit"]
+__all__ = ["ShortFit", "batches_around", "fitted_shortly", "main_density", "short_fit"]
 
 _PASSES = 2.0
 # A scan of few views is not seen in fewer steps.
 _FEWEST_STEPS = 120
+# Of the seconds that a reconstruction may take, the share for each short fit.
+_SHARE_OF_BUDGET = 0.1
 _RAYS = 60_000
 _VIEWS = 24
 # The main matter's voxels: this share of those inside of it, the ones closest to each other.
@@ -72,7 +76,7 @@ def short_fit(
     settings: Settings,
     device: torch.device,
     seed: int,
-    budget: float | None,
+    time_budget: float | None,
     fewest_steps: int = _FEWEST_STEPS,
 ) -> ShortFit:
     """Two passes over the views, or more where they are few.
@@ -86,8 +90,8 @@ def short_fit(
     settings : Settings
         Of the fit to come.
     seed : int
-    budget : float or None
-        Seconds it may take.
+    time_budget : float or None
+        Seconds of the whole reconstruction.
     fewest_steps : int
         Steps of the optimiser at least.
 
@@ -103,7 +107,7 @@ def short_fit(
     short = replace(settings, passes=min(passes, plan.passes), soft_gain=0.0)
     scene, rays = problem.scene(plan, short, device), problem.rays(plan, short, device)
     seeds = problem.seeds(start, plan, short, device)
-    outcome = fitted_shortly(seeds, plan, problem, scene, rays, short, seed, budget)
+    outcome = fitted_shortly(seeds, plan, problem, scene, rays, short, seed, time_budget)
     with torch.no_grad():
         density = scene.volume(outcome.gaussians).cpu().numpy() * plan.reference
         sample = _sample(outcome.gaussians, scene, rays, seed)
@@ -120,9 +124,9 @@ def fitted_shortly(
     rays: Rays,
     settings: Settings,
     seed: int,
-    budget: float | None,
+    time_budget: float | None,
 ) -> FitOutcome:
-    """Seeds fitted for the settings' passes, or for ``budget`` seconds.
+    """Seeds fitted for the settings' passes, or for a share of the seconds of the whole reconstruction.
 
     Raises
     ------
@@ -139,7 +143,7 @@ def fitted_shortly(
         views_per_step=plan.views_per_step,
         rng=np.random.default_rng(seed),
         started=started,
-        deadline=None if budget is None else started + budget,
+        deadline=None if time_budget is None else started + _SHARE_OF_BUDGET * time_budget,
         volume=lambda gaussians: scene.volume(gaussians).cpu().numpy(),
     )
     if outcome.reason == "interrupted":
@@ -171,15 +175,19 @@ def main_density(density: np.ndarray, metal: float = math.inf) -> float:
     return float(inside[first : first + width].mean())
 
 
+def batches_around(rays: Rays) -> Iterator[tuple[DetectorViews, torch.Tensor, torch.Tensor, torch.Tensor]]:
+    """What `Rays.batch` gives for single views, some of them, evenly spread over the scan."""
+    for view in np.unique(np.linspace(0, len(rays.views) - 1, _VIEWS).astype(int)):
+        yield rays.batch(np.array([view]))
+
+
 def _sample(
     gaussians: Gaussians, scene: FitScene, rays: Rays, seed: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Areal densities, measured values and weights of some of the rays."""
-    count = len(rays.views)
     parts: list[list[np.ndarray]] = []
     weights = gaussians.weights(scene.reference_curve)
-    for view in np.unique(np.linspace(0, count - 1, min(_VIEWS, count)).astype(int)):
-        views, measured, weight, aside = rays.batch(np.array([view]))
+    for views, measured, weight, aside in batches_around(rays):
         areal, _ = project_gaussians(gaussians, weights, views, scene.kernel, scene.cutoff)
         tensors = (
             areal.reshape(3, -1) * scene.areal_scale,
