@@ -8,7 +8,7 @@ from scipy import ndimage
 from tomo_polysplat import reconstruct
 from tomo_polysplat.fit.plan import make_plan
 from tomo_polysplat.fit.problem import Problem
-from tomo_polysplat.fit.sharpness import edges_are_sharp
+from tomo_polysplat.fit.sharpness import seeds_for_edges
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, to_astra
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.joseph import JosephProjector
@@ -40,19 +40,23 @@ def walls(blur, views=44, size=SIZE):
 
 
 def told(scan, budget=None, **settings):
-    """What is told of a scan, and its plan."""
+    """The plan with what is told of a scan's edges, and its seeds."""
     problem = Problem.of(*scan[:3], "cm", None, None)
     device, chosen = torch.device("cpu"), Settings(**settings)
     start, _ = problem.start_volume(device)
     plan = make_plan(start, problem, chosen, "cpu")
-    return edges_are_sharp(start, plan, problem, chosen, device, OPTIONS | {"time_budget": budget}), plan
+    scene, rays = problem.scene(plan, chosen, device), problem.rays(plan, chosen, device)
+    options = OPTIONS | {"time_budget": budget}
+    return seeds_for_edges(start, plan, problem, scene, rays, chosen, device, options)
 
 
 @pytest.mark.parametrize("blur", [0.0, 1.2])
 def test_two_short_fits_tell_sharp_edges_from_blurred_ones(blur):
-    (sharp, why), plan = told(walls(blur))
-    assert sharp == (blur == 0) and "after a short fit" in why
-    assert not plan.sharp and "gaussians" not in plan.reasons
+    plan, seeds = told(walls(blur))
+    assert plan.sharp == (blur == 0) and "after a short fit" in plan.reasons["edges"]
+    # As they were before the short fits, and thin where that was chosen.
+    _, same = told(walls(blur), edges="sharp" if plan.sharp else "blurred")
+    torch.testing.assert_close(seeds.parameters(), same.parameters(), rtol=0, atol=0)
 
 
 def test_sharp_edges_come_out_sharper():
@@ -79,23 +83,23 @@ def test_sharp_edges_come_out_sharper():
         ({"edges": "blurred"}, "asked for"),
         ({"seed_edge": 0.0}, "asked for"),
         ({"seed_spacing": 1.5}, "asked for"),
-        ({"max_gaussians": 900}, "far from each other"),
+        ({"max_gaussians": 500}, "far from each other"),
         ({"passes": 5.0}, "so few passes"),
     ],
 )
 def test_nobody_asks_the_rays_where_it_is_known(changed, because):
-    (sharp, why), _ = told(walls(0.0, views=41), **changed)
-    assert sharp == (changed == {"edges": "sharp"}) and because in why
+    plan, _ = told(walls(0.0, views=41), **changed)
+    assert plan.sharp == (changed == {"edges": "sharp"}) and because in plan.reasons["edges"]
 
 
 def test_an_empty_scan_has_no_edges(caplog):
     projections, *rest = walls(0.0, views=41)
-    (sharp, why), _ = told((0 * projections, *rest))
-    assert not sharp and "empty" in why and not caplog.records
+    plan, seeds = told((0 * projections, *rest))
+    assert not plan.sharp and "empty" in plan.reasons["edges"] and not len(seeds) and not caplog.records
 
 
 def test_few_views_few_voxels_and_little_time_do_not_tell():
-    assert "fewer than 40 views" in told(walls(0.0, views=39))[0][1]
-    assert "fewer than 30 voxels" in told(walls(0.0, views=41, size=29))[0][1]
-    sharp, why = told(walls(0.0, views=41), budget=1e-6)[0]
-    assert not sharp and "too short" in why
+    assert "fewer than 40 views" in told(walls(0.0, views=39))[0].reasons["edges"]
+    assert "fewer than 30 voxels" in told(walls(0.0, views=41, size=29))[0].reasons["edges"]
+    plan, _ = told(walls(0.0, views=41), budget=1e-6)
+    assert not plan.sharp and "too short" in plan.reasons["edges"]

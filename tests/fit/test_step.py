@@ -90,7 +90,7 @@ def test_the_memory_of_a_step_can_be_put_back():
 def test_totals_are_the_weights_of_the_fitted_rays():
     rays = fit_problem("cone", True, "cpu", "numba")[2]
     _, _, weight, _ = rays.batch(np.arange(5))
-    torch.testing.assert_close(rays.totals(), weight.sum(dim=(1, 2)))
+    torch.testing.assert_close(rays.totals, weight.sum(dim=(1, 2)))
     # 400 is more than float32's exponential holds.
     assert bool(torch.isfinite(weight).all())
 

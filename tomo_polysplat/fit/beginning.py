@@ -16,7 +16,7 @@ from tomo_polysplat.fit.plan import Plan, make_plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.fit.sharpness import edges_are_sharp
+from tomo_polysplat.fit.sharpness import seeds_for_edges
 from tomo_polysplat.fit.stopping import FitState
 from tomo_polysplat.kernels.device import pick_device
 from tomo_polysplat.model.gaussians import Gaussians
@@ -91,31 +91,28 @@ def begin(problem: Problem, wishes: Wishes, saved: Checkpoint | None) -> Begun:
     KeyboardInterrupt
         After Ctrl-C: there is no result yet.
     """
-    settings, device = wishes.settings, wishes.device
+    settings, device, options = wishes.settings, wishes.device, wishes.options()
     try:
-        plan, gaussians = _first_state(problem, wishes, saved)
-        scene, rays = problem.scene(plan, settings, device), problem.rays(plan, settings, device)
+        if saved is not None and saved.snapshot is not None and saved.plan is not None:
+            plan, gaussians = saved.plan, saved.snapshot.gaussians.to(device)
+            return Begun(plan, gaussians, *_model(problem, plan, wishes))
+        start, why = problem.start_volume(device, settings.metal_level)
+        plan = make_plan(start, problem, settings, device.type)
+        scene, rays = _model(problem, plan, wishes)
+        settings, agent = settings_for_agent(start, plan.reference, problem, settings, device, options)
+        plan.reasons |= {"start": why, **agent}
+        plan, gaussians = seeds_for_edges(start, plan, problem, scene, rays, settings, device, options)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("interrupted before the fit had begun: there is no result yet") from None
+    if saved is not None:
+        saved.plan = plan
     return Begun(plan, gaussians, scene, rays)
 
 
-def _first_state(problem: Problem, wishes: Wishes, saved: Checkpoint | None) -> tuple[Plan, Gaussians]:
-    """The plan and Gaussians to go on with: those of a checkpoint, or seeds of a start volume."""
+def _model(problem: Problem, plan: Plan, wishes: Wishes) -> tuple[FitScene, Rays]:
+    """The forward model and what it is compared with."""
     settings, device = wishes.settings, wishes.device
-    if saved is not None and saved.snapshot is not None and saved.plan is not None:
-        return saved.plan, saved.snapshot.gaussians.to(device)
-    start, why = problem.start_volume(device, settings.metal_level)
-    plan = make_plan(start, problem, settings, device.type)
-    settings, agent = settings_for_agent(start, plan.reference, problem, settings, device, wishes.options())
-    plan.reasons |= {"start": why, **agent}
-    plan.sharp, plan.reasons["edges"] = edges_are_sharp(
-        start, plan, problem, settings, device, wishes.options()
-    )
-    gaussians = problem.seeds(start, plan, settings, device)
-    if saved is not None:
-        saved.plan = plan
-    return plan, gaussians
+    return problem.scene(plan, settings, device), problem.rays(plan, settings, device)
 
 
 def _whole(seed: Any) -> int:

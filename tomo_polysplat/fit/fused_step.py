@@ -113,7 +113,7 @@ class FusedStep:
             nodes = nodes_on(scene.quadrature, torch.float32, rays.target)
         return Measurement(
             self.feed.projections,
-            rays.totals(),
+            rays.totals,
             rays.noise,
             rays.threshold,
             corner,

@@ -50,6 +50,7 @@ def alternatives(plan: Plan, problem: Problem, settings: Settings, gaussians: in
         "support_level": f"0: up to {everywhere:.3g} Gaussians for {gaussians}, the empty space with them",
         "passes": f"{2 * plan.passes:g} for {plan.passes:g}: twice the time",
         "patience": f"{patience_of(settings, plan.passes)} passes without improvement end it sooner",
+        "edges": "sharp or blurred: without two short fits, of about a pass over the views each, that tell which",
         "tv_weight": "0: no smoothed box, which on a CPU takes about half of the time",
     }
     if plan.views_per_step > 1:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,8 +12,8 @@ from tomo_polysplat.kernels.views import DetectorViews
 
 __all__ = ["Rays"]
 
-# Views whose weights are added up at once.
-_CHUNK = 8
+# Rays whose weights are added up at once.
+_CHUNK = 1 << 22
 
 
 @dataclass
@@ -74,11 +75,12 @@ class Rays:
         aside = self._aside(chosen, values.shape[1:])
         return self.views.select(chosen), values, weight * ~aside, weight * aside
 
+    @functools.cached_property
     def totals(self) -> torch.Tensor:
         """(views,) weight of the fitted rays of each view."""
-        sums = []
-        for first in range(0, len(self.views), _CHUNK):
-            _, _, weight, _ = self.batch(np.arange(first, min(first + _CHUNK, len(self.views))))
+        sums, many = [], max(1, _CHUNK // (self.views.rows * self.views.columns))
+        for first in range(0, len(self.views), many):
+            _, _, weight, _ = self.batch(np.arange(first, min(first + many, len(self.views))))
             sums.append(weight.sum(dim=(1, 2)))
         return torch.cat(sums)
 

@@ -25,20 +25,20 @@ from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.initial import FEW_VIEWS
 
-__all__ = ["edges_are_sharp"]
+__all__ = ["seeds_for_edges"]
 
 logger = logging.getLogger(__name__)
 
-# Thin seeds are taken where they leave less than this share of the misfit that round ones leave. 23 scans of objects
-# with sharp edges (24^3 to 48^3 voxels) came to 0.69 to 0.95, those of broccoli, which gains and loses nothing, to 0.97
-# and 0.99, and nine of blurred ones, which lose 0.4 to 4 dB by thin seeds, to 0.98 and more.
+# Thin seeds are taken where they leave less than this share of the misfit that round ones leave. 34 scans of objects
+# with sharp edges (24^3 to 256^3 voxels) came to 0.69 to 0.95, those of broccoli, which gains and loses nothing, to
+# 0.95 to 0.99, and 20 of blurred ones, of which many lose by thin seeds, up to 4 dB, to 0.98 and more.
 _SHARP = 0.96
-# A short fit is a pass over the views, or so many of them: 40 views in steps of one came to 0.75 to 0.97 by the seed,
-# and in 1.8 passes to 0.67 to 0.81.
-_FEWEST_VIEWS = 72
+# A short fit is a pass over the views, which need not have more steps than this, but has so many views: 40 views in
+# steps of one came to 0.75 to 0.97 by the seed, and in 1.8 passes to 0.67 to 0.81.
+_STEPS, _FEWEST_VIEWS = 40, 72
 # Seeds so many times as far apart as the detector could tell are thin as it is, and gain less by being thinner than
-# the short fits cost (teeth of 64^3 and 96^3, 1.0 and 1.3 times as far: 0.9 and 1.7 dB; six scenes of 256^3: 0.1 dB).
-_FARTHEST = 1.35
+# the short fits cost (teeth of 96^3, 128^3 and 256^3, 1.3, 1.4 and 2.1 times as far: 2.0, 1.8 and 0.3 dB).
+_FARTHEST = 1.8
 # Fewer voxels along the longest edge show no edge so sharp that it would pay (24^3 and 28^3: -0.2 to 0.0 dB by thin
 # seeds, though the rays are fitted better).
 _FEWEST_VOXELS = 30
@@ -46,22 +46,27 @@ _FEWEST_VOXELS = 30
 _FEWEST_PASSES = 6.0
 
 
-def edges_are_sharp(
+def seeds_for_edges(
     start: torch.Tensor,
     plan: Plan,
     problem: Problem,
+    scene: FitScene,
+    rays: Rays,
     settings: Settings,
     device: torch.device,
     options: Mapping[str, Any],
-) -> tuple[bool, str]:
-    """Whether seeds are to be thin across edges, however close they are, and why.
+) -> tuple[Plan, Gaussians]:
+    """Seeds of a start volume, thin across sharp edges however close they are, and the plan with what was told.
 
     Parameters
     ----------
     start : (nz, ny, nx) tensor
         First reconstruction in the solver's units (``Problem.start_volume``).
     plan : Plan
+        Its ``sharp`` is not looked at.
     problem : Problem
+    scene, rays : FitScene, Rays
+        The problem's.
     settings : Settings
         Of the fit to come.
     device : torch.device
@@ -73,28 +78,36 @@ def edges_are_sharp(
     KeyboardInterrupt
         After Ctrl-C.
     """
-    if settings.edges != "auto":
-        return settings.edges == "sharp", "asked for"
-    why_not = _why_not(plan, problem, settings)
-    if why_not:
-        return False, why_not
-    passes = max(1.0, _FEWEST_VIEWS / problem.geometry.views)
-    short = replace(settings, passes=passes, soft_gain=0.0, tv_weight=0.0)
-    scene, rays = problem.scene(plan, short, device), problem.rays(plan, short, device)
-    misfits = []
-    for sharp in (False, True):
+
+    def of_kind(sharp: bool) -> tuple[Plan, Gaussians]:
         # Plans of their own, as the seeds are written down there.
         own = replace(plan, sharp=sharp, reasons=dict(plan.reasons))
-        seeds = problem.seeds(start, own, short, device)
-        if not len(seeds):
-            return False, "there are no seeds: the start volume is empty"
+        return own, problem.seeds(start, own, settings, device)
+
+    if settings.edges != "auto":
+        return _because(*of_kind(settings.edges == "sharp"), "asked for")
+    plain = of_kind(False)
+    why_not = _why_not(plan, problem, settings)
+    if why_not or not len(plain[1]):
+        return _because(*plain, why_not or "there are no seeds: the start volume is empty")
+    views = problem.geometry.views
+    passes = max(_FEWEST_VIEWS, min(views, _STEPS * plan.views_per_step)) / views
+    short = replace(settings, passes=passes, soft_gain=0.0, tv_weight=0.0)
+    kinds, misfits = (plain, of_kind(True)), []
+    for own, seeds in kinds:
         outcome = fitted_shortly(
-            seeds, own, problem, scene, rays, short, options["seed"], options["time_budget"]
+            seeds.copy(), own, problem, scene, rays, short, options["seed"], options["time_budget"]
         )
         if outcome.reason.startswith("the time budget"):
-            return False, "round seeds: the time budget is too short to tell how sharp edges are"
+            return _because(*plain, "round seeds: the time budget is too short to tell how sharp edges are")
         misfits.append(_misfit(outcome.gaussians, scene, rays, short))
-    return _judged(*misfits)
+    sharp, reason = _judged(*misfits)
+    return _because(*kinds[sharp], reason)
+
+
+def _because(plan: Plan, seeds: Gaussians, reason: str) -> tuple[Plan, Gaussians]:
+    plan.reasons["edges"] = reason
+    return plan, seeds
 
 
 def _why_not(plan: Plan, problem: Problem, settings: Settings) -> str:

@@ -30,7 +30,7 @@ _FEWEST_STEPS = 120
 # Of the seconds that a reconstruction may take, the share for each short fit.
 _SHARE_OF_BUDGET = 0.1
 _RAYS = 60_000
-_VIEWS = 24
+_VIEWS, _AT_ONCE = 24, 8
 # The main matter's voxels: this share of those inside of it, the ones closest to each other.
 _CROWD = 0.3
 # As large a share of them has to lie inside. Walls a voxel or two thick look lighter than they are: those of a pepper
@@ -176,9 +176,10 @@ def main_density(density: np.ndarray, metal: float = math.inf) -> float:
 
 
 def batches_around(rays: Rays) -> Iterator[tuple[DetectorViews, torch.Tensor, torch.Tensor, torch.Tensor]]:
-    """What `Rays.batch` gives for single views, some of them, evenly spread over the scan."""
-    for view in np.unique(np.linspace(0, len(rays.views) - 1, _VIEWS).astype(int)):
-        yield rays.batch(np.array([view]))
+    """What `Rays.batch` gives for some of the views, evenly spread over the scan."""
+    views = np.unique(np.linspace(0, len(rays.views) - 1, _VIEWS).astype(int))
+    for first in range(0, len(views), _AT_ONCE):
+        yield rays.batch(views[first : first + _AT_ONCE])
 
 
 def _sample(

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from tomo_polysplat.checks import fail, require_array, require_number
-from tomo_polysplat.physics.beer_lambert import projection
+from tomo_polysplat.physics.beer_lambert import projection, shares
 
 __all__ = ["MaxPath", "span_rays"]
 
@@ -17,7 +17,8 @@ MaxPath = float | Sequence[float]
 _STEPS = (
     200  # of the tables of P along a direction; only places the samples, which are then evaluated exactly
 )
-_BISECTIONS = 50
+# Of Newton's method, whose steps end when they are as small as that beside what is sought.
+_NEWTON_STEPS, _TOLERANCE = 100, 1e-12
 
 
 def span_rays(
@@ -80,11 +81,12 @@ def _reach(
     directions: np.ndarray, log_weights: np.ndarray, attenuation: np.ndarray, largest: float
 ) -> np.ndarray:
     """Multiple of each direction ``(3, m)`` at which P reaches ``largest``."""
-    low = np.zeros(directions.shape[1])
-    # P rises at least as fast as at the energy that penetrates best.
-    high = largest / (directions.T @ attenuation).min(axis=1)
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (low + high)
-        beyond = projection(middle * directions, log_weights, attenuation) > largest
-        low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
-    return high
+    slope, reach = directions.T @ attenuation, np.zeros(directions.shape[1])
+    for _ in range(_NEWTON_STEPS):
+        value, share = shares(reach * directions, log_weights, attenuation)
+        # P is concave: from below, Newton's steps come nearer and never too far.
+        step = (largest - value) / np.einsum("mn,nm->m", slope, share)
+        reach = reach + step
+        if (np.abs(step) <= _TOLERANCE * reach).all():
+            break
+    return reach

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 
 from tomo_polysplat.checks import require_array
 from tomo_polysplat.parallel import cpu_threads, run_tasks, split_range
-from tomo_polysplat.physics.beer_lambert import projection, shares
+from tomo_polysplat.physics.beer_lambert import shares
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.physics.spectrum import Spectrum
 
@@ -75,19 +76,26 @@ def _chunks(values: torch.Tensor) -> list[tuple[int, int]]:
 
 def _inverse(spectrum: Spectrum, largest: float) -> tuple[np.ndarray, float]:
     """Areal densities of water at evenly spaced cube roots of P up to ``largest``, and dP/dwater at 0."""
+    path_of, slope = _path_of(spectrum, largest)
+    return path_of(largest * np.linspace(0.0, 1.0, _NODES) ** 3), slope
+
+
+def _path_of(spectrum: Spectrum, largest: float) -> tuple[Callable[[Any], np.ndarray], float]:
+    """The areal density of water by P, from 0 to ``largest``, and dP/dwater at 0."""
+    # Not needed where there is no spectrum.
+    from scipy.interpolate import CubicHermiteSpline
+
     lit = spectrum.weights > 0
     log_weights = np.log(spectrum.weights[lit])
     curve = mass_attenuation("water", spectrum.energies[lit])[None]
     # P rises at least as fast as at its hardest energy, so this path reaches the largest value. Cubic spacing
     # follows the curve, which bends most at 0 where the soft photons still count.
     paths = largest / curve.min() * np.linspace(0.0, 1.0, _STEPS) ** 3
-    wanted = largest * np.linspace(0.0, 1.0, _NODES) ** 3
-    nodes = np.interp(wanted, projection(paths[None], log_weights, curve), paths)
-    # A Newton's step squares an error that is small already.
-    value, share = shares(nodes[None], log_weights, curve)
-    nodes -= (value - wanted) / (curve[0] @ share)
-    nodes[0] = 0.0
-    return nodes, float(curve[0] @ np.exp(log_weights))
+    value, share = shares(paths[None], log_weights, curve)
+    # Exactly 0 without water, whatever the sum of the weights was rounded to.
+    value[0] = 0.0
+    rise = curve[0] @ share
+    return CubicHermiteSpline(value, paths, 1 / rise), float(rise[0])
 
 
 def water_linearised(projections: Any, spectrum: Spectrum) -> np.ndarray:
@@ -111,6 +119,7 @@ def transmitted_energy(projections: Any, spectrum: Spectrum) -> float:
     inside = values[values > 0.1 * values.max().clamp(min=0)] if values.numel() else values
     if not inside.numel():
         return spectrum.effective_energy
-    path = water_equivalent(float(inside.median()), spectrum)
+    value = max(float(inside.median()), 0.0)
+    path = _path_of(spectrum, value)[0](value) if value else 0.0
     through = spectrum.weights * np.exp(-path * mass_attenuation("water", spectrum.energies))
     return float(through @ spectrum.energies / through.sum())

@@ -29,7 +29,7 @@ def fits_fdk(geometry: Geometry, grid: VolumeGrid) -> tuple[bool, str]:
         return False, reason
     if np.hypot(*(grid.centre[:2] - orbit.axis)) > 0.5 * orbit.radius:
         return False, "the volume lies far off the axis of rotation"
-    offsets = ray_offsets(geometry, orbit)
+    offsets = ray_offsets(geometry, orbit, (0, geometry.columns - 1))
     if orbit.full:
         if not offsets.min(axis=1).max() < 0 < offsets.max(axis=1).min():
             return False, "the detector does not reach the shadow of the axis of rotation"

@@ -13,6 +13,8 @@ and the obliquity of the detector in place of the last factor.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
@@ -21,13 +23,13 @@ from tomo_polysplat.start.orbit import Orbit
 __all__ = ["object_radius", "pixel_weights", "ray_offsets", "redundancy"]
 
 
-def ray_offsets(geometry: Geometry, orbit: Orbit) -> np.ndarray:
-    """Signed distance from the axis to the rays of the middle row, (views, columns).
+def ray_offsets(geometry: Geometry, orbit: Orbit, columns: Sequence[int] | None = None) -> np.ndarray:
+    """Signed distance from the axis to the rays of the middle row, (views, columns), all or those that are named.
 
-    The same ray measured from its other end has the opposite sign.
+    The same ray measured from its other end has the opposite sign. The offsets rise or fall from column to column.
     """
     middle = geometry.corner + 0.5 * (geometry.rows - 1) * geometry.v
-    column = np.arange(geometry.columns)[None, :, None]
+    column = np.asarray(range(geometry.columns) if columns is None else columns)[None, :, None]
     pixel = (middle[:, None] + column * geometry.u[:, None])[..., :2]
     if geometry.beam == "parallel":
         ray = np.broadcast_to(geometry.origin[:, None, :2], pixel.shape)
