@@ -42,8 +42,7 @@ def test_the_cpu_steps_through_autograd():
 def test_the_cpu_smooths_every_other_step_twice_as_much():
     ends = []
     for every, weights in ((2, (0.3, 0.3)), (1, (0.6, 0.0))):
-        gaussians, *problem = fit_problem("cone", True, "cpu", "numba", tv_weight=0.3)
-        problem[2] = replace(problem[2], tv_every=every)
+        gaussians, *problem = fit_problem("cone", True, "cpu", "numba", tv_weight=0.3, every=every)
         step = EagerStep(gaussians, *problem[:-1])
         for k, weight in enumerate(weights):
             step.settings = replace(problem[3], tv_weight=weight)
@@ -51,12 +50,6 @@ def test_the_cpu_smooths_every_other_step_twice_as_much():
         ends.append(gaussians.copy().parameters())
     for name in ends[0]:
         torch.testing.assert_close(ends[0][name], ends[1][name], msg=name)
-
-
-def test_a_recorded_step_always_smooths():
-    scene, settings = fit_problem("cone", True, "cpu", "triton")[3:5]
-    assert not why_eager(scene, settings)
-    assert "smooth" in why_eager(replace(scene, tv_every=2), settings)
 
 
 def test_no_material_number_falls_below_what_the_curves_allow():
@@ -120,6 +113,7 @@ def test_gaussians_turn_from_the_second_step_on():
         ("parallel", False, {"loss": "weighted-l1"}),
         ("fan", True, {}),
         ("cone", True, {"tv_weight": 0.0, "held_out": 0.0}),
+        ("cone", True, {"every": 2}),
     ],
 )
 def test_a_graph_steps_like_autograd(kind, polychromatic, changes):

@@ -30,7 +30,7 @@ def fit_problem(kind, polychromatic, device, kernel, count=17, **changes):
     values[1, 0, 3:6] = float("nan")
     values[:, -1, 7] = 400.0
     blurring, one_curve = changes.pop("blurring", True), changes.pop("one_curve", False)
-    corners = changes.pop("corners", (0.1, 0.03))
+    corners, every = changes.pop("corners", (0.1, 0.03)), changes.pop("every", 1)
     settings = Settings(**({"held_out": 0.2, "tv_weight": 0.3, "material_from": 0.5} | changes))
     rays = Rays(values.to(device), views, 1e3, settings.model_error, settings.held_out)
     quadrature, curves = None, (None, None)
@@ -41,7 +41,7 @@ def fit_problem(kind, polychromatic, device, kernel, count=17, **changes):
         curves = (None, None) if one_curve else CURVES.to(device)
     shape = (1, 7, 9) if planar else (4, 5, 6)
     box = VoxelBox(np.array([-0.6, -0.5, 0.0 if planar else -0.4]), np.array([0.2, 0.21, 0.23]), shape)
-    scene = FitScene(box, quadrature, 0.7, *curves, -0.1, kernel, 3.0, 0.0, blurring, 20, corners)
+    scene = FitScene(box, quadrature, 0.7, *curves, -0.1, kernel, 3.0, 0.0, blurring, 20, corners, tv_every=every)
     return _gaussians(count, planar, device), 0.2, rays, scene, settings, box
 
 

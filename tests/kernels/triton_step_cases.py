@@ -48,6 +48,11 @@ def a_step_without_smoothing_held_out_rays_or_blur(device):
 
 
 @case
+def every_other_step_smooths_twice_as_much(device):
+    compare_steps(_fused, device, ("cpu", "numba"), every=2)
+
+
+@case
 def the_slope_by_the_blur_behind_much_matter(device):
     """As large as the projections, and yet a sum of whole numbers."""
     slopes = []

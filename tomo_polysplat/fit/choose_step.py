@@ -22,8 +22,6 @@ def why_eager(scene: FitScene, settings: Settings) -> str:
         return f"the {scene.kernel} kernel runs"
     if settings.ssim_weight:
         return "structural similarity is asked for"
-    if scene.tv_every > 1:
-        return "not every step is to smooth"
     return ""
 
 

@@ -124,9 +124,10 @@ class FusedStep:
     def __call__(self, views: np.ndarray, box: VoxelBox, share: float) -> None:
         """One step; see `Step`."""
         self._box = box.shape
+        smooth = self._smooths()
         values = self._next(views, box, share)
         self._control.copy_(torch.from_numpy(values))
-        self._enqueue()
+        self._enqueue(smooth)
         self.feed.used()
 
     def read(self) -> tuple[float, float, int]:
@@ -137,6 +138,10 @@ class FusedStep:
         self._skipped.zero_()
         self._unread = 0
         return fitted / steps, held_out_mean(held_out, weight), skipped
+
+    def _smooths(self) -> bool:
+        """Whether the next step takes the total variation."""
+        return bool(self.settings.tv_weight) and self.done % self.scene.tv_every == 0
 
     def _next(self, views: np.ndarray, box: VoxelBox, share: float) -> np.ndarray:
         """What the control tensor must hold for the next step."""
@@ -149,8 +154,8 @@ class FusedStep:
         slots = self.feed.place(views)
         return np.concatenate([head, box.first, box.spacing, views, slots, self._table[views].ravel()])
 
-    def _enqueue(self) -> None:
-        """All kernels of a step; what they read of it is in the control tensor."""
+    def _enqueue(self, smooth: bool) -> None:
+        """All kernels of a step; what else they read of it is in the control tensor."""
         gaussians, batch = self.gaussians, len(self._views)
         head, box, chosen, table = self._control.split([_HEAD, _BOX, batch * _CHOSEN, batch * _VIEW])
         scale, weight, output = activate(
@@ -162,7 +167,6 @@ class FusedStep:
             self._curves,
         )
         drawn = (gaussians.position, scale, gaussians.rotation)
-        smooth = bool(self.settings.tv_weight)
         of_box = self._box_gradients(*drawn, output, box) if smooth else self._no_box
         of_rays = self._ray_gradients(*drawn, weight, table, chosen)
         if smooth:
@@ -208,7 +212,7 @@ class FusedStep:
             chosen.tv_clip,
             self.scene.tv_corners,
             chosen.bone_level,
-            chosen.tv_weight,
+            chosen.tv_weight * self.scene.tv_every,
             self._largest[1],
         )
         moments = box_backward.sum_moments(record, slope, box, VOXEL_CUTOFF)

@@ -1,4 +1,4 @@
-"""The step of the optimiser as one CUDA graph: recorded once, replayed for every step."""
+"""The step of the optimiser as a CUDA graph: recorded once, replayed for every step."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _recording = threading.Lock()
 
 
 class GraphStep(FusedStep):
-    """Replays of a recorded `FusedStep`; see `fit.step.Step`.
+    """Replays of a recorded `FusedStep`, of one that smooths and of one that does not; see `fit.step.Step`.
 
     Where it cannot be recorded the error leaves the Gaussians as they were.
     """
@@ -45,35 +45,43 @@ class GraphStep(FusedStep):
             torch.zeros(len(self._control), dtype=torch.float64).pin_memory() for _ in range(_AHEAD)
         ]
         self._passed = [torch.cuda.Event() for _ in range(_AHEAD)]
-        self._graph = self._record(batch, box)
+        self._graphs = self._record(batch, box)
 
     def __call__(self, views: np.ndarray, box: VoxelBox, share: float) -> None:
         """One step; see `Step`."""
         turn = self.done % _AHEAD
         self._passed[turn].synchronize()
+        graph = self._graphs[self._smooths()]
         values = self._next(views, box, share)
         self._waiting[turn].numpy()[:] = values
         self._control.copy_(self._waiting[turn], non_blocking=True)
-        self._graph.replay()
+        graph.replay()
         # On another GPU than the current one, the usual stream would say nothing about this one's work.
         self._passed[turn].record(torch.cuda.current_stream(self._control.device))
         self.feed.used()
 
-    def _record(self, batch: int, box: VoxelBox) -> torch.cuda.CUDAGraph:
-        """The graph, after a trial run that compiles the kernels and leaves no trace."""
+    def _record(self, batch: int, box: VoxelBox) -> dict[bool, torch.cuda.CUDAGraph]:
+        """Graphs by whether they smooth, after a trial run that compiles the kernels and leaves no trace."""
         before, device = self.gaussians.copy(), self.gaussians.position.device
+        kinds = {self._smooths(), bool(self.settings.tv_weight) and self.scene.tv_every == 1}
         with torch.no_grad(), torch.cuda.device(device):
             try:
                 super().__call__(np.arange(batch), box, 0.0)
                 torch.cuda.synchronize()
             finally:
                 self._forget(before)
-            graph = torch.cuda.CUDAGraph()
-            # Torch's own stream for it belongs to whichever GPU came first in the process.
-            stream = torch.cuda.Stream(device)
-            with _recording, torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
-                self._enqueue()
-        return graph
+            # Torch's own stream for it belongs to whichever GPU came first in the process. As only one of the graphs
+            # runs at a time, they share what memory they need.
+            stream, pool = torch.cuda.Stream(device), torch.cuda.graph_pool_handle()
+            graphs = {}
+            for smooth in kinds:
+                graphs[smooth] = torch.cuda.CUDAGraph()
+                recording = torch.cuda.graph(
+                    graphs[smooth], pool=pool, stream=stream, capture_error_mode="thread_local"
+                )
+                with _recording, recording:
+                    self._enqueue(smooth)
+        return graphs
 
     def _forget(self, before: Gaussians) -> None:
         for name, tensor in self.gaussians.parameters().items():
