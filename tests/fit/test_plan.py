@@ -267,10 +267,14 @@ def test_what_is_smoothed_is_told(edge, words):
     assert words in plan(of, ball(of, WATER), tv_box=edge).reasons["smoothed_box"]
 
 
-def test_a_cpu_smooths_volumes_every_other_step():
+def test_volumes_are_smoothed_every_other_step_but_where_a_gpu_smooths_parts_of_them():
     of, flat = problem(size=12), problem(size=12, planar=True)
-    assert plan(of, ball(of, WATER)).tv_every == 2
-    assert plan(of, ball(of, WATER), device="cuda").tv_every == plan(flat, ball(flat, WATER)).tv_every == 1
+    assert plan(of, ball(of, WATER), tv_box=11).tv_every == 2
+    assert plan(of, ball(of, WATER), device="cuda", tv_box=12).tv_every == 2
+    assert plan(of, ball(of, WATER), device="cuda", tv_box=11).tv_every == 1
+    assert (
+        plan(flat, ball(flat, WATER)).tv_every == plan(flat, ball(flat, WATER), device="cuda").tv_every == 1
+    )
     assert plan(of, ball(of, WATER), tv_every=3).tv_every == 3
 
 

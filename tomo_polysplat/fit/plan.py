@@ -47,10 +47,11 @@ _LONGER, _LONGER_PLANAR = (1.5, 9000), (2.0, 36_000)
 # Voxels along an edge of the box that is smoothed. What a box seldom meets is smoothed by leaps, which upset the
 # optimiser's sense of scale (teeth, 128^3 voxels: 39.1, 39.7 and 40.2 dB with 32, 64 and 128).
 _TV_BOX, _TV_BOX_PLANAR = {"cpu": 48, "cuda": 128}, 256
-# On a CPU voxels take 40 % of a step. Smoothed at every other step, twice as much, volumes are the same (twelve scans
-# of 32^3 to 64^3: -0.03 dB without metal and 0.0 everywhere in the mean, -0.17 at most) in 10 to 30 % less time. In
-# slices, where they take less, a casting of 128^2 lost 0.1 dB, and on a GPU a step is one recording.
-_TV_EVERY = {"cpu": 2, "cuda": 1}
+# Voxels take 40 % of a step. Smoothed at every other step, twice as much, volumes are the same in 10 to 30 % less time
+# (twelve scans of 32^3 to 64^3 on a CPU: -0.03 dB without metal and 0.0 everywhere in the mean, -0.17 at most; seven
+# of 64^3 and 128^3 on an H200: 0.0). In slices, where they take less, a casting of 128^2 lost 0.1 dB, and where a GPU's
+# box holds an eighth of the volume, four of 256^3 lost 0.1 to 0.4.
+_TV_EVERY = 2
 # Smallest deviation of a Gaussian in voxels. Where a volume has fewer Gaussians than the detector could tell apart,
 # each shows more of an edge: half as thick (H200, six scenes of 128^3 to 256^3) 0.8 dB more everywhere in the mean,
 # 0.05 without metal. Where they are many (40^3), and in slices, that changed nothing or lost 0.1 dB.
@@ -137,7 +138,8 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     longer = _longer(_cells(support, problem) / spacing**problem.dimensions, problem.planar)
     passes, views, reason = _length(problem.geometry.views, settings, most, longer)
     box = settings.tv_box or (_TV_BOX_PLANAR if problem.planar else _TV_BOX[device])
-    every = settings.tv_every or (1 if problem.planar else _TV_EVERY[device])
+    at_each = problem.planar or (device == "cuda" and box < max(start.shape))
+    every = settings.tv_every or (1 if at_each else _TV_EVERY)
     soft = reference * problem.depth
     curves, needed = _curves(start, soft, problem.polychromatic, settings)
     blurred, told = _blurred(start, soft, settings)

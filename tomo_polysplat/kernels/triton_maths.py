@@ -88,7 +88,7 @@ def _unit_quaternion(rotation, n, live):
     x = tl.load(rotation + n * 4 + 1, mask=live, other=0.0).to(tl.float64)
     y = tl.load(rotation + n * 4 + 2, mask=live, other=0.0).to(tl.float64)
     z = tl.load(rotation + n * 4 + 3, mask=live, other=0.0).to(tl.float64)
-    inverse = 1.0 / tl.sqrt(w * w + x * x + y * y + z * z)
+    inverse = tl.math.rsqrt(w * w + x * x + y * y + z * z)
     return w * inverse, x * inverse, y * inverse, z * inverse, inverse
 
 

@@ -18,6 +18,8 @@ from tomo_polysplat.kernels.views import DetectorViews
 __all__ = ["pull_back"]
 
 _BLOCK = 64
+# Of a lane. It would take 208, with which too few warps are at work to hide what each waits for (62 us for 72).
+_REGISTERS = 128
 
 
 @triton.jit
@@ -69,14 +71,15 @@ def _pull_back_kernel(
         c1, c2, c3, _ = _moments(sums + 12, seen, inverse, inverse, inverse, inverse)
         C0, C1, C2, C3 = C0 + c0, C1 + c1, C2 + c2, C3 + c3
         # nu = r11 q1 and nv = r12 q1 + r22 q2, so x = by_t t - back u and y = by_u u.
-        by_t = 1.0 / tl.sqrt(tl.where(seen, dot(nu0, nu1, nu2, nu0, nu1, nu2), 1.0))
+        by_t = tl.math.rsqrt(tl.where(seen, dot(nu0, nu1, nu2, nu0, nu1, nu2), 1.0))
         q10, q11, q12 = by_t * nu0, by_t * nu1, by_t * nu2
         r12 = dot(q10, q11, q12, nv0, nv1, nv2)
         q20, q21, q22 = nv0 - r12 * q10, nv1 - r12 * q11, nv2 - r12 * q12
-        r22 = tl.sqrt(dot(q20, q21, q22, q20, q21, q22))
+        square = dot(q20, q21, q22, q20, q21, q22)
         by_u = none
         if not PLANAR:
-            by_u = tl.where(seen & (r22 > 0), 1.0 / tl.where(r22 > 0, r22, 1.0), 0.0)
+            by_u = tl.where(seen & (square > 0), tl.math.rsqrt(tl.where(square > 0, square, 1.0)), 0.0)
+        r22 = square * by_u
         q20, q21, q22 = by_u * q20, by_u * q21, by_u * q22
         back = by_t * r12 * by_u
         t0, t1, t2 = _mix(htt, q10, q11, q12, htu, q20, q21, q22)
@@ -158,6 +161,6 @@ def pull_back(
     with on_device(position):
         _pull_back_kernel[(triton.cdiv(len(position), _BLOCK),)](
             position, scale, rotation, table, record, moments, *grads, len(position), len(views),
-            CHANNELS=len(weight), CONE=views.cone, PLANAR=views.planar, BLOCK=_BLOCK, num_warps=2,
+            CHANNELS=len(weight), CONE=views.cone, PLANAR=views.planar, BLOCK=_BLOCK, num_warps=2, maxnreg=_REGISTERS,
         )  # fmt: skip
     return grads

@@ -39,9 +39,8 @@ def whitening(scale, rotation, n, live):
     s0 = tl.load(scale + n * 3, mask=live, other=1.0).to(tl.float64)
     s1 = tl.load(scale + n * 3 + 1, mask=live, other=1.0).to(tl.float64)
     s2 = tl.load(scale + n * 3 + 2, mask=live, other=1.0).to(tl.float64)
-    return (
-        w00 / s0, w01 / s0, w02 / s0, w10 / s1, w11 / s1, w12 / s1, w20 / s2, w21 / s2, w22 / s2, s0, s1, s2,
-    )  # fmt: skip
+    a, b, c = 1.0 / s0, 1.0 / s1, 1.0 / s2
+    return w00 * a, w01 * a, w02 * a, w10 * b, w11 * b, w12 * b, w20 * c, w21 * c, w22 * c, s0, s1, s2
 
 
 @triton.jit
@@ -102,19 +101,19 @@ def _outline(cut, r11, r12, r22, lc, lx, ly, lxx, lxy, lyy, PLANAR: tl.constexpr
     b0, b1 = -cut * lx, r11 * r12 - cut * lxy
     c0, c1, c2 = -cut * lc, -2 * cut * ly, r12 * r12 + r22 * r22 - cut * lyy
     rest = b0 * b0 - a * c0
+    by_a = 1.0 / tl.where(a > 0, a, 1.0)
     if PLANAR:
         valid = (a > 0) & (rest > 0)
-        safe = tl.where(valid, a, 1.0)
         none = tl.zeros_like(a)
-        return none, none + 1, -b0 / safe, none, tl.sqrt(tl.where(valid, rest, 1.0)) / safe, valid
+        return none, none + 1, -b0 * by_a, none, tl.sqrt(tl.where(valid, rest, 1.0)) * by_a, valid
     lead, half = b1 * b1 - a * c2, b0 * b1 - 0.5 * a * c1
     inside = half * half - lead * rest
     valid = (a > 0) & (lead < 0) & (inside > 0)
-    a, lead, inside = tl.where(valid, a, 1.0), tl.where(valid, lead, -1.0), tl.where(valid, inside, 1.0)
-    yc, ry = -half / lead, tl.sqrt(inside) / -lead
+    by_lead, inside = -1.0 / tl.where(valid, lead, -1.0), tl.where(valid, inside, 1.0)
+    yc, ry = half * by_lead, tl.sqrt(inside) * by_lead
     # rest - half^2 / lead, the parabola's top, without its cancellation.
-    hx = tl.sqrt(inside / -lead) / a
-    return yc, ry, -(b0 + b1 * yc) / a, -b1 / a, hx, valid
+    hx = tl.sqrt(inside * by_lead) * by_a
+    return yc, ry, -(b0 + b1 * yc) * by_a, -b1 * by_a, hx, valid
 
 
 @triton.jit
@@ -152,16 +151,15 @@ def _footprint_kernel(
         valid = live & (depth > 1.001 * cutoff * tl.sqrt(reach))
         tl.atomic_add(skipped, tl.sum((live & ~valid).to(tl.int64), 0), sem="relaxed")
     # In units of |e_centre|, so that l is one at the centre.
-    inverse = 1.0 / (kappa * tl.sqrt(dot(w0, w1, w2, w0, w1, w2)))
+    inverse = tl.math.rsqrt(kappa * kappa * dot(w0, w1, w2, w0, w1, w2))
     square = inverse * inverse
     uu = dot(nu0, nu1, nu2, nu0, nu1, nu2)
     valid &= uu > 0
-    r11 = tl.sqrt(uu)
-    safe = tl.where(valid, r11, 1.0)
+    by_u = tl.math.rsqrt(tl.where(valid, uu, 1.0))
     n0, n1, n2 = cross(nu0, nu1, nu2, nv0, nv1, nv2)
-    r12 = dot(nu0, nu1, nu2, nv0, nv1, nv2) / safe * inverse
-    r22 = tl.sqrt(dot(n0, n1, n2, n0, n1, n2)) / safe * inverse
-    r11 *= inverse
+    r11 = uu * by_u * inverse
+    r12 = dot(nu0, nu1, nu2, nv0, nv1, nv2) * by_u * inverse
+    r22 = tl.sqrt(dot(n0, n1, n2, n0, n1, n2)) * by_u * inverse
     zero = tl.zeros_like(r11)
     lx, ly, lxx, lxy, lyy = zero, zero, zero, zero, zero
     if CONE:

@@ -193,10 +193,11 @@ def _pull_back_block(
     t, u, v = t.to(tl.float64) * one, u.to(tl.float64) * one, v.to(tl.float64) * one
     tt, tu, tv = tt.to(tl.float64) * two, tu.to(tl.float64) * two, tv.to(tl.float64) * two
     uu, uv, vv = uu.to(tl.float64) * two, uv.to(tl.float64) * two, vv.to(tl.float64) * two
+    a, b, c = 1.0 / s0, 1.0 / s1, 1.0 / s2
     m0, m1, m2 = (
-        dot(q00, q01, q02, t, u, v) / s0,
-        dot(q10, q11, q12, t, u, v) / s1,
-        dot(q20, q21, q22, t, u, v) / s2,
+        dot(q00, q01, q02, t, u, v) * a,
+        dot(q10, q11, q12, t, u, v) * b,
+        dot(q20, q21, q22, t, u, v) * c,
     )
     tl.store(grad_position + n * 3, dot(t00, t10, t20, m0, m1, m2).to(tl.float32), mask=live)
     tl.store(grad_position + n * 3 + 1, dot(t01, t11, t21, m0, m1, m2).to(tl.float32), mask=live)
@@ -209,7 +210,7 @@ def _pull_back_block(
         tl.store(grad_weight + k * count + n, tl.load(at + 12 + k), mask=live)
     whitening_adjoint(
         scale, rotation, n, live,
-        t00 / s0, t01 / s0, t02 / s0, t10 / s1, t11 / s1, t12 / s1, t20 / s2, t21 / s2, t22 / s2,
+        t00 * a, t01 * a, t02 * a, t10 * b, t11 * b, t12 * b, t20 * c, t21 * c, t22 * c,
         g00 * sx, g01 * sy, g02 * sz, g10 * sx, g11 * sy, g12 * sz, g20 * sx, g21 * sy, g22 * sz,
         grad_scale, grad_rotation,
     )  # fmt: skip

@@ -42,10 +42,11 @@ def scaled_whitening(scale, rotation, table, n, live):
     s1 = tl.load(scale + n * 3 + 1, mask=live, other=1.0).to(tl.float64)
     s2 = tl.load(scale + n * 3 + 2, mask=live, other=1.0).to(tl.float64)
     x, y, z = tl.load(table + 3), tl.load(table + 4), tl.load(table + 5)
+    a, b, c = 1.0 / s0, 1.0 / s1, 1.0 / s2
     return (
         t00, t01, t02, t10, t11, t12, t20, t21, t22,
-        t00 / s0 * x, t01 / s0 * y, t02 / s0 * z, t10 / s1 * x, t11 / s1 * y, t12 / s1 * z,
-        t20 / s2 * x, t21 / s2 * y, t22 / s2 * z, s0, s1, s2,
+        t00 * a * x, t01 * a * y, t02 * a * z, t10 * b * x, t11 * b * y, t12 * b * z,
+        t20 * c * x, t21 * c * y, t22 * c * z, s0, s1, s2,
     )  # fmt: skip
 
 
@@ -55,17 +56,20 @@ def triangle(a00, a01, a02, a10, a11, a12, a20, a21, a22):
 
     What is left of y and z across x is kept as vectors: squares subtracted afterwards would cancel.
     """
-    r11 = tl.sqrt(dot(a00, a10, a20, a00, a10, a20))
-    x0, x1, x2 = a00 / r11, a10 / r11, a20 / r11
+    xx = dot(a00, a10, a20, a00, a10, a20)
+    by_r11 = tl.math.rsqrt(xx)
+    x0, x1, x2 = a00 * by_r11, a10 * by_r11, a20 * by_r11
     r12, r13 = dot(x0, x1, x2, a01, a11, a21), dot(x0, x1, x2, a02, a12, a22)
     y0, y1, y2 = a01 - x0 * r12, a11 - x1 * r12, a21 - x2 * r12
-    r22 = tl.sqrt(dot(y0, y1, y2, y0, y1, y2))
-    y0, y1, y2 = y0 / r22, y1 / r22, y2 / r22
+    yy = dot(y0, y1, y2, y0, y1, y2)
+    by_r22 = tl.math.rsqrt(yy)
+    y0, y1, y2 = y0 * by_r22, y1 * by_r22, y2 * by_r22
     z0, z1, z2 = a02 - x0 * r13, a12 - x1 * r13, a22 - x2 * r13
     r23 = dot(y0, y1, y2, z0, z1, z2)
     z0, z1, z2 = z0 - y0 * r23, z1 - y1 * r23, z2 - y2 * r23
-    r33 = tl.sqrt(dot(z0, z1, z2, z0, z1, z2))
-    by_r33 = tl.where(r33 > 0, 1.0 / tl.where(r33 > 0, r33, 1.0), 0.0)
+    zz = dot(z0, z1, z2, z0, z1, z2)
+    by_r33 = tl.where(zz > 0, tl.math.rsqrt(tl.where(zz > 0, zz, 1.0)), 0.0)
+    r11, r22, r33 = xx * by_r11, yy * by_r22, zz * by_r33
     return (
         r11, r12, r13, r22, r23, r33, x0, x1, x2, y0, y1, y2, z0 * by_r33, z1 * by_r33, z2 * by_r33,
     )  # fmt: skip
