@@ -141,9 +141,8 @@ def reconstruct(
     saved = _checkpoint(checkpoint, resume, problem, options)
     started -= 0.0 if saved is None else saved.seconds
     with one_torch_thread(wishes.device), kept_threads(), progress_reports(progress) as report:
-        report(0.0, "start volume")
-        problem, known = physics(problem, wanted, wishes, saved)
-        begun = begin(problem, wishes, saved)
+        problem, known = physics(problem, wanted, wishes, saved, report)
+        begun = begin(problem, wishes, saved, report)
         begun.plan.reasons |= known | _undone(water_correction)
         outcome = _fitted(begun, problem, wishes, saved, started, flipped, report)
         with postponed_interrupts("the volume") as interruption:

@@ -42,7 +42,7 @@ def fit_problem(kind, polychromatic, device, kernel, count=17, **changes):
     shape = (1, 7, 9) if planar else (4, 5, 6)
     box = VoxelBox(np.array([-0.6, -0.5, 0.0 if planar else -0.4]), np.array([0.2, 0.21, 0.23]), shape)
     scene = FitScene(
-        box, quadrature, 0.7, *curves, -0.1, kernel, 3.0, 0.0, blurring, 20, corners, tv_every=every
+        box, quadrature, 0.7, *curves, -0.1, kernel, 3.0, 0.0, blurring, 20, corners, False, every, 0.2
     )
     return _gaussians(count, planar, device), 0.2, rays, scene, settings, box
 

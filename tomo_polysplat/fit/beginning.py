@@ -71,7 +71,11 @@ class Begun:
 
 
 def physics(
-    problem: Problem, wanted: Calibration | None, wishes: Wishes, saved: Checkpoint | None
+    problem: Problem,
+    wanted: Calibration | None,
+    wishes: Wishes,
+    saved: Checkpoint | None,
+    report: Callable[[float, str], Any],
 ) -> tuple[Problem, dict[str, Any]]:
     """The problem under the physics that short fits, or those before a checkpoint, have found, and its record."""
     if wanted is None:
@@ -79,12 +83,15 @@ def physics(
     if saved is not None and saved.plan is not None:
         found = saved.plan.reasons["calibration"]
     else:
+        report(0.0, "calibration")
         found = calibrated(problem, wanted, wishes.settings, wishes.device, wishes.seed, wishes.time_budget)
     return with_fitted(problem, found["fitted"]), {"calibration": found}
 
 
-def begin(problem: Problem, wishes: Wishes, saved: Checkpoint | None) -> Begun:
-    """Plan, seed and set up, or go on from where a checkpoint was.
+def begin(
+    problem: Problem, wishes: Wishes, saved: Checkpoint | None, report: Callable[[float, str], Any]
+) -> Begun:
+    """Plan, seed and set up, or go on from where a checkpoint was; ``report`` gets the share done, none, and words.
 
     Raises
     ------
@@ -96,9 +103,11 @@ def begin(problem: Problem, wishes: Wishes, saved: Checkpoint | None) -> Begun:
         if saved is not None and saved.snapshot is not None and saved.plan is not None:
             plan, gaussians = saved.plan, saved.snapshot.gaussians.to(device)
             return Begun(plan, gaussians, *_model(problem, plan, wishes))
+        report(0.0, "start volume")
         start, why = problem.start_volume(device, settings.metal_level)
         plan = make_plan(start, problem, settings, device.type)
         scene, rays = _model(problem, plan, wishes)
+        report(0.0, "seeds")
         settings, agent = settings_for_agent(start, plan.reference, problem, settings, device, options)
         plan.reasons |= {"start": why, **agent}
         plan, gaussians = seeds_for_edges(start, plan, problem, scene, rays, settings, device, options)

@@ -72,9 +72,9 @@ class FitScene:
     blurring: bool
     tv_box: int
     tv_corners: tuple[float, float]
-    closed: bool = False
-    tv_every: int = 1
-    smallest_scale: float = 0.2
+    closed: bool
+    tv_every: int
+    smallest_scale: float
 
     def projections(self, gaussians: Gaussians, views: DetectorViews) -> tuple[torch.Tensor, int]:
         """(views, rows, columns) predicted -log(I/I0), and the pairs skipped at the source plane."""
