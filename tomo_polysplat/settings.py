@@ -64,7 +64,7 @@ class Settings:
     """Material number of soft matter that the fit starts from; near dense matter it is free."""
     soft_gain: float = 1.0
     """Once a pass the soft matter's number moves by so much times the cupping, where it is one matter; 0 holds it."""
-    bone_u: float = 0.35
+    bone_u: float = 0.3
     metal_u: float = 0.8
     free_radius: float = 6.0
     """Gaussians have a material number of their own within this many voxels of bone-like or denser matter."""
@@ -75,7 +75,7 @@ class Settings:
     learning_rate_rotation: float = 3e-3
     """Per step, of the quaternion; up to seven times as much in a run of fewer than 900 steps."""
     learning_rate_attenuation: float = 1e-2
-    learning_rate_material: float = 3e-3
+    learning_rate_material: float = 1e-3
     learning_rate_shared: float = 5e-3
     """Of each piece of metal's one number."""
     blur: float = 0.1

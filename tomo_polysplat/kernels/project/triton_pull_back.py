@@ -18,8 +18,9 @@ from tomo_polysplat.kernels.views import DetectorViews
 __all__ = ["pull_back"]
 
 _BLOCK = 64
-# Of a lane. It would take 208, with which too few warps are at work to hide what each waits for (62 us for 72).
-_REGISTERS = 128
+# Of a lane. It would take 208, with which too few warps are at work to hide what each waits for: 58 us for 66 (194 000
+# Gaussians, four views). With 128 it spills too much.
+_REGISTERS = 168
 
 
 @triton.jit
