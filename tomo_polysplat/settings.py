@@ -65,6 +65,7 @@ class Settings:
     soft_gain: float = 1.0
     """Once a pass the soft matter's number moves by so much times the cupping, where it is one matter; 0 holds it."""
     bone_u: float = 0.3
+    """Material number that bone-like matter starts from, bone's own, and near which the fit keeps it."""
     metal_u: float = 0.8
     free_radius: float = 6.0
     """Gaussians have a material number of their own within this many voxels of bone-like or denser matter."""
@@ -76,6 +77,7 @@ class Settings:
     """Per step, of the quaternion; up to seven times as much in a run of fewer than 900 steps."""
     learning_rate_attenuation: float = 1e-2
     learning_rate_material: float = 1e-3
+    """Per step of a run of 300, of material numbers outside metal; in proportion less in a longer one."""
     learning_rate_shared: float = 5e-3
     """Of each piece of metal's one number."""
     blur: float = 0.1

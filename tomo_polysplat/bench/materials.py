@@ -207,6 +207,6 @@ def write_figure(path: Path, record: Mapping[str, Any]) -> None:
     axis.set_yticks(range(len(entries)), [entry["name"] for entry in entries])
     axis.invert_yaxis()
     axis.grid(alpha=0.3)
-    axis.legend(frameon=False, fontsize=8)
+    figure.legend(loc="outside upper center", ncols=2, frameon=False, fontsize=8)
     with replacing(path, overwrite=True) as temporary:
         figure.savefig(temporary, dpi=130, format="png")

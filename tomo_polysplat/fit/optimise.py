@@ -35,8 +35,8 @@ _STEPS, _MOST_HURRY = 450, 2.0
 # (40^3: pepper 30.9 to 31.4 dB, teeth 39.3 to 39.7, lung 33.0 to 33.3), while in 900 the same rate upsets metal (teeth,
 # 256^3: 58.6 to 57.0 dB everywhere with three times the rate).
 _STEPS_OF_TURNS, _MOST_HURRIED_TURNS = 900, 7.0
-# That of Gaussians' own material numbers is for so many, and goes with their inverse, up to so many times. What the rays
-# say of a number is little beside what they say of edges that Gaussians blur, and a blurred edge looks like matter with
+# That of Gaussians' own material numbers is for so many, and goes with their inverse, up to so many times. What rays
+# say of a number is little beside what they say of edges that Gaussians blur, and a blurred edge looks like matter of
 # a larger number: a number goes on rising for as long as it is fitted.
 _STEPS_OF_NUMBERS, _MOST_HURRIED_NUMBERS = 300, 2.0
 # A pass over fewer views than this makes the steps of one over as many.
