@@ -128,3 +128,14 @@ def test_water_of_a_tensor_is_that_of_an_array():
     np.testing.assert_allclose(water.numpy(), water_equivalent(values, SPECTRUM), rtol=1e-6)
     energies = transmitted_energy(values, SPECTRUM), transmitted_energy(torch.from_numpy(values), SPECTRUM)
     assert energies[0] == pytest.approx(energies[1], rel=1e-6)
+
+
+@pytest.mark.parametrize("value", [1e-30, 1e-9, 1e-6])
+def test_hardly_attenuated_rays_transmit_the_whole_spectrum(value):
+    energy = transmitted_energy(np.array([value, 0.0]), SPECTRUM)
+    assert energy == pytest.approx(SPECTRUM.weights @ SPECTRUM.energies, rel=1e-6)
+
+
+def test_what_no_light_passes_hardens_to_the_last_energy():
+    """Though every share of it is too small for a float."""
+    assert transmitted_energy(np.array([2e3, 3e3]), SPECTRUM) == pytest.approx(90.0, abs=1.0)

@@ -85,9 +85,7 @@ def _path_of(spectrum: Spectrum, largest: float) -> tuple[Callable[[Any], np.nda
     # Not needed where there is no spectrum.
     from scipy.interpolate import CubicHermiteSpline
 
-    lit = spectrum.weights > 0
-    log_weights = np.log(spectrum.weights[lit])
-    curve = mass_attenuation("water", spectrum.energies[lit])[None]
+    log_weights, _, curve = _water_curve(spectrum)
     # P rises at least as fast as at its hardest energy, so this path reaches the largest value. Cubic spacing
     # follows the curve, which bends most at 0 where the soft photons still count.
     paths = largest / curve.min() * np.linspace(0.0, 1.0, _STEPS) ** 3
@@ -96,6 +94,13 @@ def _path_of(spectrum: Spectrum, largest: float) -> tuple[Callable[[Any], np.nda
     value[0] = 0.0
     rise = curve[0] @ share
     return CubicHermiteSpline(value, paths, 1 / rise), float(rise[0])
+
+
+def _water_curve(spectrum: Spectrum) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Logarithms of the weights (n,), energies (n,) and mass attenuation of water (1, n), where there are photons."""
+    lit = spectrum.weights > 0
+    energies = spectrum.energies[lit]
+    return np.log(spectrum.weights[lit]), energies, mass_attenuation("water", energies)[None]
 
 
 def water_linearised(projections: Any, spectrum: Spectrum) -> np.ndarray:
@@ -120,6 +125,7 @@ def transmitted_energy(projections: Any, spectrum: Spectrum) -> float:
     if not inside.numel():
         return spectrum.effective_energy
     value = max(float(inside.median()), 0.0)
-    path = _path_of(spectrum, value)[0](value) if value else 0.0
-    through = spectrum.weights * np.exp(-path * mass_attenuation("water", spectrum.energies))
-    return float(through @ spectrum.energies / through.sum())
+    # Of a range too short, rounding would decide which of two values is the larger.
+    path = _path_of(spectrum, max(value, 1.0))[0](value)
+    log_weights, energies, curve = _water_curve(spectrum)
+    return float(energies @ shares(np.array([path]), log_weights, curve)[1])
