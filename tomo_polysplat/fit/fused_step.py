@@ -14,7 +14,15 @@ import torch
 from tomo_polysplat.fit.feed import feed
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.fit.step import EPSILON, held_out_mean, log_scale_bounds, new_moments, step_rates, turning
+from tomo_polysplat.fit.step import (
+    EPSILON,
+    held_out_mean,
+    log_scale_bounds,
+    new_moments,
+    smoothing,
+    step_rates,
+    turning,
+)
 from tomo_polysplat.kernels.project import triton_backward as rays_backward
 from tomo_polysplat.kernels.project import triton_forward as rays_forward
 from tomo_polysplat.kernels.project.triton_pull_back import pull_back as rays_pull_back
@@ -124,7 +132,7 @@ class FusedStep:
     def __call__(self, views: np.ndarray, box: VoxelBox, share: float) -> None:
         """One step; see `Step`."""
         self._box = box.shape
-        smooth = self._smooths()
+        smooth = smoothing(self.settings, self.scene, self.done)
         values = self._next(views, box, share)
         self._control.copy_(torch.from_numpy(values))
         self._enqueue(smooth)
@@ -139,10 +147,6 @@ class FusedStep:
         self._unread = 0
         return fitted / steps, held_out_mean(held_out, weight), skipped
 
-    def _smooths(self) -> bool:
-        """Whether the next step takes the total variation."""
-        return bool(self.settings.tv_weight) and self.done % self.scene.tv_every == 0
-
     def _next(self, views: np.ndarray, box: VoxelBox, share: float) -> np.ndarray:
         """What the control tensor must hold for the next step."""
         turns = turning(self.done)
@@ -154,8 +158,8 @@ class FusedStep:
         slots = self.feed.place(views)
         return np.concatenate([head, box.first, box.spacing, views, slots, self._table[views].ravel()])
 
-    def _enqueue(self, smooth: bool) -> None:
-        """All kernels of a step; what else they read of it is in the control tensor."""
+    def _enqueue(self, smooth: float) -> None:
+        """All kernels of a step that smooths with this weight; what else they read of it is in the control tensor."""
         gaussians, batch = self.gaussians, len(self._views)
         head, box, chosen, table = self._control.split([_HEAD, _BOX, batch * _CHOSEN, batch * _VIEW])
         scale, weight, output = activate(
@@ -167,7 +171,7 @@ class FusedStep:
             self._curves,
         )
         drawn = (gaussians.position, scale, gaussians.rotation)
-        of_box = self._box_gradients(*drawn, output, box) if smooth else self._no_box
+        of_box = self._box_gradients(*drawn, output, box, smooth) if smooth else self._no_box
         of_rays = self._ray_gradients(*drawn, weight, table, chosen)
         if smooth:
             self._join()
@@ -201,8 +205,8 @@ class FusedStep:
     def _join(self) -> None:
         """Wait for the box's gradients, where they are made beside those of the rays."""
 
-    def _box_gradients(self, position, scale, rotation, output, table) -> tuple[torch.Tensor, ...]:
-        """Gradients of the total variation in the box, likewise."""
+    def _box_gradients(self, position, scale, rotation, output, table, smooth) -> tuple[torch.Tensor, ...]:
+        """Gradients of the total variation in the box, likewise, times ``smooth``."""
         drawn, box = (position, scale, rotation, output), VoxelBox(np.zeros(3), np.ones(3), self._box)
         record = ellipsoids(*drawn, table, VOXEL_CUTOFF)
         volume = box_forward.splat(record, 1, box, VOXEL_CUTOFF, self._largest[1])
@@ -212,7 +216,7 @@ class FusedStep:
             chosen.tv_clip,
             self.scene.tv_corners,
             chosen.bone_level,
-            chosen.tv_weight * self.scene.tv_every,
+            smooth,
             self._largest[1],
         )
         moments = box_backward.sum_moments(record, slope, box, VOXEL_CUTOFF)

@@ -10,6 +10,7 @@ import torch
 from tomo_polysplat.fit.fused_step import FusedStep
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.step import smoothing
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
@@ -51,7 +52,7 @@ class GraphStep(FusedStep):
         """One step; see `Step`."""
         turn = self.done % _AHEAD
         self._passed[turn].synchronize()
-        graph = self._graphs[self._smooths()]
+        graph = self._graphs[smoothing(self.settings, self.scene, self.done)]
         values = self._next(views, box, share)
         self._waiting[turn].numpy()[:] = values
         self._control.copy_(self._waiting[turn], non_blocking=True)
@@ -60,10 +61,10 @@ class GraphStep(FusedStep):
         self._passed[turn].record(torch.cuda.current_stream(self._control.device))
         self.feed.used()
 
-    def _record(self, batch: int, box: VoxelBox) -> dict[bool, torch.cuda.CUDAGraph]:
-        """Graphs by whether they smooth, after a trial run that compiles the kernels and leaves no trace."""
+    def _record(self, batch: int, box: VoxelBox) -> dict[float, torch.cuda.CUDAGraph]:
+        """Graphs by the weight they smooth with, after a trial run that compiles the kernels and leaves no trace."""
         before, device = self.gaussians.copy(), self.gaussians.position.device
-        kinds = {self._smooths(), bool(self.settings.tv_weight) and self.scene.tv_every == 1}
+        weights = {smoothing(self.settings, self.scene, step) for step in range(self.scene.tv_every)}
         with torch.no_grad(), torch.cuda.device(device):
             try:
                 super().__call__(np.arange(batch), box, 0.0)
@@ -74,7 +75,7 @@ class GraphStep(FusedStep):
             # runs at a time, they share what memory they need.
             stream, pool = torch.cuda.Stream(device), torch.cuda.graph_pool_handle()
             graphs = {}
-            for smooth in kinds:
+            for smooth in weights:
                 graphs[smooth] = torch.cuda.CUDAGraph()
                 recording = torch.cuda.graph(
                     graphs[smooth], pool=pool, stream=stream, capture_error_mode="thread_local"
@@ -90,11 +91,11 @@ class GraphStep(FusedStep):
             tensor.zero_()
         self.done = self._unread = 0
 
-    def _box_gradients(self, position, scale, rotation, output, table) -> tuple[torch.Tensor, ...]:
+    def _box_gradients(self, position, scale, rotation, output, table, smooth) -> tuple[torch.Tensor, ...]:
         """Beside those of the rays: each alone leaves much of a GPU idle."""
         self._side.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(self._side):
-            return super()._box_gradients(position, scale, rotation, output, table)
+            return super()._box_gradients(position, scale, rotation, output, table, smooth)
 
     def _join(self) -> None:
         torch.cuda.current_stream().wait_stream(self._side)

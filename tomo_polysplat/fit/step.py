@@ -25,6 +25,7 @@ __all__ = [
     "held_out_mean",
     "log_scale_bounds",
     "new_moments",
+    "smoothing",
     "step_rates",
     "turning",
 ]
@@ -79,6 +80,11 @@ def step_rates(settings: Settings, spacing: float) -> dict[str, float]:
         "shared_material": settings.learning_rate_shared,
         "blur": settings.learning_rate_blur,
     }
+
+
+def smoothing(settings: Settings, scene: FitScene, done: int) -> float:
+    """Weight of the total variation in the step after so many; 0 where that step does not take it."""
+    return 0.0 if done % scene.tv_every else scene.tv_every * settings.tv_weight
 
 
 def turning(done: int) -> float:
@@ -186,8 +192,7 @@ class EagerStep:
         """What is added to the misfit: total variation, and the dissimilarity of the projections if asked for."""
         settings = self.settings
         total: torch.Tensor | float = 0.0
-        if settings.tv_weight and self._done % self.scene.tv_every == 0:
-            weight_now = self.scene.tv_every * settings.tv_weight
+        if weight_now := smoothing(settings, self.scene, self._done):
             total = total + weight_now * roughness(self.gaussians, self.scene, settings, box)
         if settings.ssim_weight:
             total = total + settings.ssim_weight * dissimilarity(predicted, measured, weight)
