@@ -55,7 +55,7 @@ class Settings:
     largest_scale: float = 8.0
     """Largest standard deviation in seed spacings."""
     bone_level: float = 2.2
-    """Start attenuation, in soft references, above which a Gaussian starts as bone-like."""
+    """Start attenuation, in soft references, above which matter is bone-like, and material numbers are free near it."""
     metal_level: float = 6.0
     """The same for metal."""
     metal_rim: float = 0.0
@@ -65,7 +65,7 @@ class Settings:
     soft_gain: float = 1.0
     """Once a pass the soft matter's number moves by so much times the cupping, where it is one matter; 0 holds it."""
     bone_u: float = 0.3
-    """Material number that bone-like matter starts from, bone's own, and near which the fit keeps it."""
+    """Material number that matter of four soft references starts from, that of bone (``model/bone_numbers.py``)."""
     metal_u: float = 0.8
     free_radius: float = 6.0
     """Gaussians have a material number of their own within this many voxels of bone-like or denser matter."""

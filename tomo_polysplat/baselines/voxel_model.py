@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from tomo_polysplat.model.bone_numbers import start_numbers
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.settings import Settings
 
@@ -67,8 +68,7 @@ def start_voxels(start: np.ndarray, grid: VolumeGrid, settings: Settings, device
     """The model that a first reconstruction (nz, ny, nx), in soft references, suggests."""
     from scipy import ndimage
 
-    u = np.full(start.shape, settings.soft_u, np.float32)
-    u[start > settings.bone_level] = settings.bone_u
+    u = start_numbers(torch.from_numpy(np.asarray(start, np.float32)), settings).numpy()
     u[start > settings.metal_level] = settings.metal_u
     dense = start > settings.bone_level
     reach = settings.free_radius * float(grid.voxel_size.min())

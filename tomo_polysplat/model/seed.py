@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.kernels.spatial_order import spatial_order
+from tomo_polysplat.model.bone_numbers import start_numbers
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.model.seed_edges import edge_shapes
 from tomo_polysplat.model.seed_samples import box_mean, reaches, voxel_of
@@ -230,11 +231,10 @@ def _materials(
     between, where the start cannot be trusted to tell what is what, every Gaussian has its own.
     """
     group = torch.zeros(len(points), dtype=torch.int64, device=points.device)
-    own = torch.full_like(value, settings.soft_u)
     if not polychromatic:
-        return own, value.new_tensor([settings.soft_u]), group
+        return torch.full_like(value, settings.soft_u), value.new_tensor([settings.soft_u]), group
+    own = start_numbers(value, settings)
     group[reaches(start, points, grid, settings.bone_level, reach)] = -1
-    own[value > settings.bone_level] = settings.bone_u
     box, pieces, number = _pieces(_metal(start, settings))
     labels = torch.zeros(start.shape, dtype=torch.int64, device=start.device)
     labels[box] = torch.from_numpy(pieces.astype(np.int64)).to(start.device)
