@@ -10,7 +10,7 @@ image is continued by its border. Averaging over a pixel's own area alone has v 
 
 Light is spread before the logarithm, and -log of mixed light is less than this. But what mixed light hides at the edges
 of opaque metal could be any amount of metal: a model that mixes light has metal to spare wherever that mends another
-error of its edges (docs/accuracy.md), and this one does not.
+error of its edges (docs/limits.md), and this one does not.
 """
 
 from __future__ import annotations
