@@ -202,7 +202,7 @@ def _fitted(
         plan.spacing * problem.voxel,
         begun.rays,
         scene,
-        replace(wishes.settings, passes=plan.passes),
+        replace(plan.adapted(wishes.settings), passes=plan.passes),
         views_per_step=plan.views_per_step,
         rng=np.random.default_rng(wishes.seed),
         started=started,
@@ -235,7 +235,7 @@ def _result(outcome: FitOutcome, begun: Begun, problem: Problem, grid: VolumeGri
         plan.reasons["detector_blur"] = describe_blur(float(gaussians.blur), fitted=fitted)
     if plan.curves > 1 and len(gaussians):
         number, tunables = float(gaussians.shared_material[0]), about["settings"]
-        plan.reasons["soft_material"] = describe_soft(number, tunables["soft_u"], tunables["soft_gain"])
+        plan.reasons["soft_material"] = describe_soft(number, plan.soft_u, tunables["soft_gain"])
     with torch.no_grad():
         own = (scene.basis(gaussians) * plan.reference).cpu().numpy()
         heights = gaussians.weights(scene.reference_curve).sum(dim=0)

@@ -77,7 +77,7 @@ class Settings:
     """Per step, of the quaternion; up to seven times as much in a run of fewer than 900 steps."""
     learning_rate_attenuation: float = 1e-2
     learning_rate_material: float = 1e-3
-    """Per step of a run of 300, of material numbers outside metal; in proportion less in a longer one."""
+    """Per step of a run of 300, of material numbers outside metal; less in a longer one, by the root."""
     learning_rate_shared: float = 5e-3
     """Of each piece of metal's one number."""
     blur: float = 0.1

@@ -144,7 +144,7 @@ def test_whether_matter_is_inside_is_looked_up_once_whatever_the_physics(monkeyp
 
     monkeypatch.setattr("tomo_polysplat.fit.problem.matter_is_inside", look)
     problem, device, settings = problem_of(fan(0.0), SPECTRUM), torch.device("cpu"), make_settings()
-    start, _ = problem.start_volume(device)
+    start, _ = problem.start_volume(device, settings)
     for of in (problem, with_fitted(problem, {"scatter": 0.01})):
         plan = make_plan(start, of, settings, "cpu")
         assert of.scene(plan, settings, device).closed and plan.reasons["window"] == "inside"

@@ -76,3 +76,14 @@ def test_what_has_left_a_closed_volume_comes_back_to_its_faces():
     Cloud.position = torch.tensor([[1.5, 0.1, -0.9]])
     replace(scene, closed=False).keep_within(Cloud)
     assert float(Cloud.position[0, 0]) == 1.5
+
+
+@pytest.mark.parametrize("ends, told", [((1.0, 1.0), True), ((1.0, 0.0), False), ((0.0, 0.0), False)])
+def test_an_object_that_reaches_beyond_both_ends_of_the_detector_is_told(ends, told, caplog):
+    """Of a detector that is shifted to one side, one end alone sees matter."""
+    geometry = scanner("cone", columns=5)
+    wide = VolumeGrid((5, 7, 9), [-9, -7, -5], [9, 7, 5])
+    values = torch.ones(geometry.shape)
+    values[:, :, 0], values[:, :, -1] = ends
+    closed, why = matter_is_inside(values, geometry, wide)
+    assert not closed and ("beyond the detector" in why) == told == ("larger" in caplog.text)

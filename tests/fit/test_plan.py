@@ -59,10 +59,10 @@ def plan(of, start, device="cpu", **settings):
 
 
 @pytest.mark.parametrize("density", [0.05, 0.3, 1.0, 2.0, 20.0, 280.0])
-def test_anything_from_foam_to_gold_is_measured_by_water(density, caplog):
+def test_no_matter_from_foam_to_gold_makes_the_unit_look_wrong(density, caplog):
     of = problem(polychromatic=True)
     with caplog.at_level(logging.WARNING):
-        assert plan(of, ball(of, density)).reference == 1.0
+        assert plan(of, ball(of, density)).reference == pytest.approx(1.0 if density < 3 else density)
     assert not caplog.text
 
 
@@ -335,7 +335,8 @@ def test_curves_that_make_no_sense_are_refused(wrong):
 
 def test_seeds_of_one_curve_have_no_material_of_their_own():
     of = problem(polychromatic=True)
-    start = ball(of, 8)
+    start = ball(of, 1)
+    start[5:7, 5:7, 5:7] *= 8
     for curves, free in ((1, False), (3, True)):
         settings = Settings(curves=curves)
         chosen = make_plan(start, of, settings, "cpu")
@@ -361,7 +362,7 @@ def test_metal_is_seen_in_a_start_and_noise_is_not_taken_for_it(views, photons):
         scan = simulate_scan("pins", 20, views, metal=metal, photons=photons)
         values, _ = usable_rays(scan.projections, scan.proj_geom, scan.valid)
         of = Problem.of(values, *from_astra(scan.proj_geom, scan.vol_geom), "cm", scan.spectrum, None)
-        start, _ = of.start_volume(torch.device("cpu"))
+        start, _ = of.start_volume(torch.device("cpu"), Settings())
         assert plan(of, start).curves == curves, (metal, plan(of, start).reasons["curves"])
 
 

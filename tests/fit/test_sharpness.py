@@ -43,7 +43,7 @@ def told(scan, budget=None, **settings):
     """The plan with what is told of a scan's edges, and its seeds."""
     problem = Problem.of(*scan[:3], "cm", None, None)
     device, chosen = torch.device("cpu"), Settings(**settings)
-    start, _ = problem.start_volume(device)
+    start, _ = problem.start_volume(device, chosen)
     plan = make_plan(start, problem, chosen, "cpu")
     scene, rays = problem.scene(plan, chosen, device), problem.rays(plan, chosen, device)
     options = OPTIONS | {"time_budget": budget}

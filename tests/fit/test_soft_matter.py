@@ -38,6 +38,14 @@ def test_of_several_matters_nothing_is_said():
     assert cupping(half, *LEVELS) is None and cupping(bone, *LEVELS) is None
 
 
+def test_a_rim_of_fat_is_no_cupping():
+    z, y, x = np.mgrid[:9, :41, :41] - np.array([4, 20, 20])[:, None, None, None]
+    radius = np.hypot(x, y)
+    # Between fat and tissue voxels hold some of both.
+    torso = np.where(radius < 18, 0.9 + 0.12 * np.clip((16 - radius) / 2, 0, 1), 0.0)
+    assert cupping(torso, *LEVELS) == pytest.approx(0.0, abs=0.004)
+
+
 def test_a_part_of_aluminium_is_not_soft():
     assert cupping(7.0 / 1.1 * cylinder(slope=0.03), LEVELS[0], 20.0) is None
 

@@ -8,7 +8,7 @@ from tomo_polysplat.physics.materials import Materials, mass_attenuation
 from tomo_polysplat.physics.quadrature import fit_quadrature
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.transmission import polychromatic_projection, polychromatic_projection_numpy
-from tomo_polysplat.physics.water import transmitted_energy, water_equivalent, water_linearised
+from tomo_polysplat.physics.water import areal_density, transmitted_energy, water_linearised
 
 SPECTRUM = Spectrum.from_tube(90, filters={"Al": 0.1})
 QUADRATURE = fit_quadrature(SPECTRUM, Materials(), 10.0)
@@ -97,10 +97,10 @@ def test_wrong_input(wrong):
 @pytest.mark.parametrize(
     "spectrum", [SPECTRUM, Spectrum.from_tube(120), Spectrum.monochromatic(60.0)], ids=lambda s: s.label
 )
-def test_water_equivalent_inverts_the_projection(spectrum):
+def test_areal_density_inverts_the_projection(spectrum):
     water = np.concatenate([[0.0], np.geomspace(1e-3, 80.0, 200)])
     transmitted = np.exp(-np.outer(water, mass_attenuation("water", spectrum.energies))) @ spectrum.weights
-    np.testing.assert_allclose(water_equivalent(-np.log(transmitted), spectrum), water, rtol=2e-5, atol=1e-12)
+    np.testing.assert_allclose(areal_density(-np.log(transmitted), spectrum), water, rtol=2e-5, atol=1e-12)
 
 
 def test_water_linearised_is_the_scan_at_the_effective_energy():
@@ -112,20 +112,20 @@ def test_water_linearised_is_the_scan_at_the_effective_energy():
     assert np.abs(measured / expected - 1.0).max() > 0.02  # there was something to correct
 
 
-def test_water_equivalent_of_noise_and_of_bad_pixels():
+def test_areal_density_of_noise_and_of_bad_pixels():
     slope = SPECTRUM.weights @ mass_attenuation("water", SPECTRUM.energies)
-    np.testing.assert_allclose(water_equivalent([-0.2, -0.1], SPECTRUM), np.array([-0.2, -0.1]) / slope)
-    kept = water_equivalent([np.nan, np.inf, 1.0], SPECTRUM)
+    np.testing.assert_allclose(areal_density([-0.2, -0.1], SPECTRUM), np.array([-0.2, -0.1]) / slope)
+    kept = areal_density([np.nan, np.inf, 1.0], SPECTRUM)
     assert np.isnan(kept[0]) and kept[1] == np.inf and np.isfinite(kept[2])
-    assert water_equivalent(np.float32(0.0), SPECTRUM) == 0.0
-    assert water_equivalent(np.zeros((0, 4)), SPECTRUM).shape == (0, 4)
+    assert areal_density(np.float32(0.0), SPECTRUM) == 0.0
+    assert areal_density(np.zeros((0, 4)), SPECTRUM).shape == (0, 4)
 
 
 def test_water_of_a_tensor_is_that_of_an_array():
     values = np.array([[0.3, -0.2, np.nan], [np.inf, 0.0, 7.5]], np.float32)
-    water = water_equivalent(torch.from_numpy(values), SPECTRUM)
+    water = areal_density(torch.from_numpy(values), SPECTRUM)
     assert water.dtype == torch.float32
-    np.testing.assert_allclose(water.numpy(), water_equivalent(values, SPECTRUM), rtol=1e-6)
+    np.testing.assert_allclose(water.numpy(), areal_density(values, SPECTRUM), rtol=1e-6)
     energies = transmitted_energy(values, SPECTRUM), transmitted_energy(torch.from_numpy(values), SPECTRUM)
     assert energies[0] == pytest.approx(energies[1], rel=1e-6)
 

@@ -25,7 +25,7 @@ from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.quadrature import fit_quadrature
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.transmission import polychromatic_projection
-from tomo_polysplat.physics.water import transmitted_energy, water_equivalent
+from tomo_polysplat.physics.water import areal_density, transmitted_energy
 from tomo_polysplat.render.renderer import detector_views
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.settings import Settings, make_settings
@@ -90,7 +90,7 @@ def voxel_poly(
     chosen = settings if isinstance(settings, Settings) else make_settings(changes=dict(settings or {}))
     target = torch.device(device)
     start, _ = initial_volume(
-        (water_equivalent(projections, spectrum) / cm_per(unit)).astype(np.float32),
+        (areal_density(projections, spectrum) / cm_per(unit)).astype(np.float32),
         geometry,
         grid,
         device=device,

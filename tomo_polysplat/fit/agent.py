@@ -37,7 +37,7 @@ _STEPS = 240
 
 def settings_for_agent(
     start: torch.Tensor,
-    reference: float,
+    first: float,
     problem: Problem,
     settings: Settings,
     device: torch.device,
@@ -49,8 +49,8 @@ def settings_for_agent(
     ----------
     start : (nz, ny, nx) tensor
         First reconstruction in the solver's units (``Problem.start_volume``).
-    reference : float
-        Soft reference in g/cm3.
+    first : float
+        The first material's own soft reference in g/cm3.
     problem : Problem
     settings : Settings
         They stay as they are unless a dense material other than the default one was named.
@@ -65,7 +65,7 @@ def settings_for_agent(
     edge = edge_inside(problem.materials.dense, problem.spectrum)
     if edge is None:
         return _metal_as_named(settings, problem.materials)
-    levels = levels_between((start / (problem.depth * reference)).cpu().numpy(), settings.bone_level)
+    levels = levels_between((start / (problem.depth * first)).cpu().numpy(), settings.bone_level)
     if not levels:
         return settings, {}
     choices = [settings] + [

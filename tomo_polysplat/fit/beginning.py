@@ -104,11 +104,11 @@ def begin(
             plan, gaussians = saved.plan, saved.snapshot.gaussians.to(device)
             return Begun(plan, gaussians, *_model(problem, plan, wishes))
         report(0.0, "start volume")
-        start, why = problem.start_volume(device, settings.metal_level)
+        start, why = problem.start_volume(device, settings)
         plan = make_plan(start, problem, settings, device.type)
         scene, rays = _model(problem, plan, wishes)
         report(0.0, "seeds")
-        settings, agent = settings_for_agent(start, plan.reference, problem, settings, device, options)
+        settings, agent = settings_for_agent(start, plan.first, problem, settings, device, options)
         plan.reasons |= {"start": why, **agent}
         plan, gaussians = seeds_for_edges(start, plan, problem, scene, rays, settings, device, options)
     except KeyboardInterrupt:

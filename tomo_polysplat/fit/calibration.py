@@ -140,7 +140,7 @@ def calibrated(
 
     def trial(fitted: Mapping[str, float]) -> ShortFit:
         physics = with_fitted(problem, fitted)
-        start, _ = physics.start_volume(device, settings.metal_level)
+        start, _ = physics.start_volume(device, settings)
         return short_fit(physics, start, dict(fitted), settings, device, seed, time_budget, **steps)
 
     first = best = trial({})

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 import torch
 
@@ -9,12 +11,16 @@ from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 
 __all__ = ["matter_is_inside"]
 
+logger = logging.getLogger(__name__)
+
 # Views, and rows and columns of each, that are looked at.
 _VIEWS, _LINES = 24, 64
 # Fewer rays beside the volume than this share of all say nothing.
 _FEWEST = 0.01
 # Rays beside the volume see nothing when all but this share of them stay below this part of a typical ray.
 _SHARE, _NOTHING = 0.01, 0.1
+# Of the views and rows, the share in which matter reaches both ends of the detector if the object is truncated.
+_MOST = 0.5
 
 
 def matter_is_inside(projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid) -> tuple[bool, str]:
@@ -31,12 +37,30 @@ def matter_is_inside(projections: torch.Tensor, geometry: Geometry, grid: Volume
     values = np.stack([projections[int(view)].cpu().numpy()[np.ix_(rows, columns)] for view in some])
     beside = ~_crosses(geometry.select(some), grid, rows, columns) & np.isfinite(values)
     through = values[~beside & np.isfinite(values)]
+    typical = _typical(through)
     if beside.sum() < max(_FEWEST * values.size, 1) or not len(through):
+        if _truncated(projections, some, rows, typical):
+            logger.warning(
+                "The object reaches beyond the detector on both sides, and few rays pass beside the volume: what lies"
+                " there ends up in the volume, which is too dense towards its border. Make the volume larger."
+            )
+            return False, "not kept within the volume: the object reaches beyond the detector on both sides"
         return False, "not kept within the volume: too few rays pass beside it to say what lies there"
-    typical = float(np.median(through[through >= 0.1 * through.max()])) if through.max() > 0 else 0.0
     if float(np.quantile(values[beside], 1 - _SHARE)) > _NOTHING * typical:
         return False, "not kept within the volume: rays beside it see matter"
     return True, "kept within the volume: rays beside it see nothing"
+
+
+def _typical(values: np.ndarray) -> float:
+    """The median of rays that see something."""
+    top = values.max(initial=0.0)
+    return float(np.median(values[values >= 0.1 * top])) if top > 0 else 0.0
+
+
+def _truncated(projections: torch.Tensor, views: np.ndarray, rows: np.ndarray, typical: float) -> bool:
+    """Whether rays at both ends of the detector's rows see matter in most views."""
+    ends = projections[torch.as_tensor(views), :, :][:, torch.as_tensor(rows)][:, :, [0, -1]].cpu().numpy()
+    return bool((np.nan_to_num(ends).min(axis=-1) > _NOTHING * typical).mean() > _MOST) if typical else False
 
 
 def _crosses(geometry: Geometry, grid: VolumeGrid, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:

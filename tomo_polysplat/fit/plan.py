@@ -1,9 +1,4 @@
-"""What a scene needs, decided from the data before the fit, with the reasons.
-
-Densities and attenuations inside a fit are in units of the scan's *soft reference*: water of 1 g/cm3 for a
-polychromatic model, and the level that holds the middle of the object's mass for a monochromatic one. So the
-same settings serve a scan in any unit.
-"""
+"""What a scene needs, decided from the data before the fit, with the reasons."""
 
 from __future__ import annotations
 
@@ -15,17 +10,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from tomo_polysplat.fit.reference import adapted, soft_reference
 from tomo_polysplat.fit.stopping import patience_of
 from tomo_polysplat.fit.texture import tv_corners
 from tomo_polysplat.model.seed_samples import box_mean, widened
 from tomo_polysplat.physics.detector_blur import describe_blur
 from tomo_polysplat.settings import Settings
-from tomo_polysplat.start.levels import MAIN_SHARE, main_level, mass_level
 
 if TYPE_CHECKING:
     from tomo_polysplat.fit.problem import Problem
 
-__all__ = ["PASSES", "Plan", "finest_spacing", "make_plan", "soft_reference"]
+__all__ = ["PASSES", "Plan", "finest_spacing", "make_plan"]
 
 logger = logging.getLogger(__name__)
 
@@ -62,9 +57,6 @@ _MOST_GAUSSIANS = {"cpu": 60_000, "cuda": 400_000}
 # are better and quicker (128^3, teeth, pins, pancreas: 43.6, 36.6, 40.0 dB in 2.1 s with 450 000 of them, 44.6, 37.6,
 # 40.4 in 1.3 s with 150 000), unless they are few anyway (64^3: 40.9 for 41.8 dB).
 _MOST_PER_SURFACE, _NOT_TOO_MANY = 1.7, 60_000
-# Objects of solid metal are so many times as dense as water at most (rods of silver: 180, of gold: 280): only beyond
-# is the unit of length in doubt.
-_DENSEST = 600.0
 
 
 @dataclass
@@ -73,8 +65,9 @@ class Plan:
 
     Attributes
     ----------
-    reference : float
-        Soft reference: g/cm3, or 1/unit when monochromatic.
+    reference, first, soft_u : float
+        Soft reference, that of the first material, and the reference's material number; see ``fit.reference``: g/cm3,
+        or 1/unit when monochromatic.
     spacing : float
         Distance of the seeds in voxels.
     finer : float
@@ -102,6 +95,8 @@ class Plan:
     """
 
     reference: float
+    first: float
+    soft_u: float
     spacing: float
     finer: float
     smallest_scale: float
@@ -114,6 +109,10 @@ class Plan:
     blurred: bool
     sharp: bool = False
     reasons: dict[str, Any] = field(default_factory=dict)
+
+    def adapted(self, settings: Settings) -> Settings:
+        """The settings with levels and material numbers of what the object is made of; see ``fit.reference``."""
+        return adapted(settings, self.reference, self.first, self.soft_u)
 
 
 def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Settings, device: str) -> Plan:
@@ -128,8 +127,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
         Zero stands for "decide", anything else is taken as it is.
     device : "cpu" or "cuda"
     """
-    reference, level = soft_reference(start, problem)
-    why = _why_reference(reference, level, problem.polychromatic)
+    reference, first, soft_u, why = soft_reference(start, problem, settings)
     least = settings.support_level * reference * problem.depth
     support = int((start > least).sum())
     spacing, finer, because = _seed_spacing(start, least, support, problem, settings, device)
@@ -140,12 +138,25 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     box = settings.tv_box or (_TV_BOX_PLANAR if problem.planar else _TV_BOX[device])
     at_each = problem.planar or (device == "cuda" and box < max(start.shape))
     every = settings.tv_every or (1 if at_each else _TV_EVERY)
-    soft = reference * problem.depth
-    curves, needed = _curves(start, soft, problem.polychromatic, settings)
-    blurred, told = _blurred(start, soft, settings)
-    relative = torch.as_tensor(start) / soft if soft else torch.as_tensor(start)
-    corners, texture = tv_corners(relative, settings, problem.agreement)
-    plan = Plan(reference, spacing, finer, smallest, views, passes, box, every, corners, curves, blurred)
+    curves, needed = _curves(start, first * problem.depth, problem.polychromatic, settings)
+    blurred, told = _blurred(start, first * problem.depth, settings)
+    relative = torch.as_tensor(start) / (reference * problem.depth)
+    corners, texture = tv_corners(relative, adapted(settings, reference, first, soft_u), problem.agreement)
+    plan = Plan(
+        reference,
+        first,
+        soft_u,
+        spacing,
+        finer,
+        smallest,
+        views,
+        passes,
+        box,
+        every,
+        corners,
+        curves,
+        blurred,
+    )
     unit = "g/cm3" if problem.polychromatic else "per unit of length"
     plan.reasons = {
         "model": "polychromatic: a spectrum was given"
@@ -168,31 +179,6 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
         f" out of the fit, have not improved for {patience_of(settings, passes)}",
     }
     return plan
-
-
-def soft_reference(start: np.ndarray | torch.Tensor, problem: Problem) -> tuple[float, float]:
-    """Soft reference in g/cm3, or per unit of length for one energy, and the level of the object's main matter."""
-    if not problem.polychromatic:
-        level = main_level(start) / problem.depth
-        return level or 1.0, level
-    level = mass_level(start) / problem.depth
-    factor = 1000.0 ** round(math.log10(level) / 3) if level > 0 else 1.0
-    return (1.0 if 1 < level <= _DENSEST else factor), level
-
-
-def _why_reference(reference: float, level: float, polychromatic: bool) -> str:
-    if not polychromatic:
-        return f"{MAIN_SHARE:.0%} of the start's mass lies below it, metal not counted"
-    if reference == 1:
-        return f"water: half of the object's mass is at most {level:.3g} times as dense"
-    logger.warning(
-        "The object is as dense as %.3g g/cm3 of water: the unit of length looks wrong by a factor of %g.",
-        level,
-        reference,
-    )
-    return (
-        f"water, with lengths off by a factor of {reference:g}: the object looks {level:.3g} times as dense"
-    )
 
 
 def _curves(

@@ -7,6 +7,8 @@ not depend on how deep it lies. A number too high makes the inside look denser t
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from scipy import ndimage
@@ -24,6 +26,8 @@ _POINTS = 40
 _FROM, _UNTIL = 0.2, 0.8
 # In distances of the points: how far from air and from denser matter the soft one is taken to be itself.
 _RIM, _BESIDE = 1.5, 2.5
+# Points that near to air may hold some.
+_PARTLY_AIR = 1.0
 # In soft references: below it there is air. In units of the soft matter: air lies below the first, denser matter above
 # the second.
 _LEAST = 0.3
@@ -34,12 +38,16 @@ _OTHER = 0.005
 # Of the points inside, the share that must be this close to their median for the matter to be one, and how many there
 # must be, in how many layers of equal depth.
 _ONE, _CLOSE, _FEWEST, _LAYERS = 0.8, 0.1, 200, 6
-# Farthest from its start that the number goes: plastics and oil lie this far below water.
-_REACH = 0.1
+# So many times its standard error a slope must be to be one: where the deepest layer alone is darker, between screws,
+# it is no cupping.
+_CERTAIN = 3.0
+# Farthest from its start that the number goes: plastics and oil lie this far below water, and solids farther from what
+# their attenuation says.
+_REACH, _REACH_OF_SOLIDS = 0.1, 0.2
 # Digits to which a change is rounded: the sums behind it repeat only to rounding on a GPU, and a fit that starts to
 # differ ends a percent apart.
 _DIGITS = 4
-# Own numbers below this belong to soft matter.
+# Own numbers less than this above its number belong to soft matter.
 _SOFT = 0.2
 
 
@@ -69,10 +77,13 @@ def flatten(gaussians: Gaussians, scene: FitScene, settings: Settings, share: fl
     # Less and less, as of any estimate that is averaged over a noisy run (Robbins and Monro 1951).
     gain = settings.soft_gain * (1 - share)
     change = round(gain * (settings.soft_u - float(number) if found is None else -found), _DIGITS)
-    least, most = max(scene.least_u, settings.soft_u - _REACH), settings.soft_u + _REACH
+    reach = _REACH if settings.soft_u < _SOFT else _REACH_OF_SOLIDS
+    least, most = max(scene.least_u, settings.soft_u - reach), min(settings.soft_u + reach, 1.0)
     moved = number.add(change).clamp(least, most)
     own = gaussians.own_material
-    own.copy_(torch.where(own < _SOFT, own + (moved - number), own).clamp(min=scene.least_u))
+    own.copy_(
+        torch.where(own < settings.soft_u + _SOFT, own + (moved - number), own).clamp(scene.least_u, 1.0)
+    )
     number.copy_(moved)
 
 
@@ -115,9 +126,17 @@ def cupping(
         inside &= ndimage.distance_transform_edt(~dense, sampling=apart) > _BESIDE
     if np.count_nonzero(inside) < _FEWEST or depth[inside].max() <= 2 * _RIM:
         return None
-    values, depth = volume[inside] / np.median(volume[inside]), depth[inside]
-    close = np.abs(values - 1) < _CLOSE
-    return _slope(values[close], depth[close] / depth.max()) if close.mean() >= _ONE else None
+    values, deepest = volume / np.median(volume[inside]), depth[inside].max()
+    alike = np.abs(values - 1) < _CLOSE
+    if alike[inside].mean() < _ONE:
+        return None
+    # Points between it and other matter are of neither, and a rim of fat would pass for cupping.
+    other = (depth > _PARTLY_AIR) & (volume < metal_level) & ~alike
+    if other.any():
+        inside &= ndimage.distance_transform_edt(~other, sampling=apart) > _RIM
+    if np.count_nonzero(inside) < _FEWEST:
+        return None
+    return _slope(values[inside], depth[inside] / deepest)
 
 
 def _depth(matter: np.ndarray, sampling: np.ndarray) -> np.ndarray:
@@ -127,10 +146,18 @@ def _depth(matter: np.ndarray, sampling: np.ndarray) -> np.ndarray:
 
 
 def _slope(values: np.ndarray, depth: np.ndarray) -> float:
-    """Slope of the medians of layers of equal depth, which inclusions and what is left of streaks do not pull."""
+    """Slope of the medians of layers of equal depth, which inclusions and what is left of streaks do not pull.
+
+    0 where it is within the error that the medians' distances from a line leave it.
+    """
     layers = np.array_split(np.argsort(depth, kind="stable"), _LAYERS)
-    heights = [float(np.median(values[layer])) for layer in layers]
-    return float(np.polyfit([float(depth[layer].mean()) for layer in layers], heights, 1)[0])
+    heights = np.array([float(np.median(values[layer])) for layer in layers])
+    places = np.array([float(depth[layer].mean()) for layer in layers])
+    apart = places - places.mean()
+    slope = float(apart @ heights / (apart @ apart))
+    left = heights - heights.mean() - slope * apart
+    error = math.sqrt(float(left @ left) / (_LAYERS - 2) / float(apart @ apart))
+    return slope if abs(slope) > _CERTAIN * error else 0.0
 
 
 def describe_soft(number: float, begun_at: float, gain: float) -> str:

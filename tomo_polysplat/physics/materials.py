@@ -230,3 +230,11 @@ class Materials:
         """Shares ``[(1-u)^2, 2u(1-u), u^2]`` of the three curves, ``(3, ...)`` for ``u`` of any shape."""
         u = np.asarray(u, dtype=np.float64)
         return np.stack([(1.0 - u) ** 2, 2.0 * u * (1.0 - u), u**2])
+
+    def mixed(self, u: float) -> Mapping[str, float]:
+        """The material of a number from 0 to 1, as mass fractions of elements."""
+        shares: dict[str, float] = {}
+        for share, material in zip(self.mixture(u), self):
+            for symbol, fraction in composition(material):
+                shares[symbol] = shares.get(symbol, 0.0) + float(share) * fraction
+        return shares

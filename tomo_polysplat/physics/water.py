@@ -1,4 +1,4 @@
-"""Water as the reference material: the inverse of its polychromatic projection, and the water correction."""
+"""A scan as if of one material: the inverse of its polychromatic projection, and the water correction."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import torch
 from tomo_polysplat.checks import require_array
 from tomo_polysplat.parallel import cpu_threads, run_tasks, split_range
 from tomo_polysplat.physics.beer_lambert import shares
-from tomo_polysplat.physics.materials import mass_attenuation
+from tomo_polysplat.physics.materials import MaterialLike, mass_attenuation
 from tomo_polysplat.physics.spectrum import Spectrum
 
-__all__ = ["transmitted_energy", "water_equivalent", "water_linearised"]
+__all__ = ["areal_density", "transmitted_energy", "water_linearised"]
 
 # Nodes of the inverse, and of the table that places them.
 _NODES, _STEPS = 16384, 2048
@@ -22,8 +22,8 @@ _NODES, _STEPS = 16384, 2048
 _CHUNK = 1 << 22
 
 
-def water_equivalent(projections: Any, spectrum: Spectrum) -> Any:
-    """Areal density of water (g/cm2) that gives the measured projection values.
+def areal_density(projections: Any, spectrum: Spectrum, material: MaterialLike = "water") -> Any:
+    """Areal density of a material (g/cm2) that gives the measured projection values.
 
     Parameters
     ----------
@@ -32,6 +32,8 @@ def water_equivalent(projections: Any, spectrum: Spectrum) -> Any:
         its slope at 0, so that noise stays unbiased; NaN and infinity are kept.
     spectrum : Spectrum
         Detected spectrum of the scan.
+    material : str or mapping
+        What the object is taken for: anything ``mass_attenuation`` accepts.
 
     Returns
     -------
@@ -41,16 +43,17 @@ def water_equivalent(projections: Any, spectrum: Spectrum) -> Any:
     """
     if isinstance(projections, torch.Tensor):
         line = projections.reshape(-1)
-        return _inverted(line, spectrum, torch.empty_like(line)).reshape(projections.shape)
+        return _inverted(line, spectrum, material).reshape(projections.shape)
     values = require_array("projections", projections).astype(np.float64)
     flat = torch.from_numpy(values.reshape(-1))
-    return _inverted(flat, spectrum, torch.empty_like(flat)).numpy().reshape(values.shape)
+    return _inverted(flat, spectrum, material).numpy().reshape(values.shape)
 
 
-def _inverted(values: torch.Tensor, spectrum: Spectrum, water: torch.Tensor) -> torch.Tensor:
-    """``water`` filled with the inverse of the curve at ``values``, (n,) both."""
+def _inverted(values: torch.Tensor, spectrum: Spectrum, material: MaterialLike) -> torch.Tensor:
+    """The inverse of the material's curve at ``values``, (n,) both."""
+    density = torch.empty_like(values)
     largest = max((float(values[a:b].nan_to_num(0, 0, 0).max()) for a, b in _chunks(values)), default=0.0)
-    nodes, slope = _inverse(spectrum, max(largest, 1.0))
+    nodes, slope = _inverse(spectrum, max(largest, 1.0), material)
     table = torch.from_numpy(nodes).to(values.device)
     scale = (_NODES - 1) / max(largest, 1.0) ** (1 / 3)
 
@@ -60,57 +63,57 @@ def _inverted(values: torch.Tensor, spectrum: Spectrum, water: torch.Tensor) -> 
         index = place.nan_to_num(0).clamp_(max=_NODES - 2).long()
         left = table[index]
         found = torch.addcmul(left, table[index + 1] - left, place - index)
-        water[first:last] = torch.where(part < 0, part / slope, found)
+        density[first:last] = torch.where(part < 0, part / slope, found)
 
     if values.is_cuda:
         for a, b in _chunks(values):
             look_up(a, b)
     else:
         run_tasks(look_up, split_range(values.numel(), 4 * cpu_threads()))
-    return water
+    return density
 
 
 def _chunks(values: torch.Tensor) -> list[tuple[int, int]]:
     return split_range(values.numel(), -(-values.numel() // _CHUNK)) if values.numel() else []
 
 
-def _inverse(spectrum: Spectrum, largest: float) -> tuple[np.ndarray, float]:
-    """Areal densities of water at evenly spaced cube roots of P up to ``largest``, and dP/dwater at 0."""
-    path_of, slope = _path_of(spectrum, largest)
+def _inverse(spectrum: Spectrum, largest: float, material: MaterialLike) -> tuple[np.ndarray, float]:
+    """Areal densities at evenly spaced cube roots of P up to ``largest``, and dP by areal density at 0."""
+    path_of, slope = _path_of(spectrum, largest, material)
     return path_of(largest * np.linspace(0.0, 1.0, _NODES) ** 3), slope
 
 
-def _path_of(spectrum: Spectrum, largest: float) -> tuple[Callable[[Any], np.ndarray], float]:
-    """The areal density of water by P, from 0 to ``largest``, and dP/dwater at 0."""
+def _path_of(
+    spectrum: Spectrum, largest: float, material: MaterialLike
+) -> tuple[Callable[[Any], np.ndarray], float]:
+    """The areal density by P, from 0 to ``largest``, and dP by areal density at 0."""
     # Not needed where there is no spectrum.
     from scipy.interpolate import CubicHermiteSpline
 
-    log_weights, _, curve = _water_curve(spectrum)
+    log_weights, _, curve = _curve(spectrum, material)
     # P rises at least as fast as at its hardest energy, so this path reaches the largest value. Cubic spacing
     # follows the curve, which bends most at 0 where the soft photons still count.
     paths = largest / curve.min() * np.linspace(0.0, 1.0, _STEPS) ** 3
     value, share = shares(paths[None], log_weights, curve)
-    # Exactly 0 without water, whatever the sum of the weights was rounded to.
+    # Exactly 0 without matter, whatever the sum of the weights was rounded to.
     value[0] = 0.0
     rise = curve[0] @ share
     return CubicHermiteSpline(value, paths, 1 / rise), float(rise[0])
 
 
-def _water_curve(spectrum: Spectrum) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Logarithms of the weights (n,), energies (n,) and mass attenuation of water (1, n), where there are photons."""
+def _curve(spectrum: Spectrum, material: MaterialLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Logarithms of the weights (n,), energies (n,) and mass attenuation (1, n), where there are photons."""
     lit = spectrum.weights > 0
     energies = spectrum.energies[lit]
-    return np.log(spectrum.weights[lit]), energies, mass_attenuation("water", energies)[None]
+    return np.log(spectrum.weights[lit]), energies, mass_attenuation(material, energies)[None]
 
 
 def water_linearised(projections: Any, spectrum: Spectrum) -> np.ndarray:
     """What a monochromatic scan at the effective energy would have measured, were the object water.
 
-    The usual water correction: ``mu_water(E_eff)`` (cm2/g) times ``water_equivalent``. Same shape, float64.
+    The usual water correction: ``mu_water(E_eff)`` (cm2/g) times ``areal_density`` of water. Same shape, float64.
     """
-    return float(mass_attenuation("water", spectrum.effective_energy)) * water_equivalent(
-        projections, spectrum
-    )
+    return float(mass_attenuation("water", spectrum.effective_energy)) * areal_density(projections, spectrum)
 
 
 def transmitted_energy(projections: Any, spectrum: Spectrum) -> float:
@@ -126,6 +129,6 @@ def transmitted_energy(projections: Any, spectrum: Spectrum) -> float:
         return spectrum.effective_energy
     value = max(float(inside.median()), 0.0)
     # Of a range too short, rounding would decide which of two values is the larger.
-    path = _path_of(spectrum, max(value, 1.0))[0](value)
-    log_weights, energies, curve = _water_curve(spectrum)
+    path = _path_of(spectrum, max(value, 1.0), "water")[0](value)
+    log_weights, energies, curve = _curve(spectrum, "water")
     return float(energies @ shares(np.array([path]), log_weights, curve)[1])

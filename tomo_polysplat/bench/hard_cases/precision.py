@@ -78,7 +78,7 @@ def _fit_in(scan: Scan, dtype: torch.dtype) -> np.ndarray:
     geometry, grid = from_astra(scan.proj_geom, scan.vol_geom)
     values = projections_from_astra(scan.projections, scan.proj_geom)
     problem = Problem.of(values.copy(), geometry, grid, "cm", scan.spectrum, None)
-    start, _ = problem.start_volume(target)
+    start, _ = problem.start_volume(target, settings)
     plan = make_plan(start, problem, settings, "cpu")
     scene, rays = problem.scene(plan, settings, target), problem.rays(plan, settings, target)
     seeds = problem.seeds(start, plan, settings, target)

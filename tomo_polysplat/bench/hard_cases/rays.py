@@ -25,7 +25,7 @@ from tomo_polysplat.bench.hard_cases.easy import (
     sound,
 )
 from tomo_polysplat.bench.hard_cases.same import same_volume
-from tomo_polysplat.physics.water import water_equivalent
+from tomo_polysplat.physics.water import areal_density
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.defects import attenuation
 from tomo_polysplat.scan.scan import Scan
@@ -179,7 +179,7 @@ def _bright_lamp(device: str) -> Findings:
     darker = scan.projections - np.float32(0.02)
     fits = [(fit(scan, device, darker, seed=seed), fit(scan, device, seed=seed)) for seed in range(3)]
     shadow = scan.projections[scan.projections > 0.02].astype(np.float64)
-    whole, less = (water_equivalent(values, scan.spectrum).sum() for values in (shadow, shadow - 0.02))
+    whole, less = (areal_density(values, scan.spectrum).sum() for values in (shadow, shadow - 0.02))
     findings = sound(fits[0][0])
     assert scan.truth is not None
     inside = scan.truth > 0.5 * np.median(scan.truth[scan.truth > 0])

@@ -22,7 +22,7 @@ from tomo_polysplat.bench.hard_cases.easy import (
 from tomo_polysplat.bench.hard_cases.same import same_volume
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.physics.spectrum import Spectrum
-from tomo_polysplat.physics.water import water_equivalent
+from tomo_polysplat.physics.water import areal_density
 
 __all__ = ["CASES"]
 
@@ -37,7 +37,7 @@ def _wrong(kvp: float, device: str) -> Findings:
     water = np.abs(soft.truth / float(mass_attenuation("water", tube().effective_energy)) - 1) < 1e-3
     result, right = fit(soft, device, spectrum=wrong), fit(soft, device)
     typical = np.array([np.median(soft.projections[soft.projections > 0.1])])
-    expected = float(water_equivalent(typical, wrong)[0] / water_equivalent(typical, tube())[0]) - 1
+    expected = float(areal_density(typical, wrong)[0] / areal_density(typical, tube())[0]) - 1
     # What the wrong spectrum calls its effective energy is another one: the true one is asked for.
     shown = result.attenuation(tube().effective_energy)
     found = float(np.median(shown[water]) / np.median(right.volume[water])) - 1

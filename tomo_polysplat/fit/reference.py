@@ -1,0 +1,145 @@
+"""What the densities and attenuations of a scan are measured by.
+
+A fit has them in units of its *soft reference*. Under a spectrum that is water of 1 g/cm3 for tissue, plastics and all
+that has something of the kind in it, and the main matter of an object that has nothing so light: a rock, a casting, a
+part of metal. For one energy it is the level of the main matter whatever that is. So what counts as noise, as texture,
+as nothing or as metal is told alike in a scan of any unit and of any matter.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+
+from tomo_polysplat.physics.materials import MaterialLike, Materials, density
+from tomo_polysplat.physics.solids import number_of_solid
+from tomo_polysplat.physics.water import transmitted_energy
+from tomo_polysplat.settings import Settings
+from tomo_polysplat.start.levels import MAIN_SHARE, main_level, mass_level
+
+if TYPE_CHECKING:
+    from tomo_polysplat.fit.problem import Problem
+
+__all__ = ["SoftReference", "adapted", "soft_reference"]
+
+logger = logging.getLogger(__name__)
+
+# Objects of solid metal are so many times as dense as water at most (rods of silver: 180, of gold: 280): only beyond
+# is the unit of length in doubt.
+_DENSEST = 600.0
+# Materials denser than this are named as what an object is made of; others differ from water by less than their density
+# in a scan may.
+_SOLID = 1.5
+# Of its mass the share that an object of nothing but dense matter has below the level of bone: edges, and what noise
+# and streaks make of air.
+_LIGHT = 0.15
+# What is lighter than this share of the level of metal has no need of a reference of its own (aluminium at 150 kV); of
+# what is denser noise and inclusions would pass for metal.
+_NEAR_METAL = 0.6
+# Of an object's dense voxels more than the first share are within the factor of their median, if they are one matter
+# in the main: of rocks and parts, blurred and hardened, 0.68 and more; of a battery, circuit boards, a connector, whose
+# light matter the start hides, 0.54 and less.
+_ONE, _FACTOR = 0.6, 1.5
+# In dense matter metal is told by so many times its density at least: steel in aluminium, pyrite in quartz.
+_METAL = 3.0
+# Material number of main matter that is not the first of curves of which nothing is known.
+_BETWEEN = 0.3
+
+
+class SoftReference(NamedTuple):
+    """The soft reference, in g/cm3 of the first material, or per unit of length for one energy.
+
+    Attributes
+    ----------
+    value : float
+        The reference itself.
+    first : float
+        That of the first material: the reference, unless the object is of denser matter.
+    number : float
+        Material number of what the reference is.
+    why : str
+        In words.
+    """
+
+    value: float
+    first: float
+    number: float
+    why: str
+
+    def adapted(self, settings: Settings) -> Settings:
+        """The settings with levels and material numbers of what the object is made of."""
+        return adapted(settings, self.value, self.first, self.number)
+
+
+def adapted(settings: Settings, value: float, first: float, number: float) -> Settings:
+    """The settings for an object measured by so much, of that material number; see :class:`SoftReference`."""
+    if value == first:
+        return settings
+    metal = max(settings.metal_level * first / value, min(settings.metal_level, _METAL))
+    bone_u, metal_u = max(settings.bone_u, number), max(settings.metal_u, number)
+    return replace(settings, metal_level=metal, soft_u=number, bone_u=bone_u, metal_u=metal_u)
+
+
+def soft_reference(start: np.ndarray | torch.Tensor, problem: Problem, settings: Settings) -> SoftReference:
+    """The soft reference of a start volume in the solver's units (``Problem.start_volume``).
+
+    ``settings.bone_level`` is where dense matter begins, in references of the first material, whose number is
+    ``settings.soft_u``.
+    """
+    volume = torch.as_tensor(start)
+    if problem.spectrum is None or problem.materials is None:
+        value = main_level(volume) / problem.depth or 1.0
+        why = f"{MAIN_SHARE:.0%} of the start's mass lies below it, metal not counted"
+        return SoftReference(value, value, 0.0, why)
+    level = mass_level(volume) / problem.depth
+    first = _first_density(problem.materials.soft, level)
+    level /= first
+    if level > 0 and not 1 < level <= _DENSEST:
+        factor = 1000.0 ** round(math.log10(level) / 3)
+        if factor != 1:
+            return SoftReference(factor * first, factor * first, settings.soft_u, _wrong_unit(factor, level))
+    main = _main_solid(volume / (first * problem.depth), settings)
+    if not main:
+        why = f"soft matter: half of the object's mass is at most {level:.3g} times as dense"
+        return SoftReference(first, first, settings.soft_u, why)
+    value, number = main * first, _BETWEEN
+    if settings.curves == 1:  # The first curve is to do for all there is.
+        number = settings.soft_u
+    elif problem.materials == Materials():
+        number = number_of_solid(value, transmitted_energy(problem.projections, problem.spectrum))
+    why = f"the object's main matter, as there is nothing like soft matter; material number {number:.2f}"
+    return SoftReference(value, first, number, why)
+
+
+def _main_solid(relative: torch.Tensor, settings: Settings) -> float:
+    """Attenuation of the solid that an object is made of, for a volume in that of soft matter; 0 if of none."""
+    matter = relative[relative > 0].double()
+    dense = matter[matter > settings.bone_level]
+    if not len(dense) or dense.sum() < (1 - _LIGHT) * matter.sum():
+        return 0.0
+    level = float(dense.median())
+    alike = float(((dense > level / _FACTOR) & (dense < level * _FACTOR)).double().mean())
+    return level if level > _NEAR_METAL * settings.metal_level and alike > _ONE else 0.0
+
+
+def _first_density(material: MaterialLike, level: float) -> float:
+    """Density in g/cm3 of the first material as soft matter; that of an object mostly of it if nobody knows it."""
+    try:
+        known = density(material) if isinstance(material, str) else level
+    except ValueError:
+        known = level
+    return known if known > _SOLID else 1.0
+
+
+def _wrong_unit(factor: float, level: float) -> str:
+    logger.warning(
+        "The object is as dense as %.3g g/cm3 of water: the unit of length looks wrong by a factor of %g.",
+        level,
+        factor,
+    )
+    return f"water, with lengths off by a factor of {factor:g}: the object looks {level:.3g} times as dense"
