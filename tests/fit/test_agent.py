@@ -8,6 +8,7 @@ import torch
 from small_scans import fan, geometries
 
 from tomo_polysplat.fit.agent import levels_between, settings_for_agent
+from tomo_polysplat.fit.first_volume import first_volume
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.physics.edges import edge_inside
 from tomo_polysplat.physics.spectrum import Spectrum
@@ -52,7 +53,7 @@ def test_short_fits_begin_with_the_start_there_is_and_the_best_is_taken(dense, m
     monkeypatch.setattr("tomo_polysplat.fit.agent.short_fit", fit)
     named = ("water", "bone", dense)
     problem = Problem.of(scan.projections.swapaxes(0, 1), *geometries(scan), "cm", scan.spectrum, named)
-    start, _ = problem.start_volume(device, make_settings())
+    start, _ = first_volume(problem, device, make_settings())
     settings = make_settings()
     options = {"seed": 0, "time_budget": None}
     best, told = settings_for_agent(start, 1.0, problem, settings, device, options)
@@ -71,7 +72,7 @@ def test_metal_that_was_named_starts_as_itself():
     def start_of(dense, settings):
         named = ("water", "aluminium", dense)
         problem = Problem.of(scan.projections.swapaxes(0, 1), *geometries(scan), "cm", scan.spectrum, named)
-        start, _ = problem.start_volume(device, make_settings())
+        start, _ = first_volume(problem, device, make_settings())
         return settings_for_agent(start, 1.0, problem, settings, device, options)
 
     settings, told = start_of("titanium", make_settings())

@@ -9,6 +9,7 @@ from small_scans import geometries, reconstruct
 
 import tomo_polysplat as tps
 from tomo_polysplat.fit.calibration import Calibration, _judge, with_fitted
+from tomo_polysplat.fit.first_volume import first_volume
 from tomo_polysplat.fit.plan import make_plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.short_fit import ShortFit, main_density
@@ -144,7 +145,7 @@ def test_whether_matter_is_inside_is_looked_up_once_whatever_the_physics(monkeyp
 
     monkeypatch.setattr("tomo_polysplat.fit.problem.matter_is_inside", look)
     problem, device, settings = problem_of(fan(0.0), SPECTRUM), torch.device("cpu"), make_settings()
-    start, _ = problem.start_volume(device, settings)
+    start, _ = first_volume(problem, device, settings)
     for of in (problem, with_fitted(problem, {"scatter": 0.01})):
         plan = make_plan(start, of, settings, "cpu")
         assert of.scene(plan, settings, device).closed and plan.reasons["window"] == "inside"

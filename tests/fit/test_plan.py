@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from tomo_polysplat.fit.first_volume import first_volume
 from tomo_polysplat.fit.plan import make_plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.physics.materials import Materials
@@ -362,7 +363,7 @@ def test_metal_is_seen_in_a_start_and_noise_is_not_taken_for_it(views, photons):
         scan = simulate_scan("pins", 20, views, metal=metal, photons=photons)
         values, _ = usable_rays(scan.projections, scan.proj_geom, scan.valid)
         of = Problem.of(values, *from_astra(scan.proj_geom, scan.vol_geom), "cm", scan.spectrum, None)
-        start, _ = of.start_volume(torch.device("cpu"), Settings())
+        start, _ = first_volume(of, torch.device("cpu"), Settings())
         assert plan(of, start).curves == curves, (metal, plan(of, start).reasons["curves"])
 
 

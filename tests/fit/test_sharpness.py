@@ -6,6 +6,7 @@ import torch
 from scipy import ndimage
 
 from tomo_polysplat import reconstruct
+from tomo_polysplat.fit.first_volume import first_volume
 from tomo_polysplat.fit.plan import make_plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.sharpness import seeds_for_edges
@@ -43,7 +44,7 @@ def told(scan, budget=None, **settings):
     """The plan with what is told of a scan's edges, and its seeds."""
     problem = Problem.of(*scan[:3], "cm", None, None)
     device, chosen = torch.device("cpu"), Settings(**settings)
-    start, _ = problem.start_volume(device, chosen)
+    start, _ = first_volume(problem, device, chosen)
     plan = make_plan(start, problem, chosen, "cpu")
     scene, rays = problem.scene(plan, chosen, device), problem.rays(plan, chosen, device)
     options = OPTIONS | {"time_budget": budget}

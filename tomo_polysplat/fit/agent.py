@@ -48,7 +48,7 @@ def settings_for_agent(
     Parameters
     ----------
     start : (nz, ny, nx) tensor
-        First reconstruction in the solver's units (``Problem.start_volume``).
+        First reconstruction in the solver's units (``fit.first_volume``).
     first : float
         The first material's own soft reference in g/cm3.
     problem : Problem

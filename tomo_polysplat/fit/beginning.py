@@ -12,6 +12,7 @@ from tomo_polysplat.checks import fail, require_number
 from tomo_polysplat.fit.agent import settings_for_agent
 from tomo_polysplat.fit.calibration import Calibration, calibrated, with_fitted
 from tomo_polysplat.fit.checkpoint import Checkpoint
+from tomo_polysplat.fit.first_volume import first_volume
 from tomo_polysplat.fit.plan import Plan, make_plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays
@@ -104,7 +105,7 @@ def begin(
             plan, gaussians = saved.plan, saved.snapshot.gaussians.to(device)
             return Begun(plan, gaussians, *_model(problem, plan, wishes))
         report(0.0, "start volume")
-        start, why = problem.start_volume(device, settings)
+        start, why = first_volume(problem, device, settings)
         plan = make_plan(start, problem, settings, device.type)
         scene, rays = _model(problem, plan, wishes)
         report(0.0, "seeds")

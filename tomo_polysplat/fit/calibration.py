@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.checks import fail, require_choice, require_number
+from tomo_polysplat.fit.first_volume import first_volume
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.short_fit import ShortFit, short_fit
 from tomo_polysplat.physics.ray_estimates import estimate_scatter, matching_factor
@@ -140,7 +141,7 @@ def calibrated(
 
     def trial(fitted: Mapping[str, float]) -> ShortFit:
         physics = with_fitted(problem, fitted)
-        start, _ = physics.start_volume(device, settings)
+        start, _ = first_volume(physics, device, settings)
         return short_fit(physics, start, dict(fitted), settings, device, seed, time_budget, **steps)
 
     first = best = trial({})

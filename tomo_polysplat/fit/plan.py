@@ -121,7 +121,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     Parameters
     ----------
     start : (nz, ny, nx) array or tensor
-        First reconstruction in the solver's units (``Problem.start_volume``).
+        First reconstruction in the solver's units (``fit.first_volume``).
     problem : Problem
     settings : Settings
         Zero stands for "decide", anything else is taken as it is.

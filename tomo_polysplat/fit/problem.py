@@ -22,25 +22,22 @@ from tomo_polysplat.fit.noise import photons_per_ray
 from tomo_polysplat.fit.plan import Plan, finest_spacing
 from tomo_polysplat.fit.plan_costs import alternatives, work
 from tomo_polysplat.fit.rays import Rays
-from tomo_polysplat.fit.reference import soft_reference
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.kernels import select
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.model.seed import seed_gaussians
 from tomo_polysplat.physics.material_range import LEAST_U, least_material_number
-from tomo_polysplat.physics.materials import Materials, mass_attenuation
+from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.quadrature import Quadrature, fit_quadrature
 from tomo_polysplat.physics.scatter import add_scatter, without_scatter
 from tomo_polysplat.physics.spectrum import Spectrum
-from tomo_polysplat.physics.water import areal_density, transmitted_energy
+from tomo_polysplat.physics.water import transmitted_energy
 from tomo_polysplat.render.renderer import detector_views, voxel_box
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.scan.snapped import snapped_geometry, snapped_grid
 from tomo_polysplat.scan.view_order import view_order
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.agreement import halves_agree
-from tomo_polysplat.start.bridged import bridged_start
-from tomo_polysplat.start.initial import initial_volume_on
 from tomo_polysplat.units import LENGTH_UNITS, cm_per
 
 __all__ = ["Problem"]
@@ -51,8 +48,6 @@ logger = logging.getLogger(__name__)
 _LARGEST_PROJECTION = 15.0
 # And to this at least: a scan of nothing has no range.
 _LEAST_PROJECTION = 1e-3
-# An object of one solid looks too light as long as it is taken for water, and less so each time it is looked at.
-_TIMES_AS_SOLID = 2
 
 
 @dataclass
@@ -156,34 +151,6 @@ class Problem:
         per_gram = self.materials.mass_attenuation([self.spectrum.effective_energy])[0, 0]
         return float(per_gram) * self.depth / self.length
 
-    def start_volume(self, device: torch.device, settings: Settings) -> tuple[torch.Tensor, str]:
-        """First reconstruction, and how it was made: ``depth`` times g/cm3 of the first material or an attenuation.
-
-        Rays through what shows as metal are bridged where that helps.
-        """
-        primary = self._primary(device)
-        values = self._as_if_of(primary, 0.0)
-        volume, done = initial_volume_on(values, self.geometry, self.grid)
-        reference = soft_reference(volume, self, settings)
-        for _ in range(_TIMES_AS_SOLID if reference.number else 0):
-            values = self._as_if_of(primary, reference.number)
-            volume, done = initial_volume_on(values, self.geometry, self.grid)
-            reference = soft_reference(volume, self, settings)
-        metal = reference.adapted(settings).metal_level * self.depth * reference.value
-        volume, bridged = bridged_start(values, volume, done["method"], self.geometry, self.grid, metal=metal)
-        return volume, f"{done['method'].upper()}: {done['reason']}{bridged}"
-
-    def _as_if_of(self, primary: torch.Tensor, number: float) -> torch.Tensor:
-        """Line integrals, were the object all of one material number: of the first curve's density, or attenuation."""
-        if self.spectrum is None or self.materials is None:
-            return primary
-        if not number:
-            return areal_density(primary, self.spectrum, self.materials.soft)
-        solid = self.materials.mixed(number)
-        energy = [transmitted_energy(primary, self.spectrum)]
-        ratio = mass_attenuation(solid, energy) / mass_attenuation(self.materials.soft, energy)
-        return areal_density(primary, self.spectrum, solid) * float(ratio[0])
-
     def measured(self, device: torch.device) -> torch.Tensor:
         """The projections on a device, copied there once; on the host where they do not fit there."""
         copies = self._known.copies
@@ -239,7 +206,7 @@ class Problem:
             plan.smallest_scale,
         )
 
-    def _primary(self, device: torch.device) -> torch.Tensor:
+    def primary(self, device: torch.device) -> torch.Tensor:
         """The projections as they would be without scatter, on a device."""
         if not self.scatter:
             return self.measured(device)
@@ -253,7 +220,7 @@ class Problem:
         spectrum, materials = self.spectrum, self.materials
         if spectrum is None or materials is None:
             return None, None, None, LEAST_U
-        primary = self._primary(device)
+        primary = self.primary(device)
         most = float(primary.nan_to_num(nan=-math.inf).max())
         # Mixtures of three curves are told apart by more than what thin rays use of them.
         largest = min(max(most, 1.0 if plan.curves > 1 else _LEAST_PROJECTION), _LARGEST_PROJECTION)

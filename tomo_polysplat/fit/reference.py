@@ -35,6 +35,8 @@ _DENSEST = 600.0
 # Materials denser than this are named as what an object is made of; others differ from water by less than their density
 # in a scan may.
 _SOLID = 1.5
+# Views that tell the energy of what is transmitted.
+_VIEWS = 24
 # Of its mass the share that an object of nothing but dense matter has below the level of bone: edges, and what noise
 # and streaks make of air.
 _LIGHT = 0.15
@@ -86,7 +88,7 @@ def adapted(settings: Settings, value: float, first: float, number: float) -> Se
 
 
 def soft_reference(start: np.ndarray | torch.Tensor, problem: Problem, settings: Settings) -> SoftReference:
-    """The soft reference of a start volume in the solver's units (``Problem.start_volume``).
+    """The soft reference of a start volume in the solver's units (``fit.first_volume``).
 
     ``settings.bone_level`` is where dense matter begins, in references of the first material, whose number is
     ``settings.soft_u``.
@@ -111,7 +113,8 @@ def soft_reference(start: np.ndarray | torch.Tensor, problem: Problem, settings:
     if settings.curves == 1:  # The first curve is to do for all there is.
         number = settings.soft_u
     elif problem.materials == Materials():
-        number = number_of_solid(value, transmitted_energy(problem.projections, problem.spectrum))
+        some = problem.projections[:: -(-len(problem.projections) // _VIEWS)]
+        number = number_of_solid(value, transmitted_energy(some, problem.spectrum))
     why = f"the object's main matter, as there is nothing like soft matter; material number {number:.2f}"
     return SoftReference(value, first, number, why)
 

@@ -61,7 +61,7 @@ def seeds_for_edges(
     Parameters
     ----------
     start : (nz, ny, nx) tensor
-        First reconstruction in the solver's units (``Problem.start_volume``).
+        First reconstruction in the solver's units (``fit.first_volume``).
     plan : Plan
         Its ``sharp`` is not looked at.
     problem : Problem

@@ -21,6 +21,7 @@ from tomo_polysplat.bench.hard_cases.easy import (
 )
 from tomo_polysplat.bench.hard_cases.gaussians import compare_precisions
 from tomo_polysplat.bench.hard_cases.same import relative_rms
+from tomo_polysplat.fit.first_volume import first_volume
 from tomo_polysplat.fit.optimise import fit as optimise
 from tomo_polysplat.fit.plan import make_plan
 from tomo_polysplat.fit.problem import Problem
@@ -78,7 +79,7 @@ def _fit_in(scan: Scan, dtype: torch.dtype) -> np.ndarray:
     geometry, grid = from_astra(scan.proj_geom, scan.vol_geom)
     values = projections_from_astra(scan.projections, scan.proj_geom)
     problem = Problem.of(values.copy(), geometry, grid, "cm", scan.spectrum, None)
-    start, _ = problem.start_volume(target, settings)
+    start, _ = first_volume(problem, target, settings)
     plan = make_plan(start, problem, settings, "cpu")
     scene, rays = problem.scene(plan, settings, target), problem.rays(plan, settings, target)
     seeds = problem.seeds(start, plan, settings, target)
