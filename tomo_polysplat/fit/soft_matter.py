@@ -26,8 +26,6 @@ _POINTS = 40
 _FROM, _UNTIL = 0.2, 0.8
 # In distances of the points: how far from air and from denser matter the soft one is taken to be itself.
 _RIM, _BESIDE = 1.5, 2.5
-# Points that near to air may hold some.
-_PARTLY_AIR = 1.0
 # In soft references: below it there is air. In units of the soft matter: air lies below the first, denser matter above
 # the second.
 _LEAST = 0.3
@@ -38,8 +36,8 @@ _OTHER = 0.005
 # Of the points inside, the share that must be this close to their median for the matter to be one, and how many there
 # must be, in how many layers of equal depth.
 _ONE, _CLOSE, _FEWEST, _LAYERS = 0.8, 0.1, 200, 6
-# So many times its standard error a slope must be to be one: where the deepest layer alone is darker, between screws,
-# it is no cupping.
+# So many times its standard error the first slope must be for the number to leave where it began: where the deepest
+# layer alone is darker, between screws, that is no cupping. Later slopes bring it back as well.
 _CERTAIN = 3.0
 # Farthest from its start that the number goes: plastics and oil lie this far below water, and solids farther from what
 # their attenuation says.
@@ -47,6 +45,8 @@ _REACH, _REACH_OF_SOLIDS = 0.1, 0.2
 # Digits to which a change is rounded: the sums behind it repeat only to rounding on a GPU, and a fit that starts to
 # differ ends a percent apart.
 _DIGITS = 4
+# A number closer than this to where it began has not left it.
+_ROUNDING = 1e-6
 # Own numbers less than this above its number belong to soft matter.
 _SOFT = 0.2
 
@@ -74,9 +74,12 @@ def flatten(gaussians: Gaussians, scene: FitScene, settings: Settings, share: fl
     volume = scene.attenuation(gaussians, box).cpu().numpy()
     found = cupping(volume, settings.bone_level, settings.metal_level, sampling)
     number = gaussians.shared_material[0]
+    away = settings.soft_u - float(number)
+    if found is not None and abs(away) < _ROUNDING and abs(found[0]) < _CERTAIN * found[1]:
+        return
     # Less and less, as of any estimate that is averaged over a noisy run (Robbins and Monro 1951).
     gain = settings.soft_gain * (1 - share)
-    change = round(gain * (settings.soft_u - float(number) if found is None else -found), _DIGITS)
+    change = round(gain * (away if found is None else -found[0]), _DIGITS)
     reach = _REACH if settings.soft_u < _SOFT else _REACH_OF_SOLIDS
     least, most = max(scene.least_u, settings.soft_u - reach), min(settings.soft_u + reach, 1.0)
     moved = number.add(change).clamp(least, most)
@@ -89,7 +92,7 @@ def flatten(gaussians: Gaussians, scene: FitScene, settings: Settings, share: fl
 
 def cupping(
     attenuation: np.ndarray, bone_level: float, metal_level: float, sampling: np.ndarray | None = None
-) -> float | None:
+) -> tuple[float, float] | None:
     """By what share homogeneous matter is brighter at its deepest than at its rim.
 
     Parameters
@@ -103,8 +106,9 @@ def cupping(
 
     Returns
     -------
-    float or None
-        None where the object is not mostly one matter, is too small to tell, or nowhere ends in air.
+    (float, float) or None
+        The share and its standard error; None where the object is not mostly one matter, is too small to tell, or
+        nowhere ends in air.
     """
     volume = attenuation[0] if attenuation.shape[0] == 1 else attenuation
     apart = (np.ones(3) if sampling is None else sampling)[-volume.ndim :]
@@ -126,17 +130,9 @@ def cupping(
         inside &= ndimage.distance_transform_edt(~dense, sampling=apart) > _BESIDE
     if np.count_nonzero(inside) < _FEWEST or depth[inside].max() <= 2 * _RIM:
         return None
-    values, deepest = volume / np.median(volume[inside]), depth[inside].max()
-    alike = np.abs(values - 1) < _CLOSE
-    if alike[inside].mean() < _ONE:
-        return None
-    # Points between it and other matter are of neither, and a rim of fat would pass for cupping.
-    other = (depth > _PARTLY_AIR) & (volume < metal_level) & ~alike
-    if other.any():
-        inside &= ndimage.distance_transform_edt(~other, sampling=apart) > _RIM
-    if np.count_nonzero(inside) < _FEWEST:
-        return None
-    return _slope(values[inside], depth[inside] / deepest)
+    values, depth = volume[inside] / np.median(volume[inside]), depth[inside]
+    close = np.abs(values - 1) < _CLOSE
+    return _slope(values[close], depth[close] / depth.max()) if close.mean() >= _ONE else None
 
 
 def _depth(matter: np.ndarray, sampling: np.ndarray) -> np.ndarray:
@@ -145,10 +141,10 @@ def _depth(matter: np.ndarray, sampling: np.ndarray) -> np.ndarray:
     return wide[(slice(1, -1),) * matter.ndim]
 
 
-def _slope(values: np.ndarray, depth: np.ndarray) -> float:
+def _slope(values: np.ndarray, depth: np.ndarray) -> tuple[float, float]:
     """Slope of the medians of layers of equal depth, which inclusions and what is left of streaks do not pull.
 
-    0 where it is within the error that the medians' distances from a line leave it.
+    With the standard error that the medians' distances from a line leave it.
     """
     layers = np.array_split(np.argsort(depth, kind="stable"), _LAYERS)
     heights = np.array([float(np.median(values[layer])) for layer in layers])
@@ -156,8 +152,7 @@ def _slope(values: np.ndarray, depth: np.ndarray) -> float:
     apart = places - places.mean()
     slope = float(apart @ heights / (apart @ apart))
     left = heights - heights.mean() - slope * apart
-    error = math.sqrt(float(left @ left) / (_LAYERS - 2) / float(apart @ apart))
-    return slope if abs(slope) > _CERTAIN * error else 0.0
+    return slope, math.sqrt(float(left @ left) / (_LAYERS - 2) / float(apart @ apart))
 
 
 def describe_soft(number: float, begun_at: float, gain: float) -> str:
