@@ -57,6 +57,11 @@ def test_a_solid_is_measured_by_itself(level):
     assert changed.soft_u == found.number <= min(changed.bone_u, changed.metal_u)
 
 
+def test_a_number_that_is_asked_for_is_that_of_the_solid():
+    assert of(ball(9.0), soft_u=0.5).number == 0.5
+    assert of(ball(9.0), curves=1).number == 0.0
+
+
 def test_soft_matter_beside_it_and_several_solids_leave_water():
     level = ball(9.0)
     half = level.copy()

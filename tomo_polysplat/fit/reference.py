@@ -110,7 +110,7 @@ def soft_reference(start: np.ndarray | torch.Tensor, problem: Problem, settings:
         why = f"soft matter: half of the object's mass is at most {level:.3g} times as dense"
         return SoftReference(first, first, settings.soft_u, why)
     value, number = main * first, _BETWEEN
-    if settings.curves == 1:  # The first curve is to do for all there is.
+    if settings.soft_u or settings.curves == 1:  # Asked for, or the first curve is to do for all there is.
         number = settings.soft_u
     elif problem.materials == Materials():
         some = problem.projections[:: -(-len(problem.projections) // _VIEWS)]
