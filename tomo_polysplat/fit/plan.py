@@ -127,7 +127,8 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
         Zero stands for "decide", anything else is taken as it is.
     device : "cpu" or "cuda"
     """
-    reference, first, soft_u, why = soft_reference(start, problem, settings)
+    matter = soft_reference(start, problem, settings)
+    reference, first, soft_u, why = matter
     least = settings.support_level * reference * problem.depth
     support = int((start > least).sum())
     spacing, finer, because = _seed_spacing(start, least, support, problem, settings, device)
@@ -141,7 +142,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     curves, needed = _curves(start, first * problem.depth, problem.polychromatic, settings)
     blurred, told = _blurred(start, first * problem.depth, settings)
     relative = torch.as_tensor(start) / (reference * problem.depth)
-    corners, texture = tv_corners(relative, adapted(settings, reference, first, soft_u), problem.agreement)
+    corners, texture = tv_corners(relative, matter.adapted(settings), problem.agreement)
     plan = Plan(
         reference,
         first,
