@@ -57,7 +57,7 @@ class Settings:
     bone_level: float = 2.2
     """Start attenuation, in soft references, above which matter is bone-like, and material numbers are free near it."""
     metal_level: float = 6.0
-    """The same for metal."""
+    """The same for metal, which in an object of one solid is three times as dense as that at least."""
     metal_rim: float = 0.0
     """Level down to which what is connected to metal belongs to it; 0: ``metal_level`` itself."""
     soft_u: float = 0.0

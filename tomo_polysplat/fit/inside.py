@@ -59,7 +59,7 @@ def _typical(values: np.ndarray) -> float:
 
 def _truncated(projections: torch.Tensor, views: np.ndarray, rows: np.ndarray, typical: float) -> bool:
     """Whether rays at both ends of the detector's rows see matter in most views."""
-    ends = projections[torch.as_tensor(views), :, :][:, torch.as_tensor(rows)][:, :, [0, -1]].cpu().numpy()
+    ends = projections[:, :, [0, -1]].cpu().numpy()[np.ix_(views, rows)]
     return bool((np.nan_to_num(ends).min(axis=-1) > _NOTHING * typical).mean() > _MOST) if typical else False
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.reference import adapted, soft_reference
+from tomo_polysplat.fit.reference import SoftReference, soft_reference
 from tomo_polysplat.fit.stopping import patience_of
 from tomo_polysplat.fit.texture import tv_corners
 from tomo_polysplat.model.seed_samples import box_mean, widened
@@ -112,7 +112,7 @@ class Plan:
 
     def adapted(self, settings: Settings) -> Settings:
         """The settings with levels and material numbers of what the object is made of; see ``fit.reference``."""
-        return adapted(settings, self.reference, self.first, self.soft_u)
+        return SoftReference(self.reference, self.first, self.soft_u).adapted(settings)
 
 
 def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Settings, device: str) -> Plan:
@@ -128,7 +128,9 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     device : "cpu" or "cuda"
     """
     matter = soft_reference(start, problem, settings)
-    reference, first, soft_u, why = matter
+    reference, first = matter.value, matter.first
+    if matter.wrong_unit:
+        logger.warning("The unit of length looks wrong; densities are measured by %s.", matter.why)
     least = settings.support_level * reference * problem.depth
     support = int((start > least).sum())
     spacing, finer, because = _seed_spacing(start, least, support, problem, settings, device)
@@ -146,7 +148,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     plan = Plan(
         reference,
         first,
-        soft_u,
+        matter.number,
         spacing,
         finer,
         smallest,
@@ -167,7 +169,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
         "dimensions": "2D Gaussians: one row and one slice in one plane"
         if problem.planar
         else "3D Gaussians: several rows or slices, or rays that leave the plane",
-        "soft_reference": f"{reference:.4g} {unit}: {why}",
+        "soft_reference": f"{reference:.4g} {unit}: {matter.why}",
         "support": f"{support} of {math.prod(start.shape)} voxels"
         f" hold more than {settings.support_level:g} soft references",
         "seed_spacing_voxels": f"{spacing:.2f}: {because}",

@@ -8,7 +8,6 @@ as nothing or as metal is told alike in a scan of any unit and of any matter.
 
 from __future__ import annotations
 
-import logging
 import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -25,9 +24,7 @@ from tomo_polysplat.start.levels import MAIN_SHARE, main_level, mass_level
 if TYPE_CHECKING:
     from tomo_polysplat.fit.problem import Problem
 
-__all__ = ["SoftReference", "adapted", "soft_reference"]
-
-logger = logging.getLogger(__name__)
+__all__ = ["SoftReference", "soft_reference"]
 
 # Objects of solid metal are so many times as dense as water at most (rods of silver: 180, of gold: 280): only beyond
 # is the unit of length in doubt.
@@ -66,25 +63,23 @@ class SoftReference(NamedTuple):
         Material number of what the reference is.
     why : str
         In words.
+    wrong_unit : bool
+        Whether the unit of length looks wrong.
     """
 
     value: float
     first: float
     number: float
-    why: str
+    why: str = ""
+    wrong_unit: bool = False
 
     def adapted(self, settings: Settings) -> Settings:
         """The settings with levels and material numbers of what the object is made of."""
-        return adapted(settings, self.value, self.first, self.number)
-
-
-def adapted(settings: Settings, value: float, first: float, number: float) -> Settings:
-    """The settings for an object measured by so much, of that material number; see :class:`SoftReference`."""
-    if value == first:
-        return settings
-    metal = max(settings.metal_level * first / value, min(settings.metal_level, _METAL))
-    bone_u, metal_u = max(settings.bone_u, number), max(settings.metal_u, number)
-    return replace(settings, metal_level=metal, soft_u=number, bone_u=bone_u, metal_u=metal_u)
+        if self.value == self.first:
+            return settings
+        metal = max(settings.metal_level * self.first / self.value, min(settings.metal_level, _METAL))
+        bone_u, metal_u = max(settings.bone_u, self.number), max(settings.metal_u, self.number)
+        return replace(settings, metal_level=metal, soft_u=self.number, bone_u=bone_u, metal_u=metal_u)
 
 
 def soft_reference(start: np.ndarray | torch.Tensor, problem: Problem, settings: Settings) -> SoftReference:
@@ -104,7 +99,8 @@ def soft_reference(start: np.ndarray | torch.Tensor, problem: Problem, settings:
     if level > 0 and not 1 < level <= _DENSEST:
         factor = 1000.0 ** round(math.log10(level) / 3)
         if factor != 1:
-            return SoftReference(factor * first, factor * first, settings.soft_u, _wrong_unit(factor, level))
+            why = f"water, with lengths off by a factor of {factor:g}: the object looks {level:.3g} times as dense"
+            return SoftReference(factor * first, factor * first, settings.soft_u, why, wrong_unit=True)
     main = _main_solid(volume / (first * problem.depth), settings)
     if not main:
         why = f"soft matter: half of the object's mass is at most {level:.3g} times as dense"
@@ -137,12 +133,3 @@ def _first_density(material: MaterialLike, level: float) -> float:
     except ValueError:
         known = level
     return known if known > _SOLID else 1.0
-
-
-def _wrong_unit(factor: float, level: float) -> str:
-    logger.warning(
-        "The object is as dense as %.3g g/cm3 of water: the unit of length looks wrong by a factor of %g.",
-        level,
-        factor,
-    )
-    return f"water, with lengths off by a factor of {factor:g}: the object looks {level:.3g} times as dense"

@@ -147,12 +147,9 @@ def _slope(values: np.ndarray, depth: np.ndarray) -> tuple[float, float]:
     With the standard error that the medians' distances from a line leave it.
     """
     layers = np.array_split(np.argsort(depth, kind="stable"), _LAYERS)
-    heights = np.array([float(np.median(values[layer])) for layer in layers])
-    places = np.array([float(depth[layer].mean()) for layer in layers])
-    apart = places - places.mean()
-    slope = float(apart @ heights / (apart @ apart))
-    left = heights - heights.mean() - slope * apart
-    return slope, math.sqrt(float(left @ left) / (_LAYERS - 2) / float(apart @ apart))
+    heights = [float(np.median(values[layer])) for layer in layers]
+    line, covariance = np.polyfit([float(depth[layer].mean()) for layer in layers], heights, 1, cov=True)
+    return float(line[0]), math.sqrt(covariance[0, 0])
 
 
 def describe_soft(number: float, begun_at: float, gain: float) -> str:
