@@ -192,9 +192,9 @@ class FusedStep:
         views, cutoff, channels = self._views, self.scene.cutoff, len(weight)
         drawn = (position, scale, rotation, weight)
         record = footprints(*drawn, views, table, cutoff, self._skipped)
-        largest, beyond = self._largest[0], rays_backward.beyond(views)
+        largest = self._largest[0]
         image = rays_forward.splat(record, channels, views, cutoff, largest)
-        seen = Splat(image, table, chosen, views, self._measurement, self._sums, largest, beyond)
+        seen = Splat(image, table, chosen, views, self._measurement, self._sums, largest)
         if self.scene.blurring:
             pixels = blurred_misfit_gradient(seen, self.gaussians.blur, self._grad_blur)
         else:

@@ -17,6 +17,8 @@ __all__ = [
     "add_four",
     "add_halves",
     "adds_four",
+    "by_size",
+    "from_lane",
     "lane_set",
     "load_four",
     "lowest_lane",
@@ -24,6 +26,7 @@ __all__ = [
     "store_four",
     "store_sums",
     "two_lowest",
+    "widest",
 ]
 
 SUMS = tl.constexpr(16)  # tensors that store_sums takes
@@ -81,48 +84,106 @@ def add_four(at, a, b, c, d, live, AT_ONCE: tl.constexpr):
         tl.atomic_add(at + 3, d, mask=live, sem="relaxed")
 
 
-def _butterfly() -> str:
-    """PTX that adds up 16 numbers over each four neighbouring lanes: lane l gets the sums of numbers 4 (l % 4) on.
+def _butterfly(lanes: int) -> str:
+    """PTX that adds up 16 numbers over neighbouring ``lanes``: each gets as many of the sums, in their order.
 
     In every step a lane hands half of its numbers to its partner and takes the partner's share of the other
-    half, so that 12 exchanges do what 32 would do one number at a time.
+    half: for four lanes 12 exchanges do what 32 would do one number at a time.
     """
     registers = ", ".join(f"v{k}" for k in range(SUMS.value))
     lines = [
         f"{{ .reg .pred p; .reg .b32 lane, bit; .reg .f32 give, keep, {registers}; mov.u32 lane, %laneid;"
     ]
-    lines += [f"mov.f32 v{k}, ${k + 4};" for k in range(SUMS.value)]
-    for half, partner in ((8, 2), (4, 1)):
+    half, partner = SUMS.value, lanes
+    lines += [f"mov.f32 v{k}, ${k + half // lanes};" for k in range(half)]
+    while partner > 1:
+        half, partner = half // 2, partner // 2
         lines.append(f"and.b32 bit, lane, {partner}; setp.ne.u32 p, bit, 0;")
         for k in range(half):
             lines.append(f"selp.f32 give, v{k}, v{k + half}, p; selp.f32 keep, v{k + half}, v{k}, p;")
             lines.append(f"shfl.sync.bfly.b32 give, give, {partner}, 31, -1; add.f32 v{k}, keep, give;")
-    return " ".join([*lines, *(f"mov.f32 ${k}, v{k};" for k in range(4)), "}"])
+    return " ".join([*lines, *(f"mov.f32 ${k}, v{k};" for k in range(half)), "}"])
 
 
-_BUTTERFLY = tl.constexpr(_butterfly())
-_BUTTERFLY_TYPES = tl.constexpr(",".join(["=f"] * 4 + ["f"] * SUMS.value))
+def _butterfly_types(lanes: int) -> str:
+    return ",".join(["=f"] * (SUMS.value // lanes) + ["f"] * SUMS.value)
+
+
+_OVER_TWO, _OVER_FOUR = tl.constexpr(_butterfly(2)), tl.constexpr(_butterfly(4))
+_TYPES_OF_TWO, _TYPES_OF_FOUR = tl.constexpr(_butterfly_types(2)), tl.constexpr(_butterfly_types(4))
 
 
 @triton.jit
-def store_sums(at, live, lane, v0, v1, v2, v3, v4, v5, v6, v7, v8, v9, v10, v11, v12, v13, v14, v15):
-    """Store at ``at``, where ``live``, the 16 numbers summed over four neighbouring lanes of a one-warp program.
+def store_sums(
+    at, live, lane, v0, v1, v2, v3, v4, v5, v6, v7, v8, v9, v10, v11, v12, v13, v14, v15, LANES: tl.constexpr
+):
+    """Store at ``at``, where ``live``, the 16 numbers summed over 2 or 4 neighbouring LANES of a one-warp program.
 
-    The four lanes have one ``at``, 16-byte aligned.
+    These lanes have one ``at``, 16-byte aligned.
     """
     if _INTERPRETED:
         values = (v0, v1, v2, v3, v4, v5, v6, v7, v8, v9, v10, v11, v12, v13, v14, v15)
         for k in tl.static_range(16):
-            total = tl.sum(tl.reshape(values[k], (8, 4)), 1)[:, None]
-            total = tl.reshape(tl.broadcast_to(total, (8, 4)), (32,))
-            tl.store(at + k, total, mask=live & (lane % 4 == 0))
-    else:
+            total = tl.sum(tl.reshape(values[k], (32 // LANES, LANES)), 1)[:, None]
+            total = tl.reshape(tl.broadcast_to(total, (32 // LANES, LANES)), (32,))
+            tl.store(at + k, total, mask=live & (lane % LANES == 0))
+    elif LANES == 4:
         s0, s1, s2, s3 = tl.inline_asm_elementwise(
-            _BUTTERFLY, _BUTTERFLY_TYPES,
+            _OVER_FOUR, _TYPES_OF_FOUR,
             [v0, v1, v2, v3, v4, v5, v6, v7, v8, v9, v10, v11, v12, v13, v14, v15],
             dtype=(tl.float32, tl.float32, tl.float32, tl.float32), is_pure=False, pack=1,
         )  # fmt: skip
         store_four(at + 4 * (lane % 4), s0, s1, s2, s3, live)
+    else:
+        s0, s1, s2, s3, s4, s5, s6, s7 = tl.inline_asm_elementwise(
+            _OVER_TWO, _TYPES_OF_TWO,
+            [v0, v1, v2, v3, v4, v5, v6, v7, v8, v9, v10, v11, v12, v13, v14, v15],
+            dtype=(
+                tl.float32, tl.float32, tl.float32, tl.float32,
+                tl.float32, tl.float32, tl.float32, tl.float32,
+            ), is_pure=False, pack=1,
+        )  # fmt: skip
+        store_four(at + 8 * (lane % 2), s0, s1, s2, s3, live)
+        store_four(at + 8 * (lane % 2) + 4, s4, s5, s6, s7, live)
+
+
+@triton.jit
+def by_size(key, lane):
+    """The lanes of a one-warp program in the order of their ``key``, a float of which 19 bits count."""
+    bits = (key.to(tl.int32, bitcast=True) & -32) | lane
+    return tl.sort(bits) & 31
+
+
+@triton.jit
+def from_lane(value, lane):
+    """What other lanes of a one-warp program have."""
+    if _INTERPRETED:
+        return tl.gather(value, lane, 0)
+    return tl.inline_asm_elementwise(
+        "shfl.sync.idx.b32 $0, $1, $2, 31, -1;",
+        "=r,r,r",
+        [value, lane],
+        dtype=tl.int32,
+        is_pure=False,
+        pack=1,
+    )
+
+
+@triton.jit
+def widest(low, high):
+    """The lower ``low`` and the higher ``high`` of two neighbouring lanes of a one-warp program."""
+    if _INTERPRETED:
+        low, high = (
+            tl.min(tl.reshape(low, (16, 2)), 1)[:, None],
+            tl.max(tl.reshape(high, (16, 2)), 1)[:, None],
+        )
+        low, high = tl.broadcast_to(low, (16, 2)), tl.broadcast_to(high, (16, 2))
+        return tl.reshape(low, (32,)), tl.reshape(high, (32,))
+    return tl.inline_asm_elementwise(
+        "{ .reg .f32 other; shfl.sync.bfly.b32 other, $2, 1, 31, -1; min.f32 $0, $2, other;"
+        " shfl.sync.bfly.b32 other, $3, 1, 31, -1; max.f32 $1, $3, other; }",
+        "=&f,=&f,f,f", [low, high], dtype=(tl.float32, tl.float32), is_pure=False, pack=1,
+    )  # fmt: skip
 
 
 @triton.jit
@@ -162,9 +223,13 @@ def lane_set(hit, lane):
 
 @triton.jit
 def lowest_lane(lanes):
-    """The lowest bit set in ``lanes``: the exponent of that power of two as a float."""
-    power = (lanes & -lanes).to(tl.float32)
-    return ((power.to(tl.int32, bitcast=True) >> 23) & 255) - 127
+    """The lowest bit set in ``lanes``."""
+    lowest = lanes & -lanes
+    if _INTERPRETED:  # the exponent of that power of two as a float
+        return ((lowest.to(tl.float32).to(tl.int32, bitcast=True) >> 23) & 255) - 127
+    return tl.inline_asm_elementwise(
+        "bfind.u32 $0, $1;", "=r,r", [lowest], dtype=tl.int32, is_pure=True, pack=1
+    )
 
 
 @triton.jit

@@ -1,6 +1,6 @@
 """The adjoint of the projection on CUDA: every Gaussian gathers the gradients of its pixels, without atomics.
 
-Four lanes sum over the pixels of a Gaussian in a view; triton_pull_back.py goes on from these sums.
+Two lanes sum over the pixels of a Gaussian in a view; triton_pull_back.py goes on from these sums.
 """
 
 from __future__ import annotations
@@ -9,47 +9,52 @@ import torch
 import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
-from tomo_polysplat.kernels.project.triton_image import spread
+from tomo_polysplat.kernels.project.triton_image import folded, spread
 from tomo_polysplat.kernels.project.triton_setup import RECORD, SLACK
-from tomo_polysplat.kernels.triton_lanes import SUMS, load_four, store_sums
-from tomo_polysplat.kernels.triton_maths import HALF_LOG2E, SIZES, on_device
+from tomo_polysplat.kernels.triton_lanes import SUMS, by_size, from_lane, load_four, store_sums, widest
+from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, SIZES, on_device
 from tomo_polysplat.kernels.views import DetectorViews
 
-__all__ = ["BLOCK", "beyond", "sum_moments"]
+__all__ = ["sum_moments"]
 
-BLOCK = (2, 2)  # rows and columns of the four lanes that walk along the rows of a footprint
-_PLANAR_BLOCK = (1, 4)
-_RUN = 2  # times eight neighbours handled by one warp: more programs cost more to start than to run
+_PROGRAMS = 1 << 14  # enough to fill the device: groups of neighbours are halved where there are fewer
 _TINY = tl.constexpr(1e-20)
 _TWO_LN2 = tl.constexpr(1 / HALF_LOG2E)
 
 
 @triton.jit
-def _row_ends(offset, known, by_ry, ry, xc, m, hx, columns):
-    """First column of the rows at ``offset`` from their outlines' middles, and where they end: -1 if not ``known``."""
+def _row_ends(offset, last, by_ry, xc, m, hx, columns):
+    """First and last column of rows at ``offset`` from their outlines' middles, up to ``last``; or last < first."""
     u = offset * by_ry
-    half = hx * tl.sqrt(tl.maximum(1.0 - u * u, 0.0))
-    middle = xc + m * offset
+    rest = 1.0 - u * u
+    half, middle = hx * tl.sqrt(tl.maximum(rest, 0.0)), xc + m * offset
+    there = (rest > 0) & (offset <= last)
     start = tl.math.ceil(tl.minimum(tl.maximum(middle - half, 0.0), columns + 0.0))
-    return start, tl.where(known, tl.minimum(middle + half, columns - 0.5), -1.0)
+    stop = tl.math.floor(tl.minimum(middle + half, columns - 1.0))
+    return tl.where(there, start, columns + 0.0), tl.where(there, stop, -1.0)
 
 
 @triton.jit(do_not_specialize=SIZES)
 def _pixel_moments_kernel(
-    record, grad, moments, count, rows, columns,
-    CHANNELS: tl.constexpr, CONE: tl.constexpr, BLOCK_H: tl.constexpr, BLOCK_W: tl.constexpr,
-    RUN: tl.constexpr, SPREAD: tl.constexpr,
+    record, grad, moments, count, rows, columns, parts,
+    CHANNELS: tl.constexpr, CONE: tl.constexpr, BLOCK_H: tl.constexpr, SPREAD: tl.constexpr,
 ):  # fmt: skip
     view = tl.program_id(1).to(tl.int64)
+    last_block = (rows - 1) // BLOCK_H
     record += view * count * RECORD
     moments += view * count * SUMS
-    grad += view * rows * columns * SPREAD
+    grad += view * (last_block + 1) * columns * (BLOCK_H * SPREAD)
     lane = tl.arange(0, 32)
-    down, across = lane % 4 // BLOCK_W, lane % BLOCK_W
+    BLOCK_W: tl.constexpr = 2 // BLOCK_H
+    down, across = lane % 2 // BLOCK_W, lane % BLOCK_W
     zero = tl.zeros([32], tl.float32)
     lxx, lxy, lyy = zero, zero, zero
-    for turn in range(RUN):
-        n = (tl.program_id(0) * RUN + turn) * 8 + lane // 4
+    # What the warp does at a time takes as long as the largest footprint: like ones together.
+    group, part = tl.program_id(0) // parts, tl.program_id(0) % parts
+    own = tl.minimum(group * 32 + lane, count - 1).to(tl.int64) * RECORD
+    order = by_size(tl.load(record + own + 6) * tl.load(record + own + 9), lane)
+    for turn in range(part, 2, parts):
+        n = group * 32 + from_lane(order, turn * 16 + lane // 2)
         at = record + tl.minimum(n, count - 1).to(tl.int64) * RECORD
         column0, row0, r11, r12 = load_four(at)
         r22, yc, ry, xc = load_four(at + 4)
@@ -66,24 +71,32 @@ def _pixel_moments_kernel(
         low = tl.math.ceil(tl.minimum(tl.maximum(yc - ry, 0.0), rows - 1.0))
         high = tl.math.floor(tl.minimum(tl.maximum(yc + ry, -1.0), rows - 1.0))
         high = tl.where((ry > 0) & (n < count), high, -1.0)
+        # From where rows that lie interleaved begin.
+        low = tl.math.floor(low / BLOCK_H) * BLOCK_H
         by_ry = 1.0 / tl.maximum(ry - SLACK, _TINY)
-        i = low.to(tl.int32) + down
+        block = low.to(tl.int32) // BLOCK_H
         offset = (low - yc) + down.to(tl.float32)
-        last = high - yc
+        last = high - yc + 0.5
         for _first in range(0, tl.max((high - low + 1.0).to(tl.int32), 0), BLOCK_H):
-            start, stop = _row_ends(offset, offset <= last + 0.5, by_ry, ry, xc, m, hx, columns)
-            width = tl.max((stop - start + 1.0).to(tl.int32), 0)
+            start, stop = _row_ends(offset, last, by_ry, xc, m, hx, columns)
+            first, end = start, stop
+            if BLOCK_H == 2:
+                first, end = widest(start, stop)
+            width = tl.max((end - first + 1.0).to(tl.int32), 0)
             y = offset + (yc - row0)
             u = r22 * y
             uu = u * u
-            # Lanes past their row's end read the pixels that follow, zeros or finite numbers.
-            stop -= column0
-            pixel = (
-                grad + (tl.minimum(i, rows - 1) * columns + start.to(tl.int32) + across).to(tl.int64) * SPREAD
-            )
-            x = (start - column0) + across.to(tl.float32)
-            l0, l1, shift = 1.0 + y * (ly + lyy * y), lx + lxy * y, r12 * y
-            i += BLOCK_H
+            # Columns count from the middle of the row; what is read beside its ends is finite and not counted.
+            middle = 0.5 * (start + stop)
+            half = stop - middle + 0.25
+            x = (first - middle) + across.to(tl.float32)
+            pixel = (tl.minimum(block, last_block) * columns + first.to(tl.int32) + across) * BLOCK_H + down
+            pixel = grad + pixel.to(tl.int64) * SPREAD
+            middle -= column0
+            shift = r11 * middle + r12 * y
+            l0, l1 = 1.0 + y * (ly + lyy * y), lx + lxy * y
+            l0, l1 = l0 + middle * (l1 + lxx * middle), l1 + 2.0 * lxx * middle
+            block += 1
             offset += BLOCK_H
             h0, h1, k0, k1 = zero, zero, zero, zero
             for _walked in range(0, width, BLOCK_W):
@@ -93,7 +106,7 @@ def _pixel_moments_kernel(
                     g0, g1, g2, g3 = load_four(pixel)
                 t = r11 * x + shift
                 q = t * t + uu
-                inside = x <= stop
+                inside = tl.abs(x) <= half
                 if CONE:
                     # Far from a needle's footprint rounding can make l negative: no root is used there.
                     root = tl.where(inside, tl.math.rsqrt(tl.abs(l0 + x * (l1 + lxx * x))), 0.0)
@@ -127,7 +140,7 @@ def _pixel_moments_kernel(
                     k1 += along
                     ktt += along * t
                 x += BLOCK_W
-                pixel += BLOCK_W * SPREAD
+                pixel += BLOCK_W * BLOCK_H * SPREAD
             ht += h1
             hu += h0 * u
             htu += h1 * u
@@ -144,13 +157,8 @@ def _pixel_moments_kernel(
         stt, stu, suu = htt - _TWO_LN2 * ktt, htu - _TWO_LN2 * ktu, huu - _TWO_LN2 * kuu
         store_sums(
             moments + n.to(tl.int64) * SUMS, n < count, lane,
-            ht, hu, htt, htu, huu, s, st, su, stt, stu, suu, c0, c1, c2, c3, zero,
+            ht, hu, htt, htu, huu, s, st, su, stt, stu, suu, c0, c1, c2, c3, zero, LANES=2,
         )  # fmt: skip
-
-
-def beyond(views: DetectorViews) -> int:
-    """Pixels read after the last: a footprint's row starts on the detector and is walked for its width at most."""
-    return 2 * views.columns + 32
 
 
 def sum_moments(record, pixels: torch.Tensor, channels: int, views: DetectorViews) -> torch.Tensor:
@@ -158,14 +166,15 @@ def sum_moments(record, pixels: torch.Tensor, channels: int, views: DetectorView
 
     First of h (t, u, t^2, tu, u^2), from 5 of s (1, t, u, t^2, tu, u^2), from 11 of f dL/df by channel, where
     dL/d(distance^2 |e|^2) = -h / 2 and dL/d|e|^2 = -s / 2, all in units of |e_centre|. ``pixels`` is the gradient
-    of the image of as many ``channels`` in the kernels' layout, with `beyond` zero pixels after it.
+    of the image of as many ``channels`` in the kernels' layout for gradients.
     """
     many, count = record.shape[:2]
     moments = record.new_empty((many, count, SUMS.value))
-    block = _PLANAR_BLOCK if views.rows == 1 else BLOCK
+    groups = triton.cdiv(count, GROUP)
+    parts = 2 if groups * many < _PROGRAMS else 1
     with on_device(record):
-        _pixel_moments_kernel[(triton.cdiv(count, 8 * _RUN), many)](
-            record, pixels, moments, count, views.rows, views.columns, CHANNELS=channels, CONE=views.cone,
-            BLOCK_H=block[0], BLOCK_W=block[1], RUN=_RUN, SPREAD=spread(channels), num_warps=1, num_stages=1,
+        _pixel_moments_kernel[(groups * parts, many)](
+            record, pixels, moments, count, views.rows, views.columns, parts, CHANNELS=channels, CONE=views.cone,
+            BLOCK_H=folded(views), SPREAD=spread(channels), num_warps=1, num_stages=1,
         )  # fmt: skip
     return moments

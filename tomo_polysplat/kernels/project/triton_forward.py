@@ -30,7 +30,7 @@ __all__ = ["splat"]
 
 _TILE_ROWS = 8  # and as many columns, or 64 of a single row: half a warp has four pixels a lane
 _HALF = tl.constexpr(16)
-_PROGRAMS = 1 << 15  # enough to fill the device; the windows of fewer groups are each shared out
+_PROGRAMS = 1 << 14  # enough to fill the device; the windows of fewer groups are each shared out
 _MOST_PARTS = 16
 _FAR = tl.constexpr(1e30)
 
@@ -86,7 +86,7 @@ def _sum_tile(
     lx, ly, lxx, lxy, lyy = zero, zero, zero, zero, zero
     while found != 0:
         which, limit, found = two_lowest(found, upper, cut)
-        at = record + which * RECORD
+        at = record + which.to(tl.int64) * RECORD
         column0, row0, r11, r12 = load_four(at)
         r22, _, _, _ = load_four(at + 4)
         w0, w1, w2, w3 = load_four(at + 16)

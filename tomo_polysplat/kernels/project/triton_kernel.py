@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import torch
 
-from tomo_polysplat.kernels.project.triton_backward import beyond, sum_moments
+from tomo_polysplat.kernels.project.triton_backward import sum_moments
 from tomo_polysplat.kernels.project.triton_forward import splat
 from tomo_polysplat.kernels.project.triton_image import finish_image, lay_out_gradient
 from tomo_polysplat.kernels.project.triton_pull_back import pull_back
@@ -65,7 +65,7 @@ class _Project(torch.autograd.Function):
         position, scale, rotation, weight, table, record = ctx.saved_tensors
         if not (record.numel() and grad_image.numel()):
             return (*map(torch.zeros_like, (position, scale, rotation, weight)), None, None)
-        pixels = lay_out_gradient(grad_image, table, ctx.views, beyond(ctx.views))
+        pixels = lay_out_gradient(grad_image, table, ctx.views)
         moments = sum_moments(record, pixels, len(grad_image), ctx.views)
         grads = pull_back(position, scale, rotation, weight, table, ctx.views, record, moments)
         return (*grads, None, None)

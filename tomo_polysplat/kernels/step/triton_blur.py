@@ -13,7 +13,7 @@ import torch
 import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
-from tomo_polysplat.kernels.project.triton_image import pixel_factor
+from tomo_polysplat.kernels.project.triton_image import folded, gradient_room, pixel_factor, place
 from tomo_polysplat.kernels.step.triton_misfit import (
     PIXELS_A_PROGRAM,
     Splat,
@@ -89,13 +89,13 @@ def _blurred_kernel(
 @triton.jit(do_not_specialize=SIZES)
 def _gather_kernel(
     raw, pixels, table, slopes, blur, log_weights, attenuation,
-    area, rows, columns, beyond, many, nodes, areal_scale,
-    CURVES: tl.constexpr, CONE: tl.constexpr, BLOCK: tl.constexpr,
+    area, rows, columns, room, beyond, many, nodes, areal_scale,
+    CURVES: tl.constexpr, CONE: tl.constexpr, FOLD: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     k = tl.program_id(1).to(tl.int64)
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = pixel < area
-    live = pixel < tl.where(k == many - 1, area + beyond, area)
+    live = pixel < room + tl.where(k == many - 1, beyond, 0)
     row, column, variance = pixel // columns, pixel % columns, tl.load(blur)
     factor = pixel_factor(table, k, pixel, columns, CONE) * areal_scale
     at = k * area + tl.minimum(pixel, area - 1)
@@ -108,7 +108,8 @@ def _gather_kernel(
             there = inside & there_v & there_u
             slope = tl.load(slopes + k * area + pixel + i * columns + j, mask=there, other=0.0)
             gathered += along_v * along_u * slope
-    store_gradients(pixels, k * area + pixel, gathered * factor, d0, d1, d2, live, CURVES)
+    to = k * room + place(pixel, columns, FOLD)
+    store_gradients(pixels, to, gathered * factor, d0, d1, d2, live, CURVES)
 
 
 def blurred_misfit_gradient(splat: Splat, blur: torch.Tensor, grad_blur: torch.Tensor) -> torch.Tensor:
@@ -138,9 +139,10 @@ def blurred_misfit_gradient(splat: Splat, blur: torch.Tensor, grad_blur: torch.T
             measurement.noise, measurement.held_out, measurement.corner,
             HUBER=measurement.corner > 0, BLOCK=PIXELS_A_PROGRAM, num_warps=4,
         )  # fmt: skip
-        _gather_kernel[splat.blocks(splat.beyond)](
+        _gather_kernel[splat.gradient_blocks()](
             splat.raw, pixels, splat.table, slopes, blur, log_weights, attenuation,
-            splat.area, views.rows, views.columns, splat.beyond, len(views), nodes, measurement.areal_scale,
-            CURVES=measurement.curves, CONE=views.cone, BLOCK=PIXELS_A_PROGRAM, num_warps=4,
+            splat.area, views.rows, views.columns, *gradient_room(views), len(views), nodes,
+            measurement.areal_scale, CURVES=measurement.curves, CONE=views.cone, FOLD=folded(views),
+            BLOCK=PIXELS_A_PROGRAM, num_warps=4,
         )  # fmt: skip
     return pixels

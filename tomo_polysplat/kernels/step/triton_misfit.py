@@ -13,7 +13,7 @@ import torch
 import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
-from tomo_polysplat.kernels.project.triton_image import pixel_factor, spread
+from tomo_polysplat.kernels.project.triton_image import folded, gradient_room, pixel_factor, place, spread
 from tomo_polysplat.kernels.triton_lanes import load_four, store_four
 from tomo_polysplat.kernels.triton_maths import SIZES, on_device
 from tomo_polysplat.kernels.views import DetectorViews
@@ -86,8 +86,6 @@ class Splat:
         added.
     largest : float32 tensor of one number
         Raised to the largest value of ``raw``.
-    beyond : int
-        Zero pixels that the projection's adjoint wants after the gradient's last.
     """
 
     raw: torch.Tensor
@@ -97,7 +95,6 @@ class Splat:
     measurement: Measurement
     sums: torch.Tensor
     largest: torch.Tensor
-    beyond: int
 
     @property
     def area(self) -> int:
@@ -106,17 +103,21 @@ class Splat:
 
     def gradient(self) -> torch.Tensor:
         """Room for the gradient, laid out for the projection's adjoint."""
-        pixels = len(self.views) * self.area + self.beyond
-        return self.raw.new_empty(pixels * spread(max(1, self.measurement.curves)))
+        room, beyond = gradient_room(self.views)
+        return self.raw.new_empty((len(self.views) * room + beyond) * spread(max(1, self.measurement.curves)))
 
     def spectrum(self) -> tuple[torch.Tensor, torch.Tensor, int]:
         """Log weights, attenuation and number of the nodes; without nodes two tensors that are not read."""
         log_weights, attenuation = self.measurement.nodes or (self.raw, self.raw)
         return log_weights, attenuation, 0 if self.measurement.nodes is None else len(log_weights)
 
-    def blocks(self, beyond: int = 0) -> tuple[int, int]:
-        """The grid of a kernel over the pixels of each view, and so many after them."""
-        return triton.cdiv(self.area + beyond, PIXELS_A_PROGRAM), len(self.views)
+    def blocks(self) -> tuple[int, int]:
+        """The grid of a kernel over the pixels of each view."""
+        return triton.cdiv(self.area, PIXELS_A_PROGRAM), len(self.views)
+
+    def gradient_blocks(self) -> tuple[int, int]:
+        """The grid of a kernel over the room for the gradient."""
+        return triton.cdiv(sum(gradient_room(self.views)), PIXELS_A_PROGRAM), len(self.views)
 
 
 @triton.jit
@@ -232,13 +233,13 @@ def store_gradients(pixels, to, slope, d0, d1, d2, live, CURVES: tl.constexpr):
 @triton.jit(do_not_specialize=SIZES)
 def _misfit_kernel(
     raw, pixels, table, chosen, projections, totals, log_weights, attenuation, sums, largest,
-    area, columns, beyond, many, nodes, noise, held_out, corner, areal_scale,
-    CURVES: tl.constexpr, CONE: tl.constexpr, HUBER: tl.constexpr, BLOCK: tl.constexpr,
+    area, columns, room, beyond, many, nodes, noise, held_out, corner, areal_scale,
+    CURVES: tl.constexpr, CONE: tl.constexpr, HUBER: tl.constexpr, FOLD: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     k = tl.program_id(1).to(tl.int64)
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = pixel < area
-    live = pixel < tl.where(k == many - 1, area + beyond, area)
+    live = pixel < room + tl.where(k == many - 1, beyond, 0)
     factor = pixel_factor(table, k, pixel, columns, CONE) * areal_scale
     at = k * area + tl.minimum(pixel, area - 1)
     most, predicted, d0, d1, d2 = sharp_projection(raw, at, factor, log_weights, attenuation, nodes, CURVES)
@@ -247,7 +248,8 @@ def _misfit_kernel(
         predicted, projections, totals, chosen, sums, k, pixel, inside, area, many, noise, held_out, corner,
         HUBER,
     )  # fmt: skip
-    store_gradients(pixels, k * area + pixel, slope * factor, d0, d1, d2, live, CURVES)
+    to = k * room + place(pixel, columns, FOLD)
+    store_gradients(pixels, to, slope * factor, d0, d1, d2, live, CURVES)
 
 
 def misfit_gradient(splat: Splat) -> torch.Tensor:
@@ -255,12 +257,12 @@ def misfit_gradient(splat: Splat) -> torch.Tensor:
     measurement, pixels = splat.measurement, splat.gradient()
     log_weights, attenuation, nodes = splat.spectrum()
     with on_device(splat.raw):
-        _misfit_kernel[splat.blocks(splat.beyond)](
+        _misfit_kernel[splat.gradient_blocks()](
             splat.raw, pixels, splat.table, splat.chosen, measurement.projections, measurement.totals,
             log_weights, attenuation, splat.sums, splat.largest,
-            splat.area, splat.views.columns, splat.beyond, len(splat.views), nodes,
+            splat.area, splat.views.columns, *gradient_room(splat.views), len(splat.views), nodes,
             measurement.noise, measurement.held_out, measurement.corner, measurement.areal_scale,
             CURVES=measurement.curves, CONE=splat.views.cone, HUBER=measurement.corner > 0,
-            BLOCK=PIXELS_A_PROGRAM, num_warps=4,
+            FOLD=folded(splat.views), BLOCK=PIXELS_A_PROGRAM, num_warps=4,
         )  # fmt: skip
     return pixels

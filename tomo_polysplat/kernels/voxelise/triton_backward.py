@@ -113,7 +113,7 @@ def _voxel_moments_kernel(record, grad, moments, count, nz, ny, nx, stride, cut,
             hvv += h0 * (out * out)
     store_sums(
         moments + n.to(tl.int64) * SUMS, n < count, lane,
-        ht, hu, hv, htt, htu, htv, huu, huv, hvv, zero, zero, zero, c0, c1, c2, c3,
+        ht, hu, hv, htt, htu, htv, huu, huv, hvv, zero, zero, zero, c0, c1, c2, c3, LANES=4,
     )  # fmt: skip
 
 

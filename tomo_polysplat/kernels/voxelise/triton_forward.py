@@ -73,7 +73,7 @@ def _sum_brick(record, found, upper, x, y, z, cut, CHANNELS: tl.constexpr):
     c0, c1, c2, c3, d0, d1, d2, d3 = zero, zero, zero, zero, zero, zero, zero, zero
     while found != 0:
         which, limit, found = two_lowest(found, upper, cut)
-        at = record + which * RECORD
+        at = record + which.to(tl.int64) * RECORD
         cx, cy, cz, r11 = load_four(at)
         r12, r13, r22, r23 = load_four(at + 4)
         r33, _, _, _ = load_four(at + 8)
