@@ -12,7 +12,7 @@ import tomo_polysplat
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "tomo_polysplat"
-BASICS = ("checks", "parallel", "files", "units", "settings", "progress", "interrupts")
+BASICS = ("checks", "parallel", "files", "units", "settings", "progress", "interrupts", "transfer")
 LAYERS = (
     BASICS,
     ("kernels",),

@@ -34,6 +34,7 @@ from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import VolumeGrid, from_astra, is_planar_geometry
 from tomo_polysplat.scan.usable import uncorrected, usable_rays
 from tomo_polysplat.settings import Settings
+from tomo_polysplat.transfer import to_host
 
 __all__ = ["reconstruct"]
 
@@ -221,7 +222,7 @@ def _volume_of(
 
     def volume(gaussians: Gaussians) -> np.ndarray:
         with torch.no_grad():
-            whole = scene.volume(gaussians).cpu().numpy() * np.float32(factor)
+            whole = to_host(scene.volume(gaussians) * factor)
         return np.ascontiguousarray(whole[0, ::-1]) if flipped else whole
 
     return volume
@@ -237,7 +238,7 @@ def _result(outcome: FitOutcome, begun: Begun, problem: Problem, grid: VolumeGri
         number, tunables = float(gaussians.shared_material[0]), about["settings"]
         plan.reasons["soft_material"] = describe_soft(number, plan.soft_u, tunables["soft_gain"])
     with torch.no_grad():
-        own = (scene.basis(gaussians) * plan.reference).cpu().numpy()
+        own = to_host(scene.basis(gaussians) * plan.reference)
         heights = gaussians.weights(scene.reference_curve).sum(dim=0)
         parts = {
             "position": gaussians.position.cpu().numpy() * length + problem.centre,

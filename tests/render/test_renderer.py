@@ -132,6 +132,24 @@ def test_means_over_oblong_and_over_huge_voxels(shape):
     assert float((means - expected).norm() / expected.norm()) < 0.02
 
 
+def test_means_of_gaussians_of_all_widths_at_the_border():
+    """Those that are thinner are sampled by themselves, at more points, and only where they are."""
+    gaussians = cloud(count=60, widest=0.06, narrowest=0.006)
+    gaussians.position[:] *= 2.4
+    weights = gaussians.weights(None)
+    means = voxelise_means(gaussians, weights, voxel_box(cube(16)), KERNEL)[0]
+    fine = voxelise_gaussians(gaussians, weights, voxel_box(cube(240)), KERNEL)[0]
+    expected = fine.reshape(16, 15, 16, 15, 16, 15).mean(dim=(1, 3, 5))
+    # With three samples a voxel for all of them it is 0.057.
+    assert float((means - expected).norm() / expected.norm()) < 0.045
+
+
+def test_gaussians_beside_the_volume_leave_it_empty():
+    gaussians = cloud(widest=0.05, narrowest=0.01)
+    gaussians.position[:, 0] += 3.0
+    assert not bool(voxelise_means(gaussians, gaussians.weights(None), voxel_box(cube(16)), KERNEL).any())
+
+
 def test_where_voxels_are_fine_their_centres_do():
     gaussians = cloud()
     weights = gaussians.weights(None)

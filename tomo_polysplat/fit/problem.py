@@ -38,6 +38,7 @@ from tomo_polysplat.scan.snapped import snapped_geometry, snapped_grid
 from tomo_polysplat.scan.view_order import view_order
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.agreement import halves_agree
+from tomo_polysplat.transfer import to_device
 from tomo_polysplat.units import LENGTH_UNITS, cm_per
 
 __all__ = ["Problem"]
@@ -156,7 +157,7 @@ class Problem:
         copies = self._known.copies
         if device not in copies:
             stay = projections_stay(self.projections.nbytes, device)
-            copies[device] = torch.from_numpy(self.projections).to(device if stay else "cpu")
+            copies[device] = to_device(self.projections, device if stay else torch.device("cpu"))
         return copies[device]
 
     def agreement(self, bodies: Sequence[torch.Tensor]) -> list[float | None]:

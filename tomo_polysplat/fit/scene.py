@@ -16,6 +16,7 @@ from tomo_polysplat.physics.quadrature import Quadrature
 from tomo_polysplat.physics.transmission import polychromatic_projection
 from tomo_polysplat.render.metal_edges import tail_factors, tails
 from tomo_polysplat.render.renderer import project_gaussians, voxelise_gaussians, voxelise_means
+from tomo_polysplat.transfer import to_host
 
 __all__ = ["FitScene"]
 
@@ -116,7 +117,7 @@ class FitScene:
         some = replace(self, box=self.box.part(((nz - depth) // 2, 0, 0), (depth, ny, nx)))
         for _ in range(2):
             begun = time.perf_counter()
-            some.basis(gaussians).cpu()
+            to_host(some.basis(gaussians))
         return _SLACK * (time.perf_counter() - begun) * nz / depth
 
     def _means(self, gaussians: Gaussians, weights: torch.Tensor) -> torch.Tensor:

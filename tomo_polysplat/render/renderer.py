@@ -27,8 +27,9 @@ __all__ = [
 # Where a volume's Gaussians end so that they hold the same mass as a projected one cut at 3 deviations,
 # 1 - exp(-9/2) of the whole: the solution c of erf(c/sqrt 2) - sqrt(2/pi) c exp(-c^2/2) = 1 - exp(-9/2).
 VOXEL_CUTOFF = 3.33424
-# Samples a voxel and axis for thin Gaussians, at least and at most, and how many samples are held at once at most.
-_SAMPLES, _MOST_SAMPLES, _SLAB = 3, 24, 1 << 25
+# Samples a voxel and axis for thin Gaussians: those that do with as many are sampled together, for where half of them
+# need 3, one may need 6, eight times as many points. And how many samples are held at once at most.
+_SAMPLES, _SLAB = (3, 6, 12, 24), 1 << 25
 # Samples a voxel and axis that tell how high the Gaussians are somewhere in it.
 _PEAK_SAMPLES = 5
 # Deviations from sample to sample. The mean of a Gaussian over such samples is right within
@@ -87,16 +88,43 @@ def voxelise_means(gaussians: Gaussians, weights: torch.Tensor, box: VoxelBox, k
     these are sampled at several points a voxel, along the long edges of an oblong voxel at more.
     """
     dims = gaussians.log_scale.shape[1]
-    edge = torch.as_tensor(box.spacing[:dims].copy(), dtype=torch.float32, device=weights.device)
-    thin = (gaussians.log_scale.exp().amin(dim=1) < 0.5 * float(edge.max())).nonzero()[:, 0]
-    wide = torch.ones(len(gaussians), dtype=torch.bool, device=weights.device).index_fill_(0, thin, False)
-    volume = voxelise_gaussians(gaussians.select(wide.nonzero()[:, 0]), weights[:, wide], box, kernel)
-    if len(thin):
-        some, heights = gaussians.select(thin), weights[:, thin]
-        fine = _samples(box, float(some.log_scale.exp().amin()), planar=dims == 2)
-        for where, means in _of_samples(some, heights, box, kernel, fine, torch.mean):
-            volume[where] += means
+    edge = float(box.spacing[:dims].max())
+    thinnest = gaussians.log_scale.exp().amin(dim=1) / edge
+    wide = (thinnest >= 0.5).nonzero()[:, 0]
+    volume = voxelise_gaussians(gaussians.select(wide), weights[:, wide], box, kernel)
+    enough = [0.5, *(1 / (_SAMPLE_STEP * n) for n in _SAMPLES[:-1]), 0.0]
+    for least, below in zip(enough[1:], enough):
+        thin = ((thinnest >= least) & (thinnest < below)).nonzero()[:, 0]
+        some = gaussians.select(thin)
+        first, shape = _reached(some, box)
+        if not all(shape):
+            continue
+        fine = _samples(box, edge * float(thinnest[thin].min()), planar=dims == 2)
+        part = volume[:, first[0] :, first[1] :, first[2] :][:, : shape[0], : shape[1], : shape[2]]
+        for where, means in _of_samples(
+            some, weights[:, thin], box.part(first, shape), kernel, fine, torch.mean
+        ):
+            part[where] += means
     return volume
+
+
+def _reached(gaussians: Gaussians, box: VoxelBox) -> tuple[tuple[int, int, int], tuple[int, int, int]]:
+    """First voxel (z, y, x) and shape of the part of a box that holds what Gaussians reach of it."""
+    if not len(gaussians):
+        return (0, 0, 0), (0, 0, 0)
+    dims = gaussians.log_scale.shape[1]
+    centre, reach = (
+        gaussians.position[:, :dims],
+        VOXEL_CUTOFF * gaussians.log_scale.exp().amax(dim=1)[:, None],
+    )
+    ends = torch.stack([(centre - reach).amin(dim=0), (centre + reach).amax(dim=0)]).double().cpu().numpy()
+    count = np.array(box.shape[::-1])
+    first, end = np.zeros(3, int), count.copy()
+    # A voxel reaches half of an edge to either side of its centre.
+    low, high = np.floor((ends - box.first[:dims]) / box.spacing[:dims] + 0.5)
+    first[:dims] = np.clip(low, 0, count[:dims])
+    end[:dims] = np.clip(high + 1, first[:dims], count[:dims])
+    return tuple(first[::-1].tolist()), tuple((end - first)[::-1].tolist())  # type: ignore[return-value]
 
 
 def voxelise_peaks(gaussians: Gaussians, weights: torch.Tensor, box: VoxelBox, kernel: str) -> torch.Tensor:
@@ -135,7 +163,7 @@ def _of_samples(
 def _samples(box: VoxelBox, thinnest: float, *, planar: bool) -> np.ndarray:
     """(z, y, x) samples a voxel for Gaussians of this least deviation."""
     needed = np.ceil(box.spacing[::-1] / (_SAMPLE_STEP * thinnest) - 1e-3)
-    counts = np.clip(needed, _SAMPLES, _MOST_SAMPLES).astype(int)
+    counts = np.clip(needed, _SAMPLES[0], _SAMPLES[-1]).astype(int)
     if planar:
         counts[0] = 1
     return counts

@@ -1,0 +1,64 @@
+"""Large arrays between the host and a GPU, through page-locked memory.
+
+A copy from or to memory that the system may page out runs at a tenth of the bus: for a volume of 256^3 voxels it took
+0.12 s, as long as making it. Here one piece is copied by all CPU threads while the next is on its way.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+__all__ = ["to_device", "to_host"]
+
+_PIECE = 1 << 24  # bytes; less is not worth a buffer
+
+
+def to_host(tensor: torch.Tensor) -> np.ndarray:
+    """A tensor as an array, which shares its memory where it is on the host."""
+    tensor = tensor.detach()
+    if not tensor.is_cuda or tensor.nbytes < _PIECE:
+        return tensor.cpu().numpy()
+    whole = torch.empty(tensor.shape, dtype=tensor.dtype)
+    with torch.cuda.device(tensor.device):
+        pieces, parts, buffers = _split(tensor.contiguous(), whole)
+        arrived = [torch.cuda.Event(), torch.cuda.Event()]
+
+        def fetch(k: int) -> None:
+            buffers[k % 2][: len(pieces[k])].copy_(pieces[k], non_blocking=True)
+            arrived[k % 2].record()
+
+        fetch(0)
+        for k, part in enumerate(parts):
+            if k + 1 < len(parts):
+                fetch(k + 1)
+            arrived[k % 2].synchronize()
+            part.copy_(buffers[k % 2][: len(part)])
+    return whole.numpy()
+
+
+def to_device(array: np.ndarray, device: torch.device) -> torch.Tensor:
+    """An array as a tensor on a device, which shares its memory where that is the host."""
+    tensor = torch.from_numpy(array)
+    if device.type != "cuda" or tensor.nbytes < _PIECE:
+        return tensor.to(device)
+    whole = torch.empty(tensor.shape, dtype=tensor.dtype, device=device)
+    with torch.cuda.device(device):
+        pieces, parts, buffers = _split(tensor.contiguous(), whole)
+        left = [torch.cuda.Event(), torch.cuda.Event()]
+        for k, (piece, part) in enumerate(zip(pieces, parts)):
+            left[k % 2].synchronize()  # at once where it was never recorded
+            part.copy_(buffers[k % 2][: len(piece)].copy_(piece), non_blocking=True)
+            left[k % 2].record()
+        # The buffers may go to others now.
+        torch.cuda.current_stream().synchronize()
+    return whole
+
+
+def _split(
+    source: torch.Tensor, whole: torch.Tensor
+) -> tuple[tuple[torch.Tensor, ...], tuple[torch.Tensor, ...], list[torch.Tensor]]:
+    """Pieces of a tensor, their places in another, and two buffers for one each."""
+    length = _PIECE // source.element_size()
+    buffers = [torch.empty(length, dtype=source.dtype, pin_memory=True) for _ in range(2)]
+    return source.view(-1).split(length), whole.view(-1).split(length), buffers
