@@ -171,16 +171,16 @@ def test_a_volume_that_takes_the_budget_leaves_half_of_it_to_the_fit(monkeypatch
 
 
 def test_what_a_volume_takes_is_told_by_some_of_its_slices():
-    """With a clock that a slice moves by a second."""
+    """With a clock that a volume moves by five seconds and each of its slices by one more."""
     box, now = VoxelBox(np.zeros(3), np.ones(3), (17, 4, 5)), [0.0]
     smooth = (8, (0.1, 0.1))
     scene = FitScene(box, None, 1.0, None, None, 0.0, "reference", 3.0, 0.1, False, *smooth, False, 1, 0.2)
 
     def basis(self, gaussians):
-        now[0] += self.box.shape[0]
+        now[0] += 5 + self.box.shape[0]
         return torch.zeros(1, *self.box.shape)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(FitScene, "basis", basis)
         patch.setattr("tomo_polysplat.fit.scene.time", SimpleNamespace(perf_counter=lambda: now[0]))
-        assert scene.seconds_of_basis(None) == pytest.approx(2 * 17)
+        assert scene.seconds_of_basis(None) == pytest.approx(2 * (5 + 17))

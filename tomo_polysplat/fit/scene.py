@@ -110,15 +110,19 @@ class FitScene:
     def seconds_of_basis(self, gaussians: Gaussians) -> float:
         """How long `basis` will take from the device to the host at most, told by some slices in the middle.
 
-        They are made twice, as the first time may compile kernels.
+        Some are made first, as that may compile kernels; then as many, and twice as many, for what takes the same
+        time however few there are.
         """
         nz, ny, nx = self.box.shape
         depth = -(-nz // _SLICES_TIMED)
-        some = replace(self, box=self.box.part(((nz - depth) // 2, 0, 0), (depth, ny, nx)))
-        for _ in range(2):
+        depths, seconds = (depth, depth, min(2 * depth, nz)), []
+        for some in depths:
+            part = replace(self, box=self.box.part(((nz - some) // 2, 0, 0), (some, ny, nx)))
             begun = time.perf_counter()
-            to_host(some.basis(gaussians))
-        return _SLACK * (time.perf_counter() - begun) * nz / depth
+            to_host(part.basis(gaussians))
+            seconds.append(time.perf_counter() - begun)
+        a_slice = max(seconds[2] - seconds[1], 0.0) / max(depths[2] - depths[1], 1)
+        return _SLACK * (seconds[2] + a_slice * (nz - depths[2]))
 
     def _means(self, gaussians: Gaussians, weights: torch.Tensor) -> torch.Tensor:
         """Means over the voxels, with the tails of metal put back inside it."""
