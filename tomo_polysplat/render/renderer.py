@@ -35,6 +35,8 @@ _PEAK_SAMPLES = 5
 # Deviations from sample to sample. The mean of a Gaussian over such samples is right within
 # 2 exp(-2 pi^2 / 1.67^2) = 0.2 % wherever they fall (Poisson's summation formula).
 _SAMPLE_STEP = 5 / 3
+# Of a sample: the least deviation that a fit allows needs a whole number of them.
+_ROUNDING = 1e-3
 
 
 def detector_views(geometry: Geometry, planar: bool) -> DetectorViews:
@@ -92,7 +94,7 @@ def voxelise_means(gaussians: Gaussians, weights: torch.Tensor, box: VoxelBox, k
     thinnest = gaussians.log_scale.exp().amin(dim=1) / edge
     wide = (thinnest >= 0.5).nonzero()[:, 0]
     volume = voxelise_gaussians(gaussians.select(wide), weights[:, wide], box, kernel)
-    enough = [0.5, *(1 / (_SAMPLE_STEP * n) for n in _SAMPLES[:-1]), 0.0]
+    enough = [0.5, *(1 / (_SAMPLE_STEP * (n + _ROUNDING)) for n in _SAMPLES[:-1]), 0.0]
     for least, below in zip(enough[1:], enough):
         thin = ((thinnest >= least) & (thinnest < below)).nonzero()[:, 0]
         some = gaussians.select(thin)
@@ -162,7 +164,7 @@ def _of_samples(
 
 def _samples(box: VoxelBox, thinnest: float, *, planar: bool) -> np.ndarray:
     """(z, y, x) samples a voxel for Gaussians of this least deviation."""
-    needed = np.ceil(box.spacing[::-1] / (_SAMPLE_STEP * thinnest) - 1e-3)
+    needed = np.ceil(box.spacing[::-1] / (_SAMPLE_STEP * thinnest) - _ROUNDING)
     counts = np.clip(needed, _SAMPLES[0], _SAMPLES[-1]).astype(int)
     if planar:
         counts[0] = 1
