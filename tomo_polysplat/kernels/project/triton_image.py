@@ -5,8 +5,8 @@ single channel lies alone. ``finish_image`` goes from there to (channels, views,
 ``lay_out_gradient`` comes back.
 
 Pixels of an image lie row by row. Those of a gradient lie by pairs of rows, the two of a column side by side, so
-that the 2 x 2 pixels that the four lanes of a Gaussian read share a line of the cache: it answers one line at a time,
-and row by row that was what the adjoint waited for. After an odd last row and after the last view come zeros.
+that the two lanes of a Gaussian, one in either row, read one line of the cache: it answers one line at a time, and that
+is what the adjoint would wait for. After an odd last row and after the last view come zeros.
 """
 
 from __future__ import annotations
