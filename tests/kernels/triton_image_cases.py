@@ -1,5 +1,7 @@
 """Projection and voxelisation by the Triton kernels against the reference: every geometry, size and channel."""
 
+from unittest import mock
+
 import torch
 from splat_scenes import (
     as_float32,
@@ -13,6 +15,14 @@ from splat_scenes import (
     voxel_box,
 )
 from triton_case import case
+
+from tomo_polysplat.kernels.project.triton_image import (
+    finish_image,
+    folded,
+    gradient_room,
+    lay_out_gradient,
+    spread,
+)
 
 
 def _compare(scene, views, device, cutoff=3.0, **tolerance):
@@ -194,3 +204,30 @@ def wrong_inputs_are_refused(device):
                 assert name in str(problem)
             else:
                 raise AssertionError(f"{operation.__name__} took a wrong {name}")
+
+
+@case
+def gradients_lie_by_pairs_of_rows_and_zeros_follow(device):
+    """Whatever was in that memory: rows and footprints are read past their ends."""
+
+    def poisoned(like, *size):
+        return torch.full(size[0] if isinstance(size[0], tuple) else size, float("nan"), device=like.device)
+
+    for channels, views in (
+        (1, cone_views(2, 5, 7)),
+        (3, cone_views(2, 5, 7)),
+        (2, planar_views(True, 2, 7)),
+    ):
+        rows, columns, wide = views.rows, views.columns, spread(channels)
+        table = views.table(torch.device(device))
+        grad = torch.rand((channels, 2, rows, columns), device=device)
+        with mock.patch.object(torch.Tensor, "new_empty", poisoned):
+            pixels = lay_out_gradient(grad, table, views).view(-1, wide)
+        factor = finish_image(torch.ones((2, rows, columns, wide), device=device), table, channels, views)
+        down, (room, beyond) = folded(views), gradient_room(views)
+        assert len(pixels) == 2 * room + beyond and beyond >= down * (columns + 32)
+        laid = (
+            pixels[: 2 * room].view(2, -1, columns, down, wide).transpose(2, 3).reshape(2, -1, columns, wide)
+        )
+        assert torch.allclose(laid[:, :rows, :, :channels].movedim(-1, 0), grad * factor)
+        assert not laid[:, rows:].any() and not laid[..., channels:].any() and not pixels[2 * room :].any()
