@@ -16,8 +16,9 @@ from contextvars import ContextVar
 import numpy as np
 from numpy.typing import DTypeLike
 
-__all__ = ["contiguous", "cpu_threads", "kept_threads", "run_tasks", "split_range"]
+__all__ = ["contiguous", "copy_array", "cpu_threads", "kept_threads", "run_tasks", "split_range"]
 
+_COPIED_AT_ONCE = 1 << 21  # bytes of a task, so that the copy takes longer than to hand it to a thread
 # The process that keeps threads, and its threads.
 _kept: ContextVar[tuple[int, ThreadPoolExecutor] | None] = ContextVar("_kept", default=None)
 
@@ -97,16 +98,22 @@ def run_tasks(function: Callable[..., object], tasks: Sequence[tuple]) -> list:
     return results
 
 
-def contiguous(array: np.ndarray, dtype: DTypeLike) -> np.ndarray:
-    """``np.ascontiguousarray(array, dtype)``, copied by all threads where it must be copied."""
-    if array.flags.c_contiguous and array.dtype == dtype:
-        return array
-    copy = np.empty(array.shape, dtype)
+def copy_array(to: np.ndarray, source: np.ndarray) -> None:
+    """``to[...] = source``, by several threads where it is large."""
 
     def fill(first: int, last: int) -> None:
         # What the type cannot hold becomes infinite.
         with np.errstate(over="ignore"):
-            copy[first:last] = array[first:last]
+            to[first:last] = source[first:last]
 
-    run_tasks(fill, split_range(len(array), 4 * cpu_threads()) if len(array) else [])
+    parts = min(4 * cpu_threads(), to.nbytes // _COPIED_AT_ONCE)
+    run_tasks(fill, split_range(len(to), parts) if len(to) else [])
+
+
+def contiguous(array: np.ndarray, dtype: DTypeLike) -> np.ndarray:
+    """``np.ascontiguousarray(array, dtype)``, copied by several threads where it must be copied."""
+    if array.flags.c_contiguous and array.dtype == dtype:
+        return array
+    copy = np.empty(array.shape, dtype)
+    copy_array(copy, array)
     return copy
