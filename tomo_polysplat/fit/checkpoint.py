@@ -32,7 +32,7 @@ __all__ = ["Checkpoint", "Snapshot"]
 
 logger = logging.getLogger(__name__)
 
-FORMAT = 9
+FORMAT = 10
 # Writing takes at most this share of the time.
 _LARGEST_SHARE = 0.05
 _PARTS = tuple(field.name for field in fields(Gaussians))
@@ -213,7 +213,16 @@ def _plan(parts: dict[str, Any]) -> Plan:
     plan = Plan(**parts)
     lengths = (plan.spacing, plan.smallest_scale)
     above_zero = (
-        min(plan.reference, plan.first, *lengths, plan.views_per_step, plan.tv_box, plan.tv_every) > 0
+        min(
+            plan.reference,
+            plan.first,
+            plan.tv_factor,
+            *lengths,
+            plan.views_per_step,
+            plan.tv_box,
+            plan.tv_every,
+        )
+        > 0
     )
     whole = all(isinstance(n, int) for n in (plan.views_per_step, plan.tv_box, plan.tv_every))
     corners = len(plan.tv_corners) == 2 and all(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -90,6 +90,8 @@ class Plan:
         Whether seeds are thin across edges however close they are; `fit.sharpness` tells it by short fits.
     blurred : bool
         Whether rays are seen through the detector's blur; see ``physics.detector_blur``.
+    tv_factor : float
+        What the settings' weight of the total variation is multiplied by; `fit.smoothing` tells it by short fits.
     reasons : dict
         Decision by decision, what was chosen and why; it becomes ``Result.plan``.
     """
@@ -108,11 +110,13 @@ class Plan:
     curves: int
     blurred: bool
     sharp: bool = False
+    tv_factor: float = 1.0
     reasons: dict[str, Any] = field(default_factory=dict)
 
     def adapted(self, settings: Settings) -> Settings:
-        """The settings with levels and material numbers of what the object is made of; see ``fit.reference``."""
-        return SoftReference(self.reference, self.first, self.soft_u).adapted(settings)
+        """The settings for this object: levels and material numbers (``fit.reference``), and how much is smoothed."""
+        settings = SoftReference(self.reference, self.first, self.soft_u).adapted(settings)
+        return replace(settings, tv_weight=self.tv_factor * settings.tv_weight)
 
 
 def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Settings, device: str) -> Plan:

@@ -24,8 +24,9 @@ __all__ = ["cupping", "describe_soft", "flatten"]
 _POINTS = 40
 # Parts of a run in which the number moves: the first passes are not flat for other reasons, the last ones settle.
 _FROM, _UNTIL = 0.2, 0.8
-# In distances of the points: how far from air and from denser matter the soft one is taken to be itself.
-_RIM, _BESIDE = 1.5, 2.5
+# In distances of the points: how far from air and from denser matter the soft one is taken to be itself, and how far
+# from metal what is dense may still be the blur of that (with 2.5 a tooth's root passed for it, beside a post).
+_RIM, _BESIDE, _HALO = 1.5, 2.5, 1.5
 # In soft references: below it there is air. In units of the soft matter: air lies below the first, denser matter above
 # the second.
 _LEAST = 0.3
@@ -119,7 +120,7 @@ def cupping(
     dense, away = volume > _DENSE * level, np.full(volume.shape, np.inf)
     if (volume >= metal_level).any():
         away = ndimage.distance_transform_edt(volume < metal_level, sampling=apart)
-    if np.count_nonzero(dense & (away > _BESIDE)) > _OTHER * len(body):
+    if np.count_nonzero(dense & (away > _HALO)) > _OTHER * len(body):
         return None
     matter = volume > _AIR * level
     if matter.all():
