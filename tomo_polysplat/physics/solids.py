@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from tomo_polysplat.physics.materials import density, mass_attenuation
+from tomo_polysplat.physics.materials import mass_attenuation
 
 __all__ = ["number_of_solid"]
 
-# What `best_stand_in` finds at 90 kV with the default curves; the same within 0.05 from 60 to 160 kV. Stone and bone
-# have 0.2 to 0.35, and are as dense to x-rays as aluminium or less.
-_NUMBERS = {"aluminium": 0.27, "titanium": 0.77, "iron": 1.0}
+# Densities in g/cm3, and the numbers that `best_stand_in` finds from 60 to 160 kV with the default curves, within 0.05.
+# At the attenuation of aluminium and up to a third more, ceramics have 0.17 to 0.25, limestone and basalt 0.38 to 0.43.
+_SOLIDS = {"SiO2": (2.65, 0.20), "aluminium": (2.70, 0.27), "titanium": (4.51, 0.77), "iron": (7.87, 1.0)}
 
 
 def number_of_solid(level: float, energy_kev: float) -> float:
     """The default curves' material number of a solid, by its attenuation.
 
-    Light elements are light solids, so that the attenuation tells the one from the other: between aluminium, titanium
-    and iron the number goes with its logarithm.
+    Light elements are mostly light solids, so that the attenuation tells the one from the other: between quartz,
+    aluminium, titanium and iron the number goes with its logarithm.
 
     Parameters
     ----------
@@ -27,5 +27,9 @@ def number_of_solid(level: float, energy_kev: float) -> float:
         At which energy.
     """
     water = float(mass_attenuation("water", energy_kev))
-    levels = [density(name) * float(mass_attenuation(name, energy_kev)) / water for name in _NUMBERS]
-    return float(np.interp(np.log(max(level, 1.0)), np.log(levels), list(_NUMBERS.values())))
+    levels = [
+        grams * float(mass_attenuation(name, energy_kev)) / water for name, (grams, _) in _SOLIDS.items()
+    ]
+    return float(
+        np.interp(np.log(max(level, 1.0)), np.log(levels), [number for _, number in _SOLIDS.values()])
+    )
