@@ -100,7 +100,7 @@ def _why_not(seeds: int, plan: Plan, problem: Problem, settings: Settings) -> st
     """Why no short fits are made, if so."""
     views, rays = problem.geometry.views, problem.geometry.views * problem.geometry.columns
     if not problem.planar:
-        return "volumes gain little by more"
+        return "asked of slices only"
     if not (seeds and settings.tv_weight):
         return "there is nothing to smooth"
     if plan.passes < _FEWEST_PASSES:
