@@ -28,7 +28,8 @@ def progress_reports(
 
     layout = "{l_bar}{bar:24}| {elapsed}<{remaining} {postfix}"
     disable = None if wanted is None else not wanted
-    with tqdm(total=1.0, bar_format=layout, disable=disable, leave=False) as bar:
+    # Left to itself tqdm draws after as much progress as it has seen in a while, which one slow step makes rare.
+    with tqdm(total=1.0, bar_format=layout, disable=disable, leave=False, miniters=0) as bar:
 
         def report(share: float, words: str = "") -> None:
             bar.set_postfix_str(words, refresh=False)
