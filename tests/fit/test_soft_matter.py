@@ -107,6 +107,16 @@ def test_one_layer_does_not_make_the_number_leave_but_brings_it_back():
     assert float(gaussians.shared_material[0]) == 0.0 and float(away.shared_material[0]) > -0.05
 
 
+def test_a_rim_of_fat_does_not_make_the_number_leave():
+    z, y, x = np.mgrid[:9, :41, :41] - np.array([4, 20, 20])[:, None, None, None]
+    radius = np.hypot(x, y)
+    # Between fat and tissue voxels hold some of both.
+    torso = np.where(radius < 18, 0.9 + 0.12 * np.clip((16 - radius) / 2, 0, 1), 0.0)
+    gaussians = few_gaussians()
+    flatten(gaussians, scene_of(torso), Settings(), 0.5)
+    assert float(gaussians.shared_material[0]) == 0.0
+
+
 def test_without_evidence_the_number_goes_back_towards_where_it_began():
     gaussians, settings = few_gaussians(), Settings(soft_u=0.02)
     gaussians.shared_material[0] = -0.05

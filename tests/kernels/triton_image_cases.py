@@ -14,14 +14,6 @@ from splat_scenes import (
 )
 from triton_case import case
 
-from tomo_polysplat.kernels.project.triton_image import (
-    finish_image,
-    folded,
-    gradient_room,
-    lay_out_gradient,
-    spread,
-)
-
 
 def _compare(scene, views, device, cutoff=3.0, **tolerance):
     expected, skipped = run_project(scene, views, cutoff=cutoff)
@@ -207,14 +199,19 @@ def wrong_inputs_are_refused(device):
 @case
 def gradients_lie_by_pairs_of_rows_and_zeros_follow(device):
     """Rows and footprints are read past their ends."""
+    # Here, as the names of the cases are read where there is no Triton, too.
+    from tomo_polysplat.kernels.project import triton_image as layout
+
     odd, flat = cone_views(2, 5, 7), planar_views(True, 2, 7)
     for channels, views in ((1, odd), (3, odd), (2, flat)):
-        rows, columns, wide = views.rows, views.columns, spread(channels)
+        rows, columns, wide = views.rows, views.columns, layout.spread(channels)
         table = views.table(torch.device(device))
         grad = torch.rand((channels, 2, rows, columns), device=device)
-        pixels = lay_out_gradient(grad, table, views).view(-1, wide)
-        factor = finish_image(torch.ones((2, rows, columns, wide), device=device), table, channels, views)
-        down, (room, beyond) = folded(views), gradient_room(views)
+        pixels = layout.lay_out_gradient(grad, table, views).view(-1, wide)
+        factor = layout.finish_image(
+            torch.ones((2, rows, columns, wide), device=device), table, channels, views
+        )
+        down, (room, beyond) = layout.folded(views), layout.gradient_room(views)
         assert len(pixels) == 2 * room + beyond and beyond >= down * (columns + 32)
         pairs = pixels[: 2 * room].view(2, -1, columns, down, wide)
         laid = pairs.transpose(2, 3).reshape(2, -1, columns, wide)

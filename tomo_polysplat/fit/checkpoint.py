@@ -211,20 +211,10 @@ def _content(about: np.ndarray) -> dict[str, Any]:
 
 def _plan(parts: dict[str, Any]) -> Plan:
     plan = Plan(**parts)
-    lengths = (plan.spacing, plan.smallest_scale)
-    above_zero = (
-        min(
-            plan.reference,
-            plan.first,
-            plan.tv_factor,
-            *lengths,
-            plan.views_per_step,
-            plan.tv_box,
-            plan.tv_every,
-        )
-        > 0
-    )
-    whole = all(isinstance(n, int) for n in (plan.views_per_step, plan.tv_box, plan.tv_every))
+    counts = (plan.views_per_step, plan.tv_box, plan.tv_every)
+    amounts = (plan.reference, plan.first, plan.spacing, plan.smallest_scale, plan.tv_factor)
+    above_zero = min(*amounts, *counts) > 0
+    whole = all(isinstance(n, int) for n in counts)
     corners = len(plan.tv_corners) == 2 and all(
         isinstance(corner, (int, float)) and corner >= 0 for corner in plan.tv_corners
     )

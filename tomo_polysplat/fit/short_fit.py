@@ -22,7 +22,7 @@ from tomo_polysplat.render.renderer import project_gaussians
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.levels import mass_level
 
-__all__ = ["ShortFit", "batches_around", "fitted_shortly", "main_density", "short_fit"]
+__all__ = ["ShortFit", "batches_around", "cut_short", "fitted_shortly", "main_density", "short_fit"]
 
 _PASSES = 2.0
 # A scan of few views is not seen in fewer steps.
@@ -149,6 +149,11 @@ def fitted_shortly(
     if outcome.reason == "interrupted":
         raise KeyboardInterrupt("interrupted during a short fit: there is no result yet")
     return outcome
+
+
+def cut_short(outcome: FitOutcome) -> bool:
+    """Whether the time budget ended a short fit, which then tells nothing."""
+    return outcome.reason.startswith("the time budget")
 
 
 def main_density(density: np.ndarray, metal: float = math.inf) -> float:

@@ -17,7 +17,7 @@ from tomo_polysplat.fit.plan import Plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.fit.short_fit import fitted_shortly
+from tomo_polysplat.fit.short_fit import cut_short, fitted_shortly
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.initial import FEW_VIEWS
@@ -83,7 +83,7 @@ def slice_smoothing(
         outcome = fitted_shortly(
             seeds.copy(), plan, problem, scene, rays, short, options["seed"], options["time_budget"]
         )
-        if outcome.reason.startswith("the time budget") or not outcome.history:
+        if cut_short(outcome):
             plan.reasons["smoothing"] = "the usual weight: the time budget is too short to tell"
             return
         left.append(outcome.history[-1]["held_out"])

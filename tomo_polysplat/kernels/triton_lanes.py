@@ -160,13 +160,8 @@ def from_lane(value, lane):
     if _INTERPRETED:
         return tl.gather(value, lane, 0)
     return tl.inline_asm_elementwise(
-        "shfl.sync.idx.b32 $0, $1, $2, 31, -1;",
-        "=r,r,r",
-        [value, lane],
-        dtype=tl.int32,
-        is_pure=False,
-        pack=1,
-    )
+        "shfl.sync.idx.b32 $0, $1, $2, 31, -1;", "=r,r,r", [value, lane], dtype=tl.int32, is_pure=False, pack=1
+    )  # fmt: skip
 
 
 @triton.jit

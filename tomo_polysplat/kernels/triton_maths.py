@@ -35,20 +35,8 @@ HALF_LOG2E = 0.7213475204444817
 # Arguments of kernels for whose values none is compiled anew. Triton would for 1 and for what sixteen divides, a third
 # of a second each, and the Gaussians of every call are another number.
 SIZES = (
-    "count",
-    "rows",
-    "columns",
-    "area",
-    "room",
-    "beyond",
-    "nz",
-    "ny",
-    "nx",
-    "stride",
-    "many",
-    "nodes",
-    "parts",
-)
+    "count", "rows", "columns", "area", "room", "beyond", "nz", "ny", "nx", "stride", "many", "nodes", "parts",
+)  # fmt: skip
 
 
 def on_device(tensor: torch.Tensor):

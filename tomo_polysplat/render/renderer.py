@@ -115,10 +115,8 @@ def _reached(gaussians: Gaussians, box: VoxelBox) -> tuple[tuple[int, int, int],
     if not len(gaussians):
         return (0, 0, 0), (0, 0, 0)
     dims = gaussians.log_scale.shape[1]
-    centre, reach = (
-        gaussians.position[:, :dims],
-        VOXEL_CUTOFF * gaussians.log_scale.exp().amax(dim=1)[:, None],
-    )
+    centre = gaussians.position[:, :dims]
+    reach = VOXEL_CUTOFF * gaussians.log_scale.exp().amax(dim=1, keepdim=True)
     ends = torch.stack([(centre - reach).amin(dim=0), (centre + reach).amax(dim=0)]).double().cpu().numpy()
     count = np.array(box.shape[::-1])
     first, end = np.zeros(3, int), count.copy()
