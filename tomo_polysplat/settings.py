@@ -67,6 +67,8 @@ class Settings:
     bone_u: float = 0.3
     """Material number that matter of four soft references starts from, that of bone (``model/bone_numbers.py``)."""
     metal_u: float = 0.8
+    """Material number that metal starts from; at this default, under the default curves, its attenuation tells the
+    number after the first pass (``fit/metal_numbers.py``)."""
     free_radius: float = 6.0
     """Gaussians have a material number of their own within this many voxels of bone-like or denser matter."""
     learning_rate_position: float = 0.03

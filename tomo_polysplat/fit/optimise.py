@@ -15,6 +15,7 @@ import torch
 from tomo_polysplat.fit.checkpoint import Checkpoint, Snapshot
 from tomo_polysplat.fit.choose_step import make_step
 from tomo_polysplat.fit.loss import random_box
+from tomo_polysplat.fit.metal_numbers import number_metals
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.soft_matter import flatten
@@ -110,6 +111,7 @@ class _Fitter:
         # Once a pass does: in its few steps a Gaussian does not get far beyond the volume.
         self.scene.keep_within(self.gaussians)
         flatten(self.gaussians, self.scene, self.settings, share)
+        number_metals(self.gaussians, self.scene, self.settings, share)
         return self.step.read()
 
     def snapshot(self, best: Gaussians | None, numbers: dict[str, Any]) -> Snapshot:

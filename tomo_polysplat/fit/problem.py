@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -30,6 +30,7 @@ from tomo_polysplat.physics.material_range import LEAST_U, least_material_number
 from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.quadrature import Quadrature, fit_quadrature
 from tomo_polysplat.physics.scatter import add_scatter, without_scatter
+from tomo_polysplat.physics.solids import number_of_solid
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.water import transmitted_energy
 from tomo_polysplat.render.renderer import detector_views, voxel_box
@@ -205,6 +206,7 @@ class Problem:
             closed,
             plan.tv_every,
             plan.smallest_scale,
+            self._solid_number(plan, settings),
         )
 
     def primary(self, device: torch.device) -> torch.Tensor:
@@ -237,6 +239,13 @@ class Problem:
         plan.reasons["reference_energy"] = f"{energy:.1f} keV: the mean of what a typical ray transmits"
         output = _relative(materials, spectrum.effective_energy, device)
         return lit_by_scatter, _relative(materials, energy, device), output, least_u
+
+    def _solid_number(self, plan: Plan, settings: Settings) -> Callable[[np.ndarray], np.ndarray] | None:
+        """Numbers of solids by attenuation at the volume's energy, for curves that they are known for."""
+        if self.spectrum is None or self.materials != Materials() or settings.metal_u != Settings().metal_u:
+            return None
+        energy = self.spectrum.effective_energy
+        return lambda levels: number_of_solid(plan.reference * levels, energy)
 
     def seeds(
         self, start: np.ndarray | torch.Tensor, plan: Plan, settings: Settings, device: torch.device

@@ -110,7 +110,7 @@ def soft_reference(start: np.ndarray | torch.Tensor, problem: Problem, settings:
         number = settings.soft_u
     elif problem.materials == Materials():
         some = problem.projections[:: -(-len(problem.projections) // _VIEWS)]
-        number = number_of_solid(value, transmitted_energy(some, problem.spectrum))
+        number = float(number_of_solid(value, transmitted_energy(some, problem.spectrum)))
     why = f"the object's main matter, as there is nothing like soft matter; material number {number:.2f}"
     return SoftReference(value, first, number, why)
 

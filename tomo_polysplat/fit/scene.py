@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -59,6 +60,8 @@ class FitScene:
         In every how many steps that total variation is taken, and counts as many times.
     smallest_scale : float
         Smallest deviation of a Gaussian, in voxels, or in spacings of the seeds where these are closer.
+    solid_number : callable or None
+        Material numbers of solids by their attenuation in soft references; None where that does not tell them.
     """
 
     box: VoxelBox
@@ -76,6 +79,7 @@ class FitScene:
     closed: bool
     tv_every: int
     smallest_scale: float
+    solid_number: Callable[[np.ndarray], np.ndarray] | None = None
 
     def projections(self, gaussians: Gaussians, views: DetectorViews) -> tuple[torch.Tensor, int]:
         """(views, rows, columns) predicted -log(I/I0), and the pairs skipped at the source plane."""

@@ -13,15 +13,15 @@ __all__ = ["number_of_solid"]
 _SOLIDS = {"SiO2": (2.65, 0.20), "aluminium": (2.70, 0.27), "titanium": (4.51, 0.77), "iron": (7.87, 1.0)}
 
 
-def number_of_solid(level: float, energy_kev: float) -> float:
-    """The default curves' material number of a solid, by its attenuation.
+def number_of_solid(level: np.ndarray | float, energy_kev: float) -> np.ndarray:
+    """The default curves' material numbers of solids, by their attenuation.
 
     Light elements are mostly light solids, so that the attenuation tells the one from the other: between quartz,
     aluminium, titanium and iron the number goes with its logarithm.
 
     Parameters
     ----------
-    level : float
+    level : array or float
         Attenuation in multiples of that of water of 1 g/cm3.
     energy_kev : float
         At which energy.
@@ -30,6 +30,5 @@ def number_of_solid(level: float, energy_kev: float) -> float:
     levels = [
         grams * float(mass_attenuation(name, energy_kev)) / water for name, (grams, _) in _SOLIDS.items()
     ]
-    return float(
-        np.interp(np.log(max(level, 1.0)), np.log(levels), [number for _, number in _SOLIDS.values()])
-    )
+    numbers = [number for _, number in _SOLIDS.values()]
+    return np.interp(np.log(np.maximum(level, 1.0)), np.log(levels), numbers)

@@ -1,0 +1,79 @@
+"""Pieces of metal get the number of the solid that is as dense as they come out."""
+
+import astra
+import numpy as np
+import pytest
+import torch
+
+from tomo_polysplat import reconstruct
+from tomo_polysplat.fit.metal_numbers import number_metals
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.kernels.voxelise.box import VoxelBox
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.physics.beer_lambert import projection
+from tomo_polysplat.physics.materials import density, mass_attenuation
+from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.settings import Settings
+
+
+def blocks(levels, size=11):
+    """A block of Gaussians for each level, so wide that its lattice is flat; soft matter first."""
+    scale, height = 0.6, 1 / (np.sqrt(2 * np.pi) * 0.6) ** 3
+    corners = np.stack(np.meshgrid(*[np.arange(size)] * 3, indexing="ij"), -1).reshape(-1, 3).astype(float)
+    places = [corners + [0, 0, 2 * size * k] for k in range(len(levels))]
+    heights = [np.full(len(corners), level * height) for level in levels]
+    groups = [np.full(len(corners), k) for k in range(len(levels))]
+    count = len(levels) * len(corners)
+    gaussians = Gaussians(
+        torch.from_numpy(np.concatenate(places)).float(), torch.full((count, 3), np.log(scale)),
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1), torch.from_numpy(np.concatenate(heights)).float(),
+        torch.zeros(count), torch.tensor([0.0] + [0.8] * (len(levels) - 1)),
+        torch.from_numpy(np.concatenate(groups)), torch.zeros(1),
+    )  # fmt: skip
+    box = VoxelBox(np.zeros(3), np.ones(3), (2 * size * len(levels), size, size))
+    return gaussians, box
+
+
+def scene_of(box, numbers):
+    smooth = (8, (0.1, 0.1))
+    return FitScene(
+        box, None, 1.0, None, None, -0.1, "reference", 3.0, 0.1, False, *smooth, False, 1, 0.2, numbers
+    )
+
+
+def test_each_piece_gets_the_number_of_its_own_attenuation():
+    gaussians, box = blocks([1.0, 10.0, 40.0])
+    # Linear, so that what comes out is what the blocks' attenuation was taken to be.
+    number_metals(gaussians, scene_of(box, lambda levels: levels / 100), Settings(), 0.1)
+    # Of eleven Gaussians an edge most are not at the rim, where voxels hold less.
+    assert gaussians.shared_material.tolist() == pytest.approx([0.0, 0.1, 0.4], rel=0.03)
+
+
+@pytest.mark.parametrize("share, known", [(0.4, True), (0.1, False)])
+def test_numbers_stay_once_they_are_fitted_and_where_nothing_tells_them(share, known):
+    gaussians, box = blocks([1.0, 10.0])
+    number_metals(
+        gaussians, scene_of(box, (lambda levels: levels / 100) if known else None), Settings(), share
+    )
+    assert gaussians.shared_material.tolist() == pytest.approx([0.0, 0.8])
+
+
+def disc_of(metal, spectrum):
+    """A metal disc in water, 60 views of a parallel beam in closed form; lengths in cm."""
+    angles, width = np.arange(60) * np.pi / 60, 0.01
+    geometry = astra.create_proj_geom("parallel", width, 61, angles)
+    volume = astra.create_vol_geom(45, 45, -0.25, 0.25, -0.25, 0.25)
+    across = (np.arange(61) - 30) * width
+    outer, inner = (2 * np.sqrt(np.clip(radius**2 - across**2, 0.0, None)) for radius in (0.22, 0.08))
+    curves = [mass_attenuation(material, spectrum.energies) for material in ("water", metal)]
+    paths = np.stack([outer - inner, density(metal) * inner])
+    row = projection(paths, np.log(np.maximum(spectrum.weights, 1e-30)), np.stack(curves))
+    return np.broadcast_to(row, (60, 61)).astype(np.float32), geometry, volume
+
+
+@pytest.mark.parametrize("metal, least, most", [("iron", 0.93, 1.0), ("titanium", 0.7, 0.88)])
+def test_iron_and_titanium_are_told_apart(metal, least, most):
+    spectrum = Spectrum.from_tube(160, filters={"Cu": 0.05})
+    result = reconstruct(*disc_of(metal, spectrum), spectrum=spectrum, unit="cm", progress=False)
+    numbers = result.gaussians["u"][result.gaussians["density"] > 0.5 * density(metal)]
+    assert len(numbers) > 20 and least < np.median(numbers) < most
