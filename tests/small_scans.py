@@ -6,6 +6,8 @@ import astra
 import numpy as np
 
 import tomo_polysplat as tps
+from tomo_polysplat.physics.beer_lambert import projection
+from tomo_polysplat.physics.materials import density, mass_attenuation
 from tomo_polysplat.scan.geometry import Geometry, from_astra, to_astra
 
 # Two passes over the views in a few steps: enough to see every part at work.
@@ -32,6 +34,23 @@ def reconstruct(scan, projections=None, proj_geom=None, vol_geom=None, **options
         vol_geom or scan.vol_geom,
         **options,
     )
+
+
+def disc(core, spectrum, *, water=1.0, half=0.25):
+    """A disc of some material in one of water of so many g/cm3, 60 views of a parallel beam in closed form.
+
+    Projections and geometries in cm, of 45 x 45 voxels over twice ``half``: the water is 0.9 of that wide, the
+    core 0.3, both around the middle.
+    """
+    width = 2.4 * half / 61
+    proj_geom = astra.create_proj_geom("parallel", width, 61, np.arange(60) * np.pi / 60)
+    vol_geom = astra.create_vol_geom(45, 45, -half, half, -half, half)
+    across = (np.arange(61) - 30) * width
+    outer, inner = (2 * half * np.sqrt(np.clip(r**2 - (across / half) ** 2, 0.0, None)) for r in (0.9, 0.3))
+    curves = [mass_attenuation(material, spectrum.energies) for material in ("water", core)]
+    paths = np.stack([water * (outer - inner), density(core) * inner])
+    row = projection(paths, np.log(np.maximum(spectrum.weights, 1e-30)), np.stack(curves))
+    return np.broadcast_to(row, (60, 61)).astype(np.float32), proj_geom, vol_geom
 
 
 def geometries(scan) -> tuple[Geometry, object]:

@@ -49,7 +49,8 @@ class Settings:
     """"sharp" makes all seeds thin across edges, "blurred" none thinner than the detector could tell apart; "auto"
     finds out by two short fits which of the two an object has."""
     support_level: float = 0.1
-    """Where the start is below this share of the soft reference in a seed's cell and those around it, there is none."""
+    """Where the start is below this share of the soft reference in a seed's cell and those around it, there is none;
+    foam and down, whose main matter is lighter than 0.15 of the reference, have it lowered alike."""
     smallest_scale: float = 0.0
     """Smallest standard deviation in voxels, or in seed spacings where seeds are closer; 0 leaves it to the plan."""
     largest_scale: float = 8.0

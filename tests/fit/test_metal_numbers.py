@@ -1,17 +1,16 @@
 """Pieces of metal get the number of the solid that is as dense as they come out."""
 
-import astra
 import numpy as np
 import pytest
 import torch
+from small_scans import disc
 
 from tomo_polysplat import reconstruct
 from tomo_polysplat.fit.metal_numbers import number_metals
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model.gaussians import Gaussians
-from tomo_polysplat.physics.beer_lambert import projection
-from tomo_polysplat.physics.materials import density, mass_attenuation
+from tomo_polysplat.physics.materials import density
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.settings import Settings
 
@@ -58,22 +57,9 @@ def test_numbers_stay_once_they_are_fitted_and_where_nothing_tells_them(share, k
     assert gaussians.shared_material.tolist() == pytest.approx([0.0, 0.8])
 
 
-def disc_of(metal, spectrum):
-    """A metal disc in water, 60 views of a parallel beam in closed form; lengths in cm."""
-    angles, width = np.arange(60) * np.pi / 60, 0.01
-    geometry = astra.create_proj_geom("parallel", width, 61, angles)
-    volume = astra.create_vol_geom(45, 45, -0.25, 0.25, -0.25, 0.25)
-    across = (np.arange(61) - 30) * width
-    outer, inner = (2 * np.sqrt(np.clip(radius**2 - across**2, 0.0, None)) for radius in (0.22, 0.08))
-    curves = [mass_attenuation(material, spectrum.energies) for material in ("water", metal)]
-    paths = np.stack([outer - inner, density(metal) * inner])
-    row = projection(paths, np.log(np.maximum(spectrum.weights, 1e-30)), np.stack(curves))
-    return np.broadcast_to(row, (60, 61)).astype(np.float32), geometry, volume
-
-
 @pytest.mark.parametrize("metal, least, most", [("iron", 0.93, 1.0), ("titanium", 0.7, 0.88)])
 def test_iron_and_titanium_are_told_apart(metal, least, most):
     spectrum = Spectrum.from_tube(160, filters={"Cu": 0.05})
-    result = reconstruct(*disc_of(metal, spectrum), spectrum=spectrum, unit="cm", progress=False)
+    result = reconstruct(*disc(metal, spectrum), spectrum=spectrum, unit="cm", progress=False)
     numbers = result.gaussians["u"][result.gaussians["density"] > 0.5 * density(metal)]
     assert len(numbers) > 20 and least < np.median(numbers) < most

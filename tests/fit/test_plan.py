@@ -59,7 +59,7 @@ def plan(of, start, device="cpu", **settings):
     return make_plan(start, of, Settings(**settings), device)
 
 
-@pytest.mark.parametrize("density", [0.05, 0.3, 1.0, 2.0, 20.0, 280.0])
+@pytest.mark.parametrize("density", [0.015, 0.05, 0.3, 1.0, 2.0, 20.0, 280.0])
 def test_no_matter_from_foam_to_gold_makes_the_unit_look_wrong(density, caplog):
     of = problem(polychromatic=True)
     with caplog.at_level(logging.WARNING):
@@ -68,7 +68,7 @@ def test_no_matter_from_foam_to_gold_makes_the_unit_look_wrong(density, caplog):
 
 
 @pytest.mark.parametrize("wrong", [1e-6, 1e-3, 1e3, 1e6])
-@pytest.mark.parametrize("density", [0.7, 1.0, 20.0])
+@pytest.mark.parametrize("density", [0.7, 1.0, 8.9])
 def test_lengths_off_by_a_power_of_a_thousand_change_the_reference_alike(wrong, density, caplog):
     of = problem(polychromatic=True, factor=1 / wrong)
     with caplog.at_level(logging.WARNING):

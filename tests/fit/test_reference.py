@@ -4,10 +4,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from scipy import ndimage
-from small_scans import reconstruct
+from small_scans import disc, reconstruct
 
-from tomo_polysplat.fit.reference import soft_reference
+import tomo_polysplat as tps
+from tomo_polysplat.fit.reference import lightness, soft_reference
 from tomo_polysplat.physics.materials import Materials, density, mass_attenuation
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.settings import Settings
@@ -55,6 +57,39 @@ def test_a_solid_is_measured_by_itself(level):
     # What is not much denser than the solid is no metal, and no number is below that of the solid.
     assert changed.metal_level * found.value == pytest.approx(max(6.0, 3 * found.value))
     assert changed.soft_u == found.number <= min(changed.bone_u, changed.metal_u)
+
+
+@pytest.mark.parametrize("level", [0.015, 0.3, 1.0])
+def test_the_lightness_is_that_of_the_main_matter_in_noise_and_beside_metal(level):
+    volume = ball(level) + 0.3 * level * np.random.default_rng(1).normal(size=(25, 25, 25))
+    volume[12:14, 12:14, 5:9] = 40.0
+    assert lightness(torch.from_numpy(volume), 6.0) == pytest.approx(level, rel=0.15)
+
+
+def test_without_air_or_matter_nothing_is_light():
+    noise = np.random.default_rng(1).normal(size=(25, 25, 25))
+    assert lightness(torch.from_numpy(0.1 + 0.001 * noise), 6.0) == 1.0
+    assert lightness(torch.zeros(1, 9, 11), 6.0) == 1.0
+
+
+@pytest.mark.parametrize(
+    "level, unit", [(0.015, 1.0), (0.9, 1.0), (0.0011, 1e-3), (0.0079, 1e-3), (1.1e3, 1e3)]
+)
+def test_foam_is_matter_and_lighter_than_that_is_only_a_wrong_unit(level, unit):
+    found = of(ball(level))
+    assert found.value == unit and found.wrong_unit == (unit != 1.0)
+
+
+def test_foam_around_water_comes_out_as_dense_as_it_is():
+    """Where nothing lighter than a tenth of water counted as matter it came out as nothing."""
+    spectrum = Spectrum.from_tube(90, filters={"Al": 0.1})
+    result = tps.reconstruct(
+        *disc("water", spectrum, water=0.04, half=6), spectrum=spectrum, unit="cm", progress=False
+    )
+    y, x = np.mgrid[:45, :45] - 22
+    foam = (np.hypot(x, y) > 12) & (np.hypot(x, y) < 18)
+    expected = 0.04 * float(mass_attenuation("water", spectrum.effective_energy))
+    assert np.median(result.volume[..., foam]) == pytest.approx(expected, rel=0.05)
 
 
 def test_a_number_that_is_asked_for_is_that_of_the_solid():

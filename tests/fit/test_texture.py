@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from tomo_polysplat.fit.texture import bodies, corners_for, share_alike
+from tomo_polysplat.fit.texture import bodies, corners_for, share_alike, tv_corners
 from tomo_polysplat.settings import Settings
 
 
@@ -20,6 +20,12 @@ def test_what_two_halves_agree_on_is_smoothed_less():
     assert alone[0] == alone[1] and 0.02 < alone[0] < 0.1
     assert alone[0] < corners_for([0.15, None], (50, 50, 50), 0.0)[0] < 0.1
     assert alone[0] < corners_for([0.15, None], large, 0.7)[0] < 0.1
+
+
+@pytest.mark.parametrize("light, share", [(1.0, 1.0), (0.5, 0.5), (0.01, 0.3)])
+def test_light_matter_is_smoothed_by_smaller_differences(light, share):
+    (soft, dense), _ = tv_corners(torch.ones(7, 9, 11), Settings(), lambda bodies: [None, None], light)
+    assert soft == pytest.approx(0.1 * share) and dense == pytest.approx(0.1)
 
 
 def test_thick_volumes_of_several_matters_are_smoothed_less_whatever_the_halves_say():

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.reference import SoftReference, soft_reference
+from tomo_polysplat.fit.reference import SoftReference, lightness, soft_reference
 from tomo_polysplat.fit.stopping import patience_of
 from tomo_polysplat.fit.texture import tv_corners
 from tomo_polysplat.model.seed_samples import box_mean, widened
@@ -31,6 +31,8 @@ _FEWEST_SEEDS = 12
 # steps cost little, makes more of them (256^3: 40.1 dB with 4 views a step, 39.0 with 8, for 1.6 times the time).
 # The few rays of a planar view do with fewer steps (five fan-beam slices: 38.0 dB with 4 views a step, 38.3 with 8).
 _STEPS, _MOST_VIEWS, _MOST_VIEWS_PLANAR = 300, {"cpu": 8, "cuda": 4}, 8
+# An object whose main matter is lighter than so many soft references, foam or down, has its level of nothing lowered.
+_LIGHT = 0.15
 # Passes of a run that nobody has given a length.
 PASSES = 10.0
 # Steps of a small cloud cost little: with fewer seeds in matter than the second number a run is longer, in steps and
@@ -68,6 +70,8 @@ class Plan:
     reference, first, soft_u : float
         Soft reference, that of the first material, and the reference's material number; see ``fit.reference``: g/cm3,
         or 1/unit when monochromatic.
+    support_level : float
+        What the start holds less of, in soft references, is empty.
     spacing : float
         Distance of the seeds in voxels.
     finer : float
@@ -99,6 +103,7 @@ class Plan:
     reference: float
     first: float
     soft_u: float
+    support_level: float
     spacing: float
     finer: float
     smallest_scale: float
@@ -116,7 +121,8 @@ class Plan:
     def adapted(self, settings: Settings) -> Settings:
         """The settings for this object: levels and material numbers (``fit.reference``), and how much is smoothed."""
         settings = SoftReference(self.reference, self.first, self.soft_u).adapted(settings)
-        return replace(settings, tv_weight=self.tv_factor * settings.tv_weight)
+        weight = self.tv_factor * settings.tv_weight
+        return replace(settings, tv_weight=weight, support_level=self.support_level)
 
 
 def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Settings, device: str) -> Plan:
@@ -135,7 +141,10 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     reference, first = matter.value, matter.first
     if matter.wrong_unit:
         logger.warning("The unit of length looks wrong; densities are measured by %s.", matter.why)
-    least = settings.support_level * reference * problem.depth
+    relative = torch.as_tensor(start) / (reference * problem.depth)
+    light = lightness(relative, matter.adapted(settings).metal_level)
+    level = settings.support_level * min(1.0, light / _LIGHT)
+    least = level * reference * problem.depth
     support = int((start > least).sum())
     spacing, finer, because = _seed_spacing(start, least, support, problem, settings, device)
     smallest, thin = _smallest_scale(spacing, problem, settings)
@@ -147,12 +156,12 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     every = settings.tv_every or (1 if at_each else _TV_EVERY)
     curves, needed = _curves(start, first * problem.depth, problem.polychromatic, settings)
     blurred, told = _blurred(start, first * problem.depth, settings)
-    relative = torch.as_tensor(start) / (reference * problem.depth)
-    corners, texture = tv_corners(relative, matter.adapted(settings), problem.agreement)
+    corners, texture = tv_corners(relative, matter.adapted(settings), problem.agreement, light)
     plan = Plan(
         reference,
         first,
         matter.number,
+        level,
         spacing,
         finer,
         smallest,
@@ -174,8 +183,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
         if problem.planar
         else "3D Gaussians: several rows or slices, or rays that leave the plane",
         "soft_reference": f"{reference:.4g} {unit}: {matter.why}",
-        "support": f"{support} of {math.prod(start.shape)} voxels"
-        f" hold more than {settings.support_level:g} soft references",
+        "support": f"{support} of {math.prod(start.shape)} voxels hold more than {level:.2g} soft references",
         "seed_spacing_voxels": f"{spacing:.2f}: {because}",
         "smallest_scale": f"{smallest:g} voxels: {thin}",
         "views_per_step": f"{views} of {problem.geometry.views}: {reason}",

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import torch
 
+from tomo_polysplat.model.seed_samples import box_mean
 from tomo_polysplat.physics.materials import MaterialLike, Materials, density
 from tomo_polysplat.physics.solids import number_of_solid
 from tomo_polysplat.physics.water import transmitted_energy
@@ -24,11 +25,14 @@ from tomo_polysplat.start.levels import MAIN_SHARE, main_level, mass_level
 if TYPE_CHECKING:
     from tomo_polysplat.fit.problem import Problem
 
-__all__ = ["SoftReference", "soft_reference"]
+__all__ = ["SoftReference", "lightness", "soft_reference"]
 
 # Objects of solid metal are so many times as dense as water at most (rods of silver: 180, of gold: 280): only beyond
 # is the unit of length in doubt.
 _DENSEST = 600.0
+# Lighter than ten to the power of this less 1.5, that is a hundredth of water, nothing is that is not gas (foams have
+# 0.015 and more); in a unit a thousand times too long solids are.
+_BETWEEN_UNITS = -0.5
 # Materials denser than this are named as what an object is made of; others differ from water by less than their density
 # in a scan may.
 _SOLID = 1.5
@@ -46,6 +50,8 @@ _NEAR_METAL = 0.6
 _ONE, _FACTOR = 0.6, 1.5
 # In dense matter metal is told by so many times its density at least: steel in aluminium, pyrite in quartz.
 _METAL = 3.0
+# So many voxels an axis have a mean in which there is little noise, and what is so many times its deviation is matter.
+_ALIKE_VOXELS, _ABOVE_NOISE, _UPPER = 3, 3.0, 0.75
 # Material number of main matter that is not the first of curves of which nothing is known.
 _BETWEEN = 0.3
 
@@ -97,7 +103,7 @@ def soft_reference(start: np.ndarray | torch.Tensor, problem: Problem, settings:
     first = _first_density(problem.materials.soft, level)
     level /= first
     if level > 0 and not 1 < level <= _DENSEST:
-        factor = 1000.0 ** round(math.log10(level) / 3)
+        factor = 1000.0 ** round((math.log10(level) - _BETWEEN_UNITS) / 3)
         if factor != 1:
             why = f"water, with lengths off by a factor of {factor:g}: the object looks {level:.3g} times as dense"
             return SoftReference(factor * first, factor * first, settings.soft_u, why, wrong_unit=True)
@@ -113,6 +119,23 @@ def soft_reference(start: np.ndarray | torch.Tensor, problem: Problem, settings:
         number = float(number_of_solid(value, transmitted_energy(some, problem.spectrum)))
     why = f"the object's main matter, as there is nothing like soft matter; material number {number:.2f}"
     return SoftReference(value, first, number, why)
+
+
+def lightness(relative: torch.Tensor, metal_level: float) -> float:
+    """Attenuation in soft references of most matter in a start volume, at most 1.
+
+    Matter stands out of the noise, which where there is none goes below zero as far as above; where nothing does, it
+    is not told, and 1.
+    """
+    mean = box_mean(relative.float(), np.minimum(_ALIKE_VOXELS, relative.shape))
+    below = mean[mean < 0]
+    if not len(below):
+        return 1.0
+    matter = mean[(mean > _ABOVE_NOISE * below.square().mean().sqrt()) & (mean < metal_level)]
+    if not len(matter):
+        return 1.0
+    # Of foam most voxels show its level; of thin walls hardly any do, and the densest are closest to it.
+    return min(float(matter.sort().values[int(_UPPER * len(matter))]), 1.0)
 
 
 def _main_solid(relative: torch.Tensor, settings: Settings) -> float:

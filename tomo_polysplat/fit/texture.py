@@ -35,12 +35,16 @@ _AT_LEAST, _THICK = 0.63, (64, 128)
 # homogeneous from the second on (pins of 48 to 96 voxels along an edge 0.73 to 0.76, the other scenes 0.00 to 0.62),
 # told by so many voxels.
 _ALIKE, _ONE_MATTER, _FEWEST = 0.05, (0.6, 0.75), 1000
+# The least share of those differences that light matter is smoothed by: what looks lighter is walls too thin to show
+# how dense they are.
+_LIGHTEST = 0.3
 
 
 def tv_corners(
     relative: torch.Tensor,
     settings: Settings,
     agreement: Callable[[Sequence[torch.Tensor]], list[float | None]],
+    lightness: float = 1.0,
 ) -> tuple[tuple[float, float], str]:
     """Where differences begin to count by their logarithm, sooner the more of them are the object's own, and why.
 
@@ -51,6 +55,8 @@ def tv_corners(
     settings : Settings
     agreement : callable
         What `start.agreement.halves_agree` finds of the bodies it is given; called where that matters.
+    lightness : float
+        Attenuation of the main matter, at most 1: differences within foam or wood are smaller than in water.
 
     Returns
     -------
@@ -60,13 +66,15 @@ def tv_corners(
     """
     if settings.tv_corner or not settings.tv_weight:
         return (settings.tv_corner, settings.tv_corner), "asked for"
+    light = max(lightness, _LIGHTEST)
     if math.prod(relative.shape) <= _SMALL**3:
-        words = f"differences up to {_SMOOTH:g} soft references are smoothed"
-        return (_SMOOTH, _SMOOTH), f"{words}: in so few voxels edges cannot be told from texture"
+        words = f"differences up to {light * _SMOOTH:.2g} soft references are smoothed"
+        return (light * _SMOOTH, _SMOOTH), f"{words}: in so few voxels edges cannot be told from texture"
     matter = bodies(relative, settings)
     found = agreement(matter)
     alike = share_alike(relative, matter[0])
-    corners = corners_for(found, relative.shape, alike)
+    of_soft, of_dense = corners_for(found, relative.shape, alike)
+    corners = (light * of_soft, of_dense)
     words = f"differences up to {corners[0]:.2g} soft references are smoothed, in dense matter up to {corners[1]:.2g}"
     told = [
         f"of {kind} by {share:+.0%}"
