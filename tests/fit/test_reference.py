@@ -97,6 +97,14 @@ def test_a_number_that_is_asked_for_is_that_of_the_solid():
     assert of(ball(9.0), curves=1).number == 0.0
 
 
+def test_a_solid_that_looks_lighter_once_it_is_taken_for_one_stays_one():
+    """Aluminium at 135 kV is 4.0 times as dense as water, were it water, and 3.5 times as aluminium."""
+    spectrum = Spectrum.from_tube(135, filters={"Al": 0.1})
+    scan = disc("aluminium", spectrum, water=0.0, half=2)
+    result = tps.reconstruct(*scan, spectrum=spectrum, unit="cm", progress=False, settings={"passes": 0.2})
+    assert 3.3 < float(result.plan["soft_reference"].split()[0]) < 3.6
+
+
 def test_soft_matter_beside_it_and_several_solids_leave_water():
     level = ball(9.0)
     half = level.copy()

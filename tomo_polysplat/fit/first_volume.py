@@ -28,12 +28,11 @@ def first_volume(problem: Problem, device: torch.device, settings: Settings) -> 
     values = _as_if_soft(problem, primary)
     volume, done = initial_volume_on(values, problem.geometry, problem.grid)
     reference = soft_reference(volume, problem, settings)
-    for _ in range(_TIMES):
-        if reference.value == reference.first:
-            break
+    problem.remember_solid(reference.value != reference.first)
+    for _ in range(_TIMES if problem.solid else 0):
         values = _as_if_solid(problem, primary, reference.number)
         volume, done = initial_volume_on(values, problem.geometry, problem.grid)
-        reference = soft_reference(volume, problem, settings)
+        reference = soft_reference(volume, problem, settings, problem.solid)
     metal = reference.adapted(settings).metal_level * problem.depth * reference.value
     volume, bridged = bridged_start(
         values, volume, done["method"], problem.geometry, problem.grid, metal=metal

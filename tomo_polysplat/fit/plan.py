@@ -137,7 +137,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
         Zero stands for "decide", anything else is taken as it is.
     device : "cpu" or "cuda"
     """
-    matter = soft_reference(start, problem, settings)
+    matter = soft_reference(start, problem, settings, problem.solid)
     reference, first = matter.value, matter.first
     if matter.wrong_unit:
         logger.warning("The unit of length looks wrong; densities are measured by %s.", matter.why)

@@ -59,6 +59,7 @@ class _Known:
     copies: dict[torch.device, torch.Tensor] = field(default_factory=dict)
     closed: tuple[bool, str] | None = None
     agreement: list[float | None] | None = None
+    solid: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +130,15 @@ class Problem:
     def polychromatic(self) -> bool:
         """Whether energies differ."""
         return self.spectrum is not None
+
+    @property
+    def solid(self) -> bool:
+        """Whether the start volume was made as that of an object of one solid."""
+        return self._known.solid
+
+    def remember_solid(self, whether: bool) -> None:
+        """Keep whether it is, for those who look at that volume."""
+        self._known.solid = whether
 
     @property
     def dimensions(self) -> int:

@@ -44,6 +44,8 @@ _LIGHT = 0.15
 # What is lighter than this share of the level of metal has no need of a reference of its own (aluminium at 150 kV); of
 # what is denser noise and inclusions would pass for metal.
 _NEAR_METAL = 0.6
+# A solid looks lighter by up to this once it is no longer taken for water (quartz at 100 kV: 4.24, then 3.50).
+_LIGHTER = 0.75
 # Of an object's dense voxels more than the first share are within the factor of their median, if they are one matter
 # in the main: of rocks and parts, blurred and hardened, 0.68 and more; of a battery, circuit boards, a connector, whose
 # light matter the start hides, 0.54 and less.
@@ -88,11 +90,14 @@ class SoftReference(NamedTuple):
         return replace(settings, metal_level=metal, soft_u=self.number, bone_u=bone_u, metal_u=metal_u)
 
 
-def soft_reference(start: np.ndarray | torch.Tensor, problem: Problem, settings: Settings) -> SoftReference:
+def soft_reference(
+    start: np.ndarray | torch.Tensor, problem: Problem, settings: Settings, solid: bool = False
+) -> SoftReference:
     """The soft reference of a start volume in the solver's units (``fit.first_volume``).
 
     ``settings.bone_level`` is where dense matter begins, in references of the first material, whose number is
-    ``settings.soft_u``.
+    ``settings.soft_u``. ``solid`` says that the start was made as that of an object of one solid, which it then is
+    though it looks lighter.
     """
     volume = torch.as_tensor(start)
     if problem.spectrum is None or problem.materials is None:
@@ -107,7 +112,8 @@ def soft_reference(start: np.ndarray | torch.Tensor, problem: Problem, settings:
         if factor != 1:
             why = f"water, with lengths off by a factor of {factor:g}: the object looks {level:.3g} times as dense"
             return SoftReference(factor * first, factor * first, settings.soft_u, why, wrong_unit=True)
-    main = _main_solid(volume / (first * problem.depth), settings)
+    lighter = _LIGHTER if solid else 1.0
+    main = _main_solid(volume / (first * problem.depth), settings, lighter * _NEAR_METAL)
     if not main:
         why = f"soft matter: half of the object's mass is at most {level:.3g} times as dense"
         return SoftReference(first, first, settings.soft_u, why)
@@ -138,15 +144,18 @@ def lightness(relative: torch.Tensor, metal_level: float) -> float:
     return min(float(matter.sort().values[int(_UPPER * len(matter))]), 1.0)
 
 
-def _main_solid(relative: torch.Tensor, settings: Settings) -> float:
-    """Attenuation of the solid that an object is made of, for a volume in that of soft matter; 0 if of none."""
+def _main_solid(relative: torch.Tensor, settings: Settings, near_metal: float) -> float:
+    """Attenuation of the solid that an object is made of, for a volume in that of soft matter; 0 if of none.
+
+    ``near_metal`` is the least share of the level of metal that it has.
+    """
     matter = relative[relative > 0].double()
     dense = matter[matter > settings.bone_level]
     if not len(dense) or dense.sum() < (1 - _LIGHT) * matter.sum():
         return 0.0
     level = float(dense.median())
     alike = float(((dense > level / _FACTOR) & (dense < level * _FACTOR)).double().mean())
-    return level if level > _NEAR_METAL * settings.metal_level and alike > _ONE else 0.0
+    return level if level > near_metal * settings.metal_level and alike > _ONE else 0.0
 
 
 def _first_density(material: MaterialLike, level: float) -> float:
