@@ -97,6 +97,16 @@ def test_a_number_that_is_asked_for_is_that_of_the_solid():
     assert of(ball(9.0), curves=1).number == 0.0
 
 
+def test_a_sponge_of_a_solid_is_one_and_a_thick_rod_in_soft_matter_is_none():
+    """Of either about a fifth of the mass is light."""
+    sponge = ball(4.2)
+    sponge[:, ::2] /= 3.5
+    rod = ball(1.0)
+    rod[6:19, 10:15, 10:15] = 45.0
+    assert of(sponge).value == pytest.approx(4.2)
+    assert of(rod).value == 1.0
+
+
 def test_a_solid_that_looks_lighter_once_it_is_taken_for_one_stays_one():
     """Aluminium at 135 kV is 4.0 times as dense as water, were it water, and 3.5 times as aluminium."""
     spectrum = Spectrum.from_tube(135, filters={"Al": 0.1})
