@@ -7,7 +7,6 @@ import torch
 from scipy import ndimage
 
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 
@@ -54,10 +53,10 @@ def number_metals(gaussians: Gaussians, scene: FitScene, settings: Settings, sha
 def _at_centres(metal: Gaussians, scene: FitScene) -> np.ndarray:
     """Attenuation in soft references of the voxel that each Gaussian is in, or of the nearest one."""
     box = scene.box
-    voxel = (metal.position.cpu().numpy() - box.first) / box.spacing
-    index = np.clip(np.round(voxel).astype(int)[:, ::-1], 0, np.array(box.shape) - 1)
-    lowest = index.min(axis=0)
-    nz, ny, nx = (index.max(axis=0) - lowest + 1).tolist()
-    part: VoxelBox = box.part(tuple(lowest.tolist()), (nz, ny, nx))
-    values = scene.attenuation(metal, part).cpu().numpy()
-    return values[tuple((index - lowest).T)]
+    first, spacing, size = (metal.position.new_tensor(v) for v in (box.first, box.spacing, box.shape[::-1]))
+    index = torch.minimum(((metal.position - first) / spacing).round().clamp(min=0), size - 1).long().flip(1)
+    lowest = index.amin(dim=0)
+    nz, ny, nx = (index.amax(dim=0) - lowest + 1).tolist()
+    z, y, x = lowest.tolist()
+    values = scene.attenuation(metal, box.part((z, y, x), (nz, ny, nx)))
+    return values[tuple((index - lowest).T)].cpu().numpy()
