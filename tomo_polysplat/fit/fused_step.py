@@ -200,7 +200,7 @@ class FusedStep:
         else:
             pixels = misfit_gradient(seen)
         moments = rays_backward.sum_moments(record, pixels, channels, views)
-        return rays_pull_back(*drawn, table, views, record, moments)
+        return rays_pull_back(*drawn, table, views, moments)
 
     def _join(self) -> None:
         """Wait for the box's gradients, where they are made beside those of the rays."""

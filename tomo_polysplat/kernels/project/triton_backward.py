@@ -48,7 +48,6 @@ def _pixel_moments_kernel(
     BLOCK_W: tl.constexpr = 2 // BLOCK_H
     down, across = lane % 2 // BLOCK_W, lane % BLOCK_W
     zero = tl.zeros([32], tl.float32)
-    lxx, lxy, lyy = zero, zero, zero
     # What the warp does at a time takes as long as the largest footprint: like ones together.
     group, part = tl.program_id(0) // parts, tl.program_id(0) % parts
     own = tl.minimum(group * 32 + lane, count - 1).to(tl.int64) * RECORD
@@ -59,8 +58,7 @@ def _pixel_moments_kernel(
         column0, row0, r11, r12 = load_four(at)
         r22, yc, ry, xc = load_four(at + 4)
         m, hx, lx, ly = load_four(at + 8)
-        if CONE:
-            lxx, lxy, lyy, _ = load_four(at + 12)
+        lxx, lxy, lyy, unit = load_four(at + 12)
         w0, w1, w2, w3 = load_four(at + 16)
         h_sum, ht, hu, htt, htu, huu = zero, zero, zero, zero, zero, zero
         k, kt, ku, ktt, ktu, kuu = zero, zero, zero, zero, zero, zero
@@ -152,12 +150,13 @@ def _pixel_moments_kernel(
                 ku += k0 * u
                 ktu += k1 * u
                 kuu += k0 * (u * u)
+        unit = tl.where(ry > 0, 0.5 * unit, 0.0)  # of either lane
         s = h_sum - _TWO_LN2 * k
         st, su = ht - _TWO_LN2 * kt, hu - _TWO_LN2 * ku
         stt, stu, suu = htt - _TWO_LN2 * ktt, htu - _TWO_LN2 * ktu, huu - _TWO_LN2 * kuu
         store_sums(
             moments + n.to(tl.int64) * SUMS, n < count, lane,
-            ht, hu, htt, htu, huu, s, st, su, stt, stu, suu, c0, c1, c2, c3, zero, LANES=2,
+            ht, hu, htt, htu, huu, s, st, su, stt, stu, suu, c0, c1, c2, c3, unit, LANES=2,
         )  # fmt: skip
 
 
@@ -165,8 +164,9 @@ def sum_moments(record, pixels: torch.Tensor, channels: int, views: DetectorView
     """(views, count, 16) sums over each footprint, with t = r11 x + r12 y and u = r22 y of the record.
 
     First of h (t, u, t^2, tu, u^2), from 5 of s (1, t, u, t^2, tu, u^2), from 11 of f dL/df by channel, where
-    dL/d(distance^2 |e|^2) = -h / 2 and dL/d|e|^2 = -s / 2, all in units of |e_centre|. ``pixels`` is the gradient
-    of the image of as many ``channels`` in the kernels' layout for gradients.
+    dL/d(distance^2 |e|^2) = -h / 2 and dL/d|e|^2 = -s / 2, all in units of |e_centre|; last 1 / |e_centre| itself, 0
+    for a Gaussian that misses the detector. ``pixels`` is the gradient of the image of as many ``channels`` in the
+    kernels' layout for gradients.
     """
     many, count = record.shape[:2]
     moments = record.new_empty((many, count, SUMS.value))

@@ -67,5 +67,5 @@ class _Project(torch.autograd.Function):
             return (*map(torch.zeros_like, (position, scale, rotation, weight)), None, None)
         pixels = lay_out_gradient(grad_image, table, ctx.views)
         moments = sum_moments(record, pixels, len(grad_image), ctx.views)
-        grads = pull_back(position, scale, rotation, weight, table, ctx.views, record, moments)
+        grads = pull_back(position, scale, rotation, weight, table, ctx.views, moments)
         return (*grads, None, None)

@@ -10,7 +10,7 @@ import torch
 import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
-from tomo_polysplat.kernels.project.triton_setup import RECORD, ROOT, VIEW, chain, whitening
+from tomo_polysplat.kernels.project.triton_setup import ROOT, VIEW, chain, whitening
 from tomo_polysplat.kernels.triton_lanes import SUMS, load_four
 from tomo_polysplat.kernels.triton_maths import SIZES, cross, dot, on_device, whitening_adjoint
 from tomo_polysplat.kernels.views import DetectorViews
@@ -42,7 +42,7 @@ def _mix(a, x0, x1, x2, b, y0, y1, y2):
 
 @triton.jit(do_not_specialize=SIZES)
 def _pull_back_kernel(
-    position, scale, rotation, views, record, moments,
+    position, scale, rotation, views, moments,
     grad_position, grad_scale, grad_rotation, grad_weight, count, many,
     CHANNELS: tl.constexpr, CONE: tl.constexpr, PLANAR: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -54,11 +54,10 @@ def _pull_back_kernel(
     P0, P1, P2 = none, none, none
     C0, C1, C2, C3 = none, none, none, none
     known = tl.minimum(n, count - 1)
-    at, footprint, sums = views, record + known * RECORD, moments + known * SUMS
+    at, sums = views, moments + known * SUMS
     for _view in range(many):
-        _, _, ry, _ = load_four(footprint + 4)
-        _, _, _, inverse = load_four(footprint + 12)
-        seen, inverse = live & (ry > 0), inverse.to(tl.float64)
+        c1, c2, c3, inverse = load_four(sums + 12)
+        seen, inverse = live & (inverse > 0), inverse.to(tl.float64)
         (
             _, kappa, column, row, r0, r1, r2, w0, w1, w2, a0, a1, a2, b0, b1, b2,
             nu0, nu1, nu2, nv0, nv1, nv2,
@@ -69,8 +68,8 @@ def _pull_back_kernel(
         ht, hu, htt, htu = _moments(sums, seen, two, two, zero, zero)
         huu, s, st, su = _moments(sums + 4, seen, zero, one, two, two)
         stt, stu, suu, c0 = _moments(sums + 8, seen, zero, zero, zero, inverse)
-        c1, c2, c3, _ = _moments(sums + 12, seen, inverse, inverse, inverse, inverse)
-        C0, C1, C2, C3 = C0 + c0, C1 + c1, C2 + c2, C3 + c3
+        unit = tl.where(seen, inverse, 0.0)
+        C0, C1, C2, C3 = C0 + c0, C1 + c1 * unit, C2 + c2 * unit, C3 + c3 * unit
         # nu = r11 q1 and nv = r12 q1 + r22 q2, so x = by_t t - back u and y = by_u u.
         by_t = tl.math.rsqrt(tl.where(seen, dot(nu0, nu1, nu2, nu0, nu1, nu2), 1.0))
         q10, q11, q12 = by_t * nu0, by_t * nu1, by_t * nu2
@@ -136,7 +135,6 @@ def _pull_back_kernel(
         P1 += dot(tl.load(at + 4), tl.load(at + 7), tl.load(at + 10), g_column, g_row, g_depth)
         P2 += dot(tl.load(at + 5), tl.load(at + 8), tl.load(at + 11), g_column, g_row, g_depth)
         at += VIEW
-        footprint += tl.cast(count, tl.int64) * RECORD
         sums += tl.cast(count, tl.int64) * SUMS
     tl.store(grad_position + n * 3, P0.to(tl.float32), mask=live)
     tl.store(grad_position + n * 3 + 1, P1.to(tl.float32), mask=live)
@@ -155,13 +153,13 @@ def _pull_back_kernel(
 
 
 def pull_back(
-    position, scale, rotation, weight, table: torch.Tensor, views: DetectorViews, record, moments
+    position, scale, rotation, weight, table: torch.Tensor, views: DetectorViews, moments
 ) -> tuple[torch.Tensor, ...]:
     """Gradients of position, scale, rotation and weight from the moments, summed over the views."""
     grads = tuple(torch.empty_like(t) for t in (position, scale, rotation, weight))
     with on_device(position):
         _pull_back_kernel[(triton.cdiv(len(position), _BLOCK),)](
-            position, scale, rotation, table, record, moments, *grads, len(position), len(views),
+            position, scale, rotation, table, moments, *grads, len(position), len(views),
             CHANNELS=len(weight), CONE=views.cone, PLANAR=views.planar, BLOCK=_BLOCK, num_warps=2, maxnreg=_REGISTERS,
         )  # fmt: skip
     return grads

@@ -149,7 +149,9 @@ def _footprint_kernel(
         reach = _turned(w00, w01, w02, c0, c1, c2, s0) + _turned(w10, w11, w12, c0, c1, c2, s1)
         reach += _turned(w20, w21, w22, c0, c1, c2, s2)
         valid = live & (depth > 1.001 * cutoff * tl.sqrt(reach))
-        tl.atomic_add(skipped, tl.sum((live & ~valid).to(tl.int64), 0), sem="relaxed")
+        behind = tl.sum((live & ~valid).to(tl.int64), 0)
+        # Additions to one place wait for each other, and nearly all would add nothing.
+        tl.atomic_add(skipped, behind, mask=behind > 0, sem="relaxed")
     # In units of |e_centre|, so that l is one at the centre.
     inverse = tl.math.rsqrt(kappa * kappa * dot(w0, w1, w2, w0, w1, w2))
     square = inverse * inverse
