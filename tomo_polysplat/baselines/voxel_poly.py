@@ -174,7 +174,7 @@ class _Fit:
             if not errors:
                 break
             loss, aside, weight = torch.stack(errors).sum(dim=0).tolist()
-            loss, held_out = loss / len(errors), held_out_mean(aside, weight)
+            loss, held_out = loss / len(errors), held_out_mean(aside, weight, self.rays.typical_weight)
             seconds = time.perf_counter() - started
             state = FitState(seconds, step, 0, loss, held_out, share(), lambda: self.volume(self.model))
             ended = bool(watch.judge(state, self.model))

@@ -18,7 +18,7 @@ from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.sharpness import seeds_for_edges
-from tomo_polysplat.fit.smoothing import slice_smoothing
+from tomo_polysplat.fit.smoothing import choose_smoothing
 from tomo_polysplat.fit.stopping import FitState
 from tomo_polysplat.kernels.device import pick_device
 from tomo_polysplat.model.gaussians import Gaussians
@@ -113,7 +113,7 @@ def begin(
         settings, agent = settings_for_agent(start, plan.first, problem, settings, device, options)
         plan.reasons |= {"start": why, **agent}
         plan, gaussians = seeds_for_edges(start, plan, problem, scene, rays, settings, device, options)
-        slice_smoothing(gaussians, plan, problem, scene, rays, settings, options)
+        choose_smoothing(gaussians, plan, problem, scene, rays, settings, options)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("interrupted before the fit had begun: there is no result yet") from None
     if saved is not None:

@@ -145,7 +145,7 @@ class FusedStep:
         self._sums.zero_()
         self._skipped.zero_()
         self._unread = 0
-        return fitted / steps, held_out_mean(held_out, weight), skipped
+        return fitted / steps, held_out_mean(held_out, weight, self.rays.typical_weight), skipped
 
     def _next(self, views: np.ndarray, box: VoxelBox, share: float) -> np.ndarray:
         """What the control tensor must hold for the next step."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from tomo_polysplat.fit.depth import optical_depth
 from tomo_polysplat.fit.reference import SoftReference, lightness, soft_reference
 from tomo_polysplat.fit.stopping import patience_of
 from tomo_polysplat.fit.texture import tv_corners
@@ -70,6 +71,8 @@ class Plan:
     reference, first, soft_u : float
         Soft reference, that of the first material, and the reference's material number; see ``fit.reference``: g/cm3,
         or 1/unit when monochromatic.
+    depth : float
+        -log(I/I0) of a typical ray through the soft matter; see ``fit.depth``.
     support_level : float
         What the start holds less of, in soft references, is empty.
     spacing : float
@@ -95,7 +98,7 @@ class Plan:
     blurred : bool
         Whether rays are seen through the detector's blur; see ``physics.detector_blur``.
     tv_factor : float
-        What the settings' weight of the total variation is multiplied by; `fit.smoothing` tells it by short fits.
+        What the settings' weight of the total variation is multiplied by; see `fit.smoothing`.
     reasons : dict
         Decision by decision, what was chosen and why; it becomes ``Result.plan``.
     """
@@ -103,6 +106,7 @@ class Plan:
     reference: float
     first: float
     soft_u: float
+    depth: float
     support_level: float
     spacing: float
     finer: float
@@ -161,6 +165,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
         reference,
         first,
         matter.number,
+        optical_depth(relative, level, reference, problem),
         level,
         spacing,
         finer,

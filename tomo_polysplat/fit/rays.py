@@ -84,6 +84,12 @@ class Rays:
             sums.append(weight.sum(dim=(1, 2)))
         return torch.cat(sums)
 
+    @functools.cached_property
+    def typical_weight(self) -> float:
+        """Mean weight of a ray."""
+        pixels = len(self.views) * self.views.rows * self.views.columns
+        return float(self.totals.sum()) / max(pixels, 1) / (1 - self.held_out)
+
     def _aside(self, chosen: np.ndarray, shape: torch.Size) -> torch.Tensor:
         """Pixels held out: a fixed pseudo-random choice, different in every view, that needs no memory."""
         device = self.target

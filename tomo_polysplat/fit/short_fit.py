@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 
+from tomo_polysplat.fit.depth import weights_by_depth
 from tomo_polysplat.fit.optimise import FitOutcome, fit
 from tomo_polysplat.fit.plan import Plan, make_plan
 from tomo_polysplat.fit.problem import Problem
@@ -107,6 +108,7 @@ def short_fit(
     short = replace(settings, passes=min(passes, plan.passes), soft_gain=0.0)
     scene, rays = problem.scene(plan, short, device), problem.rays(plan, short, device)
     seeds = problem.seeds(start, plan, short, device)
+    short = replace(short, tv_weight=weights_by_depth(plan.depth, rays)[0] * settings.tv_weight)
     outcome = fitted_shortly(seeds, plan, problem, scene, rays, short, seed, time_budget)
     with torch.no_grad():
         density = scene.volume(outcome.gaussians).cpu().numpy() * plan.reference
@@ -180,9 +182,11 @@ def main_density(density: np.ndarray, metal: float = math.inf) -> float:
     return float(inside[first : first + width].mean())
 
 
-def batches_around(rays: Rays) -> Iterator[tuple[DetectorViews, torch.Tensor, torch.Tensor, torch.Tensor]]:
-    """What `Rays.batch` gives for some of the views, evenly spread over the scan."""
-    views = np.unique(np.linspace(0, len(rays.views) - 1, _VIEWS).astype(int))
+def batches_around(
+    rays: Rays, most: int = _VIEWS
+) -> Iterator[tuple[DetectorViews, torch.Tensor, torch.Tensor, torch.Tensor]]:
+    """What `Rays.batch` gives for so many of the views at most, evenly spread over the scan."""
+    views = np.unique(np.linspace(0, len(rays.views) - 1, min(most, len(rays.views))).astype(int))
     for first in range(0, len(views), _AT_ONCE):
         yield rays.batch(views[first : first + _AT_ONCE])
 

@@ -1,44 +1,58 @@
-"""How strongly a slice is smoothed, told by rays that are held out of two short fits.
+"""How strongly a volume is smoothed.
 
-A slice of few rays a voxel can fit noise and the streaks of missing views as well as the object: what fits the others
-best need not fit the rays that are held out. How much smoothing that takes depends on noise, views and detail together;
-photon noise alone does not tell a brain, which gains by it, from a laminate, which loses.
+The misfit is counted in -log(I/I0) and the total variation in soft references, so what one weighs against the other
+depends on how much light the object takes away: through a sample of a few millimetres a ray loses a tenth of it, and
+what is a small residual there is a large share of the object. The usual weight, chosen on objects that take away half,
+would melt a scaffold together.
+
+How much smoothing is right depends on noise, views and detail together, and photon noise alone does not tell a brain,
+which gains by more, from a laminate, which loses. So rays that are held out of short fits are asked: of thin objects,
+which may be all smooth, whether the usual weight does as well, and of slices of few rays a voxel, which can fit noise
+and the streaks of missing views as well as the object, whether more is better.
 """
 
 from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
+import torch
+
+from tomo_polysplat.fit.depth import weights_by_depth
+from tomo_polysplat.fit.loss import misfit
 from tomo_polysplat.fit.plan import Plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.fit.short_fit import cut_short, fitted_shortly
+from tomo_polysplat.fit.short_fit import batches_around, cut_short, fitted_shortly
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.initial import FEW_VIEWS
 
-__all__ = ["slice_smoothing"]
+__all__ = ["choose_smoothing"]
 
 logger = logging.getLogger(__name__)
 
-# So many times the usual weight is tried, and taken where it leaves less of the held-out misfit. Eight slices that gain
-# 0.4 to 3.9 dB by it came to 0.79 to 0.92, one that loses 0.6 to 0.88, a laminate that loses 2.4 to 1.09
+# In thin objects less than the usual weight is taken where it leaves less than this of the held-out misfit.
+_CLEARLY = 0.97
+# In slices so many times the usual weight is tried, and taken where it leaves less of the held-out misfit. Eight slices
+# that gain 0.4 to 3.9 dB by it came to 0.79 to 0.92, one that loses 0.6 to 0.88, a laminate that loses 2.4 to 1.09
 # (docs/limits.md).
 _TIMES = 3.0
-# Of a short fit: the longer it is, the less it shows of what smoothing holds back.
-_PASSES = 3.0
-# With more rays a voxel short fits are too early to tell: slices of 3.9, which lose 1.3 dB, would have it.
+# Of a short fit: the longer it is, the less it shows of what smoothing holds back. In a volume fewer of many views do.
+_PASSES, _STEPS = 3.0, 100
+# With more rays a voxel a slice's short fits are too early to tell: slices of 3.9, which lose 1.3 dB, would have it.
 _MOST_RAYS = 3.0
-# A run of fewer passes, as of the fast preset, is in a hurry; fewer rays held out tell their own noise.
-_FEWEST_PASSES, _FEWEST_HELD_OUT = 10.0, 100
+# Share of the rays that is held out to ask them, more than a run holds out, in so many views: fewer tell their own noise.
+_HELD_OUT, _FEWEST_HELD_OUT, _VIEWS, _VIEWS_PLANAR = 0.1, 100, 48, 1000
+# A run of fewer passes, as of the fast preset, is in a hurry.
+_FEWEST_PASSES = 10.0
 
 
-def slice_smoothing(
+def choose_smoothing(
     seeds: Gaussians,
     plan: Plan,
     problem: Problem,
@@ -72,43 +86,107 @@ def slice_smoothing(
         plan.tv_factor = settings.tv_factor
         plan.reasons["smoothing"] = f"{plan.tv_factor:g} times the usual weight: asked for"
         return
-    why_not = _why_not(len(seeds), plan, problem, settings)
+    by_depth, by_noise = weights_by_depth(plan.depth, rays)
+    plan.tv_factor, thin = by_depth, by_depth < 1
+    usual = "the usual weight"
+    if thin:
+        light = f"{1 - math.exp(-plan.depth):.0%} of the light"
+        usual = f"{by_depth:.2g} times {usual}, as soft matter takes away {light} of a typical ray"
+    more = not _why_no_more(problem)
+    why_not = _why_not(len(seeds), plan, problem, settings) or ("" if thin else _why_no_more(problem))
     if why_not:
-        plan.reasons["smoothing"] = f"the usual weight: {why_not}"
+        plan.reasons["smoothing"] = f"{usual}: {why_not}"
         return
-    left = []
-    for factor in (1.0, _TIMES):
-        short = replace(plan.adapted(settings), passes=_PASSES, soft_gain=0.0)
-        short = replace(short, tv_weight=factor * short.tv_weight)
+
+    asking = replace(rays, held_out=max(rays.held_out, _HELD_OUT))
+
+    def left_by(factor: float) -> float:
+        own = replace(plan, tv_factor=factor)
+        passes = _PASSES
+        if not problem.planar:
+            passes = min(passes, _STEPS * plan.views_per_step / problem.geometry.views)
+        short = replace(own.adapted(settings), passes=passes, soft_gain=0.0)
         outcome = fitted_shortly(
-            seeds.copy(), plan, problem, scene, rays, short, options["seed"], options["time_budget"]
+            seeds.copy(), own, problem, scene, asking, short, options["seed"], options["time_budget"]
         )
         if cut_short(outcome):
-            plan.reasons["smoothing"] = "the usual weight: the time budget is too short to tell"
-            return
-        left.append(outcome.history[-1]["held_out"])
-    share = left[1] / left[0] if left[0] else 1.0
-    plan.tv_factor = _TIMES if share < 1.0 else 1.0
-    weight = f"{_TIMES:g} times the usual weight" if plan.tv_factor > 1 else "the usual weight"
-    plan.reasons["smoothing"] = (
-        f"{weight}: after a short fit {_TIMES:g} times as much leaves {share:.2f} of the misfit of the held-out rays"
-    )
-    logger.info("A slice is smoothed with %s", plan.reasons["smoothing"])
+            raise _Untold("the time budget is too short to tell")
+        return _misfit_aside(
+            outcome.gaussians, scene, asking, short, _VIEWS_PLANAR if problem.planar else _VIEWS
+        )
+
+    try:
+        plan.tv_factor, told = _asked(left_by, [by_depth, by_noise] if thin else [], more)
+    except _Untold as reason:
+        plan.reasons["smoothing"] = f"{usual}: {reason}"
+        return
+    weight = "the usual weight" if plan.tv_factor == 1 else f"{plan.tv_factor:.2g} times the usual weight"
+    plan.reasons["smoothing"] = f"{weight}: after a short fit {told} of the misfit of the held-out rays"
+    logger.info("The volume is smoothed with %s", plan.reasons["smoothing"])
+
+
+class _Untold(Exception):
+    """Short fits that tell nothing, and why."""
+
+
+def _asked(left_by: Callable[[float], float], less: list[float], more: bool) -> tuple[float, str]:
+    """The factor to take, of 1, ever ``less`` and perhaps ``more``, and what each leaves of the misfit."""
+    usual = best = left_by(1.0)
+    if not usual:
+        raise _Untold("no ray of those held out is usable")
+    chosen, told = 1.0, []
+
+    def share(factor: float) -> float:
+        misfit = left_by(factor)
+        told.append(f"{factor:.2g} times as much leaves {misfit / usual:.2f}")
+        return misfit
+
+    for factor in less:
+        misfit = share(factor)
+        if misfit >= _CLEARLY * best:
+            break
+        chosen, best = factor, misfit
+    if more and chosen == 1 and share(_TIMES) < usual:
+        chosen = _TIMES
+    return chosen, " and ".join(told)
+
+
+@torch.no_grad()
+def _misfit_aside(gaussians: Gaussians, scene: FitScene, rays: Rays, settings: Settings, most: int) -> float:
+    """Mean misfit of the rays held out in so many views at most; 0 if there are none."""
+    total = weighed = 0.0
+    for views, measured, _, aside in batches_around(rays, most):
+        predicted, _ = scene.projections(gaussians, views)
+        weight = float(aside.sum())
+        total += weight * float(misfit(predicted, measured, aside, settings))
+        weighed += weight
+    return total / weighed if weighed else 0.0
 
 
 def _why_not(seeds: int, plan: Plan, problem: Problem, settings: Settings) -> str:
     """Why no short fits are made, if so."""
-    views, rays = problem.geometry.views, problem.geometry.views * problem.geometry.columns
-    if not problem.planar:
-        return "asked of slices only"
     if not (seeds and settings.tv_weight):
         return "there is nothing to smooth"
     if plan.passes < _FEWEST_PASSES:
-        return "in so few passes two short fits would take too long a part"
-    if views < FEW_VIEWS:
+        return "in so few passes short fits would take too long a part"
+    if problem.geometry.views < FEW_VIEWS:
         return f"fewer than {FEW_VIEWS} views do not tell"
-    if settings.held_out * rays < _FEWEST_HELD_OUT:
-        return f"fewer than {_FEWEST_HELD_OUT} rays are held out"
-    if rays > _MOST_RAYS * math.prod(problem.grid.shape):
+    if not settings.held_out:
+        return "no rays are held out"
+    if _HELD_OUT * _rays(problem) < _FEWEST_HELD_OUT:
+        return f"fewer than {_FEWEST_HELD_OUT / _HELD_OUT:.0f} rays do not tell"
+    return ""
+
+
+def _why_no_more(problem: Problem) -> str:
+    """Why more than the usual smoothing is not tried, if so."""
+    if not problem.planar:
+        return "more is tried in slices only"
+    if _rays(problem) > _MOST_RAYS * math.prod(problem.grid.shape):
         return f"more than {_MOST_RAYS:g} rays a voxel need no more"
     return ""
+
+
+def _rays(problem: Problem) -> int:
+    geometry = problem.geometry
+    return geometry.views * geometry.rows * geometry.columns

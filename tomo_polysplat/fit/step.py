@@ -32,7 +32,7 @@ __all__ = [
 
 # Of Adam, so small that gradients of any unit give the same steps.
 EPSILON = 1e-15
-# Fewer held-out rays in a pass, counted by weight, go up and down by chance.
+# Fewer held-out rays in a pass, those of a typical weight, go up and down by chance.
 _FEWEST_HELD_OUT = 10.0
 
 # Adam's first and second moment of each parameter by name.
@@ -109,9 +109,9 @@ def new_moments(parameters: dict[str, torch.Tensor]) -> Moments:
     return {name: (torch.zeros_like(t), torch.zeros_like(t)) for name, t in parameters.items()}
 
 
-def held_out_mean(total: float, weight: float) -> float:
-    """Mean misfit of the held-out rays from its sum and their weight."""
-    return total / weight if weight >= _FEWEST_HELD_OUT else math.nan
+def held_out_mean(total: float, weight: float, typical: float) -> float:
+    """Mean misfit of the held-out rays from its sum and their weight; NaN where they are few of a typical one."""
+    return total / weight if weight and weight >= _FEWEST_HELD_OUT * typical else math.nan
 
 
 class EagerStep:
@@ -184,7 +184,7 @@ class EagerStep:
         """Means since the last call; see `Step`."""
         fitted, held_out, weight, skipped = (float(sum(values)) for values in zip(*self._sums))
         steps, self._sums = len(self._sums), []
-        return fitted / steps, held_out_mean(held_out, weight), round(skipped)
+        return fitted / steps, held_out_mean(held_out, weight, self.rays.typical_weight), round(skipped)
 
     def _regularisation(
         self, predicted: torch.Tensor, measured: torch.Tensor, weight: torch.Tensor, box: VoxelBox
