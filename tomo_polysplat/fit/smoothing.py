@@ -46,7 +46,7 @@ _TIMES = 3.0
 _PASSES, _STEPS = 3.0, 100
 # With more rays a voxel a slice's short fits are too early to tell: slices of 3.9, which lose 1.3 dB, would have it.
 _MOST_RAYS = 3.0
-# Share of the rays that is held out to ask them, more than a run holds out, in so many views: fewer tell their own noise.
+# Share of the rays that is held out to ask them, in so many views: as few as a run holds out tell their own noise.
 _HELD_OUT, _FEWEST_HELD_OUT, _VIEWS, _VIEWS_PLANAR = 0.1, 100, 48, 1000
 # A run of fewer passes, as of the fast preset, is in a hurry.
 _FEWEST_PASSES = 10.0
