@@ -92,7 +92,9 @@ def error_figure(record: Mapping[str, Any], scene: str, size: int) -> Figure:
         dress(axis)
     handles, labels = axis.get_legend_handles_labels()
     if handles:
-        figure.legend(handles, labels, loc="outside lower center", ncol=len(labels), frameon=False, fontsize=8)
+        figure.legend(
+            handles, labels, loc="outside lower center", ncol=len(labels), frameon=False, fontsize=8
+        )
     figure.suptitle(
         f"{scene}, {size}³ voxels, {record['bench']['views']} views; {machine(record)}", fontsize=10
     )

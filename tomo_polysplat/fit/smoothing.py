@@ -136,17 +136,17 @@ def _asked(left_by: Callable[[float], float], less: list[float], more: bool) -> 
         raise _Untold("no ray of those held out is usable")
     chosen, told = 1.0, []
 
-    def share(factor: float) -> float:
-        misfit = left_by(factor)
-        told.append(f"{factor:.2g} times as much leaves {misfit / usual:.2f}")
-        return misfit
+    def ask(factor: float) -> float:
+        left = left_by(factor)
+        told.append(f"{factor:.2g} times as much leaves {left / usual:.2f}")
+        return left
 
     for factor in less:
-        misfit = share(factor)
-        if misfit >= _CLEARLY * best:
+        left = ask(factor)
+        if left >= _CLEARLY * best:
             break
-        chosen, best = factor, misfit
-    if more and chosen == 1 and share(_TIMES) < usual:
+        chosen, best = factor, left
+    if more and chosen == 1 and ask(_TIMES) < usual:
         chosen = _TIMES
     return chosen, " and ".join(told)
 
