@@ -42,11 +42,11 @@ def optical_depth(relative: torch.Tensor, empty: float, reference: float, proble
     float
         0 for a volume without matter.
     """
-    matter = torch.where(relative > _MATTER * empty, relative.clamp(max=1.0), 0.0).double()
+    matter = torch.where(relative > _MATTER * empty, relative.clamp(max=1.0), 0.0)
     per_length = reference * problem.soft_attenuation() * problem.length
     depths = []
     for axis, edge in ((2, problem.grid.voxel_size[0]), (1, problem.grid.voxel_size[1])):
-        lines = matter.sum(dim=axis) * (float(edge) * per_length)
+        lines = matter.sum(dim=axis, dtype=torch.float64) * (float(edge) * per_length)
         depths.append(float(lines.square().sum() / lines.sum().clamp(min=1e-300)))
     return sum(depths) / len(depths)
 
