@@ -51,7 +51,7 @@ def relative_error(volume, truth):
 
 
 @pytest.mark.parametrize(
-    ("discs", "noise", "denser", "more"), [(FLAT, 0.05, 1, True), (RINGS, 0.05, 3, False)]
+    ("discs", "noise", "denser", "more"), [(FLAT, 0.05, 1, True), (RINGS, 0.05, 1.6, False)]
 )
 def test_more_smoothing_is_taken_where_held_out_rays_want_it_and_lowers_the_error(discs, noise, denser, more):
     scan = slice_of(discs, noise, denser)
@@ -59,8 +59,8 @@ def test_more_smoothing_is_taken_where_held_out_rays_want_it_and_lowers_the_erro
     assert "misfit of the held-out rays" in found.plan["smoothing"] and "asked for" in once.plan["smoothing"]
     # The short fits leave no trace: it is the run that asks for what they told.
     assert np.array_equal(found.volume, (thrice if more else once).volume)
-    once, thrice = (relative_error(result.volume, scan[3]) for result in (once, thrice))
-    assert thrice < 0.9 * once if more else once < 0.95 * thrice
+    once, thrice = (np.square(result.volume - scan[3]).mean() for result in (once, thrice))
+    assert thrice < 0.8 * once if more else once < 0.8 * thrice
 
 
 @pytest.mark.parametrize("discs", [FLAT, RINGS])

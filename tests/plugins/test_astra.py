@@ -154,13 +154,14 @@ def test_the_solver_itself():
     chord = 2 * np.sqrt(
         np.clip(3.0**2 - (position - (np.cos(ANGLES) + np.sin(ANGLES))[:, None]) ** 2, 0, None)
     )
-    values = 0.3 * chord.astype(np.float32)
+    values = 0.1 * chord.astype(np.float32)
     sinogram, volume = astra.data2d.create("-sino", proj_geom, values), astra.data2d.create("-vol", vol_geom)
-    settings = {"passes": 4}
+    # ASTRA's geometry comes back rounded, and few rays with little smoothing, as of so thin a disc, make that show.
+    settings = {"passes": 4, "tv_factor": 1}
     astra.algorithm.run(algorithm(sinogram, volume, Options=AstraOptions(unit="cm", settings=settings)))
     direct = tomo_polysplat.reconstruct(values, proj_geom, vol_geom, unit="cm", settings=settings)
     recon = astra.data2d.get(volume)
-    np.testing.assert_allclose(recon, direct.volume, atol=3e-3)
+    np.testing.assert_allclose(recon, direct.volume, atol=1e-3)
     rows, columns = np.mgrid[:9, :10]
     mass = recon.clip(0).sum()
     # The disc is at x = y = 1; row 0 is at the largest y.
