@@ -92,8 +92,8 @@ def choose_smoothing(
     if thin:
         light = f"{1 - math.exp(-plan.depth):.0%} of the light"
         usual = f"{by_depth:.2g} times {usual}, as soft matter takes away {light} of a typical ray"
-    more = not _why_no_more(problem)
-    why_not = _why_not(len(seeds), plan, problem, settings) or ("" if thin else _why_no_more(problem))
+    no_more = _why_no_more(problem)
+    why_not = _why_not(len(seeds), plan, problem, settings) or ("" if thin else no_more)
     if why_not:
         plan.reasons["smoothing"] = f"{usual}: {why_not}"
         return
@@ -116,7 +116,7 @@ def choose_smoothing(
         )
 
     try:
-        plan.tv_factor, told = _asked(left_by, [by_depth, by_noise] if thin else [], more)
+        plan.tv_factor, told = _asked(left_by, [by_depth, by_noise] if thin else [], not no_more)
     except _Untold as reason:
         plan.reasons["smoothing"] = f"{usual}: {reason}"
         return
@@ -130,7 +130,7 @@ class _Untold(Exception):
 
 
 def _asked(left_by: Callable[[float], float], less: list[float], more: bool) -> tuple[float, str]:
-    """The factor to take, of 1, ever ``less`` and perhaps ``more``, and what each leaves of the misfit."""
+    """The factor to take, of 1, those ever ``less``, and with ``more`` three, and what each leaves of the misfit."""
     usual = best = left_by(1.0)
     if not usual:
         raise _Untold("no ray of those held out is usable")
@@ -173,7 +173,7 @@ def _why_not(seeds: int, plan: Plan, problem: Problem, settings: Settings) -> st
         return f"fewer than {FEW_VIEWS} views do not tell"
     if not settings.held_out:
         return "no rays are held out"
-    if _HELD_OUT * _rays(problem) < _FEWEST_HELD_OUT:
+    if _HELD_OUT * problem.projections.size < _FEWEST_HELD_OUT:
         return f"fewer than {_FEWEST_HELD_OUT / _HELD_OUT:.0f} rays do not tell"
     return ""
 
@@ -182,11 +182,6 @@ def _why_no_more(problem: Problem) -> str:
     """Why more than the usual smoothing is not tried, if so."""
     if not problem.planar:
         return "more is tried in slices only"
-    if _rays(problem) > _MOST_RAYS * math.prod(problem.grid.shape):
+    if problem.projections.size > _MOST_RAYS * math.prod(problem.grid.shape):
         return f"more than {_MOST_RAYS:g} rays a voxel need no more"
     return ""
-
-
-def _rays(problem: Problem) -> int:
-    geometry = problem.geometry
-    return geometry.views * geometry.rows * geometry.columns
