@@ -109,8 +109,6 @@ class Settings:
     tv_corner: float = 0.0
     """Difference of neighbouring voxels, in soft references, up to which it counts in full; larger ones count by
     their logarithm, so that edges and texture stay. 0 leaves it to the plan; with 1000 all count in full."""
-    tv_box: int = 0
-    """Edge in voxels of the random box whose total variation is taken; 0 leaves it to the plan."""
     tv_every: int = 0
     """In every how many steps it is taken, and counts as many times; 0 leaves it to the plan."""
     relocated: float = 0.03

@@ -260,23 +260,25 @@ def test_few_voxels_get_more_seeds_than_voxels(planar):
         assert ("few voxels" in chosen.reasons["seed_spacing_voxels"]) == (pixel < 1)
 
 
-@pytest.mark.parametrize(
-    ("edge", "words"), [(0, "all of the volume, in one step of 2: what"), (5, "a box of 5 voxels")]
-)
-def test_what_is_smoothed_is_told(edge, words):
+def test_the_larger_a_volume_the_less_often_it_is_smoothed():
+    """As often as steps have time for, but neither at every step of a volume nor by leaps."""
+
+    def every(size, device, planar=False):
+        of = problem(size, planar=planar)
+        return plan(of, ball(of, WATER), device=device).tv_every
+
+    assert [every(size, "cpu") for size in (12, 50, 70, 105)] == [2, 2, 3, 4]
+    assert [every(size, "cuda") for size in (12, 105)] == [2, 2]
+    assert [every(size, "cpu", planar=True) for size in (12, 256, 300, 900)] == [1, 1, 2, 4]
+
+
+def test_what_is_smoothed_is_told():
     of = problem(size=12)
-    assert words in plan(of, ball(of, WATER), tv_box=edge).reasons["smoothed_box"]
-
-
-def test_volumes_are_smoothed_every_other_step_but_where_a_gpu_smooths_parts_of_them():
-    of, flat = problem(size=12), problem(size=12, planar=True)
-    assert plan(of, ball(of, WATER), tv_box=11).tv_every == 2
-    assert plan(of, ball(of, WATER), device="cuda", tv_box=12).tv_every == 2
-    assert plan(of, ball(of, WATER), device="cuda", tv_box=11).tv_every == 1
     assert (
-        plan(flat, ball(flat, WATER)).tv_every == plan(flat, ball(flat, WATER), device="cuda").tv_every == 1
+        plan(of, ball(of, WATER)).reasons["smoothed"]
+        == "the volume, in one step of 2: what steps have time for"
     )
-    assert plan(of, ball(of, WATER), tv_every=3).tv_every == 3
+    assert plan(of, ball(of, WATER), tv_every=1).reasons["smoothed"] == "the volume, in every step: asked for"
 
 
 @pytest.mark.parametrize("passes", [1.0, 60.0, 90.0, 10_000.0])

@@ -13,28 +13,15 @@ import pytest
 import torch
 
 from tomo_polysplat.fit.choose_step import make_step, why_eager
-from tomo_polysplat.fit.loss import random_box
 from tomo_polysplat.fit.step import EagerStep
 
 sys.path.append(str(Path(__file__).parents[1] / "kernels"))
 from step_scenes import BATCH, compare_steps, fit_problem
 
 
-def test_a_random_box_is_inside_and_always_of_one_shape():
-    whole = fit_problem("cone", True, "cpu", "numba")[-1].refined(np.array([6, 6, 6]))
-    rng, starts = np.random.default_rng(1), set()
-    for _ in range(20):
-        box = random_box(whole, 20, rng)
-        assert box.shape == (20, 20, 20)
-        start = np.rint((box.first - whole.first) / whole.spacing).astype(int)
-        assert (start >= 0).all() and (start + 20 <= whole.shape[::-1]).all()
-        starts.add(tuple(start))
-    assert len(starts) > 10
-
-
 def test_the_cpu_steps_through_autograd():
     problem = fit_problem("cone", True, "cpu", "numba")
-    step = make_step(*problem[:-1], batch=BATCH, box=problem[-1])
+    step = make_step(*problem, batch=BATCH)
     assert isinstance(step, EagerStep)
     assert "numba" in why_eager(problem[3], problem[4])
 
@@ -43,20 +30,20 @@ def test_the_cpu_smooths_every_other_step_twice_as_much():
     ends = []
     for every, weights in ((2, (0.3, 0.3)), (1, (0.6, 0.0))):
         gaussians, *problem = fit_problem("cone", True, "cpu", "numba", tv_weight=0.3, every=every)
-        step = EagerStep(gaussians, *problem[:-1])
+        step = EagerStep(gaussians, *problem)
         for k, weight in enumerate(weights):
-            step.settings = replace(problem[3], tv_weight=weight)
-            step(np.array([k, 4 - k]), problem[-1], 0.0)
+            step.settings = replace(problem[-1], tv_weight=weight)
+            step(np.array([k, 4 - k]), 0.0)
         ends.append(gaussians.copy().parameters())
     for name in ends[0]:
         torch.testing.assert_close(ends[0][name], ends[1][name], msg=name)
 
 
 def test_no_material_number_falls_below_what_the_curves_allow():
-    gaussians, *problem, box = fit_problem("cone", True, "cpu", "numba")
+    gaussians, *problem = fit_problem("cone", True, "cpu", "numba")
     gaussians.own_material.fill_(-0.1)
     problem[2] = replace(problem[2], least_u=-0.03)
-    EagerStep(gaussians, *problem)(np.array([0, 1]), box, 0.9)
+    EagerStep(gaussians, *problem)(np.array([0, 1]), 0.9)
     assert float(gaussians.own_material.detach().min()) == pytest.approx(-0.03)
 
 
@@ -65,17 +52,17 @@ def test_the_memory_of_a_step_can_be_put_back():
     ends = []
     for interrupted in (False, True):
         problem = fit_problem("cone", True, "cpu", "numba")
-        step = EagerStep(*problem[:-1])
-        step(np.array([0, 1]), problem[-1], 0.0)
+        step = EagerStep(*problem)
+        step(np.array([0, 1]), 0.0)
         if interrupted:
             gaussians = problem[0].copy()
-            again = EagerStep(gaussians, *problem[1:-1])
+            again = EagerStep(gaussians, *problem[1:])
             for name, moments in again.moments.items():
                 for new, old in zip(moments, step.moments[name]):
                     new.copy_(old)
             again.done = step.done
             step, problem = again, (gaussians, *problem[1:])
-        step(np.array([2, 3]), problem[-1], 0.7)
+        step(np.array([2, 3]), 0.7)
         ends.append(problem[0].copy().parameters())
     assert all(torch.equal(ends[0][name], ends[1][name]) for name in ends[0])
 
@@ -97,11 +84,11 @@ def graph_step(*problem):
 def test_gaussians_turn_from_the_second_step_on():
     """What would turn a round one in the first is rounding."""
     gaussians, *problem = fit_problem("cone", True, "cpu", "numba")
-    before, step = gaussians.copy(), EagerStep(gaussians, *problem[:-1])
-    step(np.array([0, 1]), problem[-1], 0.0)
+    before, step = gaussians.copy(), EagerStep(gaussians, *problem)
+    step(np.array([0, 1]), 0.0)
     assert torch.equal(gaussians.rotation, before.rotation)
     assert not torch.equal(gaussians.position, before.position)
-    step(np.array([2, 3]), problem[-1], 0.5)
+    step(np.array([2, 3]), 0.5)
     assert not torch.equal(gaussians.rotation, before.rotation)
 
 
@@ -129,9 +116,9 @@ def test_projections_on_the_host_give_the_same_steps():
         if streamed:
             rays = problem[2]
             rays.device, rays.projections = torch.device("cuda", 0), rays.projections.cpu().pin_memory()
-        step = graph_step(*problem[:-1], BATCH, problem[-1])
+        step = graph_step(*problem, BATCH)
         for k in range(9):
-            step(np.array([k % 5, (k + 2) % 5]), problem[-1], 0.1 * k)
+            step(np.array([k % 5, (k + 2) % 5]), 0.1 * k)
         ends.append((step.read(), problem[0].position.cpu()))
     np.testing.assert_allclose(ends[0][0], ends[1][0], rtol=1e-5)
     torch.testing.assert_close(ends[0][1], ends[1][1], rtol=1e-4, atol=1e-5)
@@ -153,8 +140,8 @@ def test_another_number_of_views_or_gaussians_compiles_nothing(monkeypatch):
     for count, batch in ((17, 2), (16, 1), (33, 3)):
         compiled.clear()
         problem = fit_problem("cone", True, "cuda", "triton", count=count)
-        step = graph_step(*problem[:-1], batch, problem[-1])
-        step(np.arange(batch), problem[-1], 0.0)
+        step = graph_step(*problem, batch)
+        step(np.arange(batch), 0.0)
         found.append(list(compiled))
     assert found[0] and found[1:] == [[], []]
 
@@ -169,9 +156,9 @@ def test_a_graph_that_cannot_be_recorded_is_said_and_replaced(monkeypatch, caplo
 
     monkeypatch.setattr(torch.cuda, "graph", refuse)
     with caplog.at_level(logging.WARNING):
-        step = make_step(*problem[:-1], batch=BATCH, box=problem[-1])
+        step = make_step(*problem, batch=BATCH)
     assert isinstance(step, EagerStep) and "no graphs here" in caplog.text
     for name, tensor in problem[0].parameters().items():
         assert torch.equal(tensor, before.parameters()[name]), name
-    step(np.array([0, 1]), problem[-1], 0.0)
+    step(np.array([0, 1]), 0.0)
     assert np.isfinite(step.read()[0])

@@ -18,7 +18,7 @@ CURVES = torch.tensor([[1.0, 2.1, 6.0], [0.8, 1.5, 3.5]])
 
 
 def fit_problem(kind, polychromatic, device, kernel, count=17, **changes):
-    """Gaussians, spacing, rays, scene, settings and box of a fit that has far to go."""
+    """Gaussians, spacing, rays, scene and settings of a fit that has far to go."""
     views, planar = {
         "cone": (cone_views, False),
         "parallel": (parallel_views, False),
@@ -42,9 +42,9 @@ def fit_problem(kind, polychromatic, device, kernel, count=17, **changes):
     shape = (1, 7, 9) if planar else (4, 5, 6)
     box = VoxelBox(np.array([-0.6, -0.5, 0.0 if planar else -0.4]), np.array([0.2, 0.21, 0.23]), shape)
     scene = FitScene(
-        box, quadrature, 0.7, *curves, -0.1, kernel, 3.0, 0.0, blurring, 20, corners, False, every, 0.2
+        box, quadrature, 0.7, *curves, -0.1, kernel, 3.0, 0.0, blurring, corners, False, every, 0.2
     )
-    return _gaussians(count, planar, device), 0.2, rays, scene, settings, box
+    return _gaussians(count, planar, device), 0.2, rays, scene, settings
 
 
 def _gaussians(count, planar, device):
@@ -63,16 +63,15 @@ def _gaussians(count, planar, device):
 
 
 def compare_steps(make, device, truth, kind="cone", polychromatic=True, **changes):
-    """Both forms, from the same start with the same views and boxes, must read and change the same."""
+    """Both forms, from the same start with the same views, must read and change the same."""
     outcomes = []
     for form, where, kernel in ((make, device, "triton"), (EagerStep, *truth)):
         problem = fit_problem(kind, polychromatic, where, kernel, **changes)
-        gaussians, box = problem[0], problem[-1]
+        gaussians = problem[0]
         before = gaussians.copy()
-        step = form(*problem[:-1]) if form is EagerStep else form(*problem[:-1], BATCH, box)
+        step = form(*problem) if form is EagerStep else form(*problem, BATCH)
         for k in range(STEPS):
-            part = VoxelBox(box.first + 0.1 * k, box.spacing, box.shape)
-            step(np.array([k, 4 - k]), part, k / STEPS)
+            step(np.array([k, 4 - k]), k / STEPS)
         read = step.read()
         after = {k: t.detach().cpu() for k, t in gaussians.parameters().items()}
         moved = {k: t - before.parameters()[k].cpu() for k, t in after.items()}

@@ -10,7 +10,7 @@ from tomo_polysplat.fit.step import EagerStep
 def _fused(*problem):
     from tomo_polysplat.fit.fused_step import FusedStep
 
-    return FusedStep(*problem[:-1])
+    return FusedStep(*problem)
 
 
 @case
@@ -56,12 +56,12 @@ def every_other_step_smooths_twice_as_much(device):
 def the_slope_by_the_blur_behind_much_matter(device):
     """As large as the projections, and yet a sum of whole numbers."""
     slopes = []
-    for where, kernel, form in ((device, "triton", _fused), ("cpu", "numba", lambda *p: EagerStep(*p[:-2]))):
+    for where, kernel, form in ((device, "triton", _fused), ("cpu", "numba", lambda *p: EagerStep(*p[:-1]))):
         problem = fit_problem("cone", True, where, kernel, held_out=0.0, loss="l1")
         problem[0].blur.zero_()
         problem[0].attenuation.mul_(60.0)
-        step = form(*problem[:-1], BATCH, problem[-1])
-        step(np.array([0, 3]), problem[-1], 0.0)
+        step = form(*problem, BATCH)
+        step(np.array([0, 3]), 0.0)
         slopes.append(10 * float(step.moments["blur"][0]))
     assert abs(slopes[0] / slopes[1] - 1) < 1e-3 and abs(slopes[1]) > 0.1, slopes
 
@@ -71,7 +71,7 @@ def what_is_not_a_number_shows_in_the_misfit(device):
     """Hidden, it would spread through the volume and never end the run."""
     for blurring in (True, False):
         problem = fit_problem("cone", True, device, "triton", blurring=blurring, held_out=0.0)
-        step = _fused(*problem[:-1], BATCH, problem[-1])
+        step = _fused(*problem, BATCH)
         problem[0].attenuation[3] = float("nan")
-        step(np.array([0, 3]), problem[-1], 0.0)
+        step(np.array([0, 3]), 0.0)
         assert np.isnan(step.read()[0]), blurring

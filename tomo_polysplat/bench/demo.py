@@ -28,7 +28,7 @@ FILES = ("demo.png", "demo.h5", "demo.json")
 
 # Small enough for a laptop's patience, large enough to see.
 _SIZE, _VIEWS = 56, 84
-_SETTINGS = {"passes": 5.0, "views_per_step": 4, "max_gaussians": 22_000, "tv_box": 32, "tv_every": 1}
+_SETTINGS = {"passes": 5.0, "views_per_step": 4, "max_gaussians": 22_000}
 
 
 def run_demo(

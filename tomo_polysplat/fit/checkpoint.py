@@ -32,7 +32,7 @@ __all__ = ["Checkpoint", "Snapshot"]
 
 logger = logging.getLogger(__name__)
 
-FORMAT = 12
+FORMAT = 13
 # Writing takes at most this share of the time.
 _LARGEST_SHARE = 0.05
 _PARTS = tuple(field.name for field in fields(Gaussians))
@@ -211,7 +211,7 @@ def _content(about: np.ndarray) -> dict[str, Any]:
 
 def _plan(parts: dict[str, Any]) -> Plan:
     plan = Plan(**parts)
-    counts = (plan.views_per_step, plan.tv_box, plan.tv_every)
+    counts = (plan.views_per_step, plan.tv_every)
     amounts = (plan.reference, plan.first, plan.spacing, plan.smallest_scale, plan.tv_factor)
     above_zero = min(*amounts, *counts) > 0
     whole = all(isinstance(n, int) for n in counts)

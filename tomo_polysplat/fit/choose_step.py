@@ -7,7 +7,6 @@ import logging
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.step import EagerStep, Step
-from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 
@@ -33,7 +32,6 @@ def make_step(
     settings: Settings,
     *,
     batch: int,
-    box: VoxelBox,
 ) -> Step:
     """A CUDA graph where there can be one, else operation by operation.
 
@@ -41,15 +39,13 @@ def make_step(
     ----------
     batch : int
         Views of a step.
-    box : VoxelBox
-        Of the shape that every step will smooth.
     """
     reason = why_eager(scene, settings)
     if not reason:
         from tomo_polysplat.fit.graph_step import GraphStep
 
         try:
-            return GraphStep(gaussians, spacing, rays, scene, settings, batch, box)
+            return GraphStep(gaussians, spacing, rays, scene, settings, batch)
         # Of compiler or driver, of any kind: the slower way gives the same result.
         except Exception as problem:
             logger.debug("no CUDA graph", exc_info=True)

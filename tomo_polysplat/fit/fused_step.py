@@ -34,8 +34,7 @@ from tomo_polysplat.kernels.step.triton_update import FIRST_DECAY, SECOND_DECAY,
 from tomo_polysplat.kernels.step.triton_variation import variation_gradient
 from tomo_polysplat.kernels.voxelise import triton_backward as box_backward
 from tomo_polysplat.kernels.voxelise import triton_forward as box_forward
-from tomo_polysplat.kernels.voxelise.box import VoxelBox
-from tomo_polysplat.kernels.voxelise.triton_setup import ellipsoids
+from tomo_polysplat.kernels.voxelise.triton_setup import box_table, ellipsoids
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.detector_blur import LARGEST_BLUR
 from tomo_polysplat.physics.transmission import nodes_on
@@ -44,10 +43,9 @@ from tomo_polysplat.settings import Settings
 
 __all__ = ["FusedStep"]
 
-# Numbers of the control tensor, in its order: of the update (three and a place left free), of the box, of each view
-# its number and slot, and its geometry. Every part begins at 16 bytes whatever the batch: elsewhere the kernels
-# would be compiled once more.
-_HEAD, _BOX, _CHOSEN, _VIEW = 4, 6, 2, 21
+# Numbers of the control tensor, in its order: of the update, and of each view its number and slot, and its geometry.
+# Every part begins at 16 bytes whatever the batch: elsewhere the kernels would be compiled once more.
+_HEAD, _CHOSEN, _VIEW = 4, 2, 21
 
 
 class FusedStep:
@@ -87,25 +85,23 @@ class FusedStep:
         self._views, self._table = rays.views.select(np.arange(batch)), rays.views.host_table()
         self._sums = torch.zeros(3, dtype=torch.float64, device=device)
         self._skipped = torch.zeros((), dtype=torch.int64, device=device)
-        # The largest values so far of an image and of a box, for sums that do not depend on their order.
+        # The largest values so far of an image and of a volume, for sums that do not depend on their order.
         self._largest = torch.zeros((2, 1), dtype=torch.float32, device=device)
         self._grad_shared = torch.zeros(len(gaussians.shared_material), dtype=torch.int64, device=device)
         self._grad_blur = torch.zeros(1, dtype=torch.int64, device=device)
-        self._control = torch.zeros(
-            _HEAD + _BOX + batch * (_CHOSEN + _VIEW), dtype=torch.float64, device=device
-        )
+        self._control = torch.zeros(_HEAD + batch * (_CHOSEN + _VIEW), dtype=torch.float64, device=device)
         self._curves = None
         if scene.reference_curve is not None and scene.output_curve is not None:
             self._curves = torch.cat([scene.reference_curve, scene.output_curve])
         self._measurement = self._measure()
-        self._box: tuple[int, int, int] = (0, 0, 0)
-        self._no_box = tuple(
+        self._box_table = box_table(scene.box, device)
+        self._not_smoothed = tuple(
             torch.zeros(shape, device=device) for shape in ((len(gaussians), 3),) * 2 + ((len(gaussians), 4),)
         ) + (torch.zeros((1, len(gaussians)), device=device),)
 
     @property
     def largest(self) -> list[float]:
-        """Largest value so far of an image and of a box; see `Step`."""
+        """Largest value so far of an image and of a volume; see `Step`."""
         return self._largest[:, 0].tolist()
 
     @largest.setter
@@ -129,11 +125,10 @@ class FusedStep:
             nodes,
         )
 
-    def __call__(self, views: np.ndarray, box: VoxelBox, share: float) -> None:
+    def __call__(self, views: np.ndarray, share: float) -> None:
         """One step; see `Step`."""
-        self._box = box.shape
         smooth = smoothing(self.settings, self.scene, self.done)
-        values = self._next(views, box, share)
+        values = self._next(views, share)
         self._control.copy_(torch.from_numpy(values))
         self._enqueue(smooth)
         self.feed.used()
@@ -147,7 +142,7 @@ class FusedStep:
         self._unread = 0
         return fitted / steps, held_out_mean(held_out, weight, self.rays.typical_weight), skipped
 
-    def _next(self, views: np.ndarray, box: VoxelBox, share: float) -> np.ndarray:
+    def _next(self, views: np.ndarray, share: float) -> np.ndarray:
         """What the control tensor must hold for the next step."""
         turns = turning(self.done)
         self.done += 1
@@ -156,12 +151,12 @@ class FusedStep:
         root = math.sqrt(1 - SECOND_DECAY**self.done)
         head = [rate, root, float(share >= self.settings.material_from), turns]
         slots = self.feed.place(views)
-        return np.concatenate([head, box.first, box.spacing, views, slots, self._table[views].ravel()])
+        return np.concatenate([head, views, slots, self._table[views].ravel()])
 
     def _enqueue(self, smooth: float) -> None:
         """All kernels of a step that smooths with this weight; what else they read of it is in the control tensor."""
         gaussians, batch = self.gaussians, len(self._views)
-        head, box, chosen, table = self._control.split([_HEAD, _BOX, batch * _CHOSEN, batch * _VIEW])
+        head, chosen, table = self._control.split([_HEAD, batch * _CHOSEN, batch * _VIEW])
         scale, weight, output = activate(
             gaussians.log_scale,
             gaussians.attenuation,
@@ -171,7 +166,7 @@ class FusedStep:
             self._curves,
         )
         drawn = (gaussians.position, scale, gaussians.rotation)
-        of_box = self._box_gradients(*drawn, output, box, smooth) if smooth else self._no_box
+        of_volume = self._volume_gradients(*drawn, output, smooth) if smooth else self._not_smoothed
         of_rays = self._ray_gradients(*drawn, weight, table, chosen)
         if smooth:
             self._join()
@@ -181,7 +176,7 @@ class FusedStep:
             self.moments,
             (scale, self._curves),
             of_rays,
-            of_box,
+            of_volume,
             (self._grad_shared, self._grad_blur, self.pull, self._rates, head),
             self._bounds,
             self.scene.blurring,
@@ -203,11 +198,11 @@ class FusedStep:
         return rays_pull_back(*drawn, table, views, moments)
 
     def _join(self) -> None:
-        """Wait for the box's gradients, where they are made beside those of the rays."""
+        """Wait for the volume's gradients, where they are made beside those of the rays."""
 
-    def _box_gradients(self, position, scale, rotation, output, table, smooth) -> tuple[torch.Tensor, ...]:
-        """Gradients of the total variation in the box, likewise, times ``smooth``."""
-        drawn, box = (position, scale, rotation, output), VoxelBox(np.zeros(3), np.ones(3), self._box)
+    def _volume_gradients(self, position, scale, rotation, output, smooth) -> tuple[torch.Tensor, ...]:
+        """Gradients of the volume's total variation, likewise, times ``smooth``."""
+        drawn, box, table = (position, scale, rotation, output), self.scene.box, self._box_table
         record = ellipsoids(*drawn, table, VOXEL_CUTOFF)
         volume = box_forward.splat(record, 1, box, VOXEL_CUTOFF, self._largest[1])
         chosen = self.settings

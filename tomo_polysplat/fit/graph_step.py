@@ -11,7 +11,6 @@ from tomo_polysplat.fit.fused_step import FusedStep
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.step import smoothing
-from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 
@@ -37,23 +36,21 @@ class GraphStep(FusedStep):
         scene: FitScene,
         settings: Settings,
         batch: int,
-        box: VoxelBox,
     ) -> None:
         super().__init__(gaussians, spacing, rays, scene, settings, batch)
-        self._box = box.shape
         self._side = torch.cuda.Stream(gaussians.position.device)
         self._waiting = [
             torch.zeros(len(self._control), dtype=torch.float64).pin_memory() for _ in range(_AHEAD)
         ]
         self._passed = [torch.cuda.Event() for _ in range(_AHEAD)]
-        self._graphs = self._record(batch, box)
+        self._graphs = self._record(batch)
 
-    def __call__(self, views: np.ndarray, box: VoxelBox, share: float) -> None:
+    def __call__(self, views: np.ndarray, share: float) -> None:
         """One step; see `Step`."""
         turn = self.done % _AHEAD
         self._passed[turn].synchronize()
         graph = self._graphs[smoothing(self.settings, self.scene, self.done)]
-        values = self._next(views, box, share)
+        values = self._next(views, share)
         self._waiting[turn].numpy()[:] = values
         self._control.copy_(self._waiting[turn], non_blocking=True)
         graph.replay()
@@ -61,13 +58,13 @@ class GraphStep(FusedStep):
         self._passed[turn].record(torch.cuda.current_stream(self._control.device))
         self.feed.used()
 
-    def _record(self, batch: int, box: VoxelBox) -> dict[float, torch.cuda.CUDAGraph]:
+    def _record(self, batch: int) -> dict[float, torch.cuda.CUDAGraph]:
         """Graphs by the weight they smooth with, after a trial run that compiles the kernels and leaves no trace."""
         before, device = self.gaussians.copy(), self.gaussians.position.device
         weights = {smoothing(self.settings, self.scene, step) for step in range(self.scene.tv_every)}
         with torch.no_grad(), torch.cuda.device(device):
             try:
-                super().__call__(np.arange(batch), box, 0.0)
+                super().__call__(np.arange(batch), 0.0)
                 torch.cuda.synchronize()
             finally:
                 self._forget(before)
@@ -91,11 +88,11 @@ class GraphStep(FusedStep):
             tensor.zero_()
         self.done = self._unread = 0
 
-    def _box_gradients(self, position, scale, rotation, output, table, smooth) -> tuple[torch.Tensor, ...]:
+    def _volume_gradients(self, position, scale, rotation, output, smooth) -> tuple[torch.Tensor, ...]:
         """Beside those of the rays: each alone leaves much of a GPU idle."""
         self._side.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(self._side):
-            return super()._box_gradients(position, scale, rotation, output, table, smooth)
+            return super()._volume_gradients(position, scale, rotation, output, smooth)
 
     def _join(self) -> None:
         torch.cuda.current_stream().wait_stream(self._side)

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import torch
 
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model.gaussians import Gaussians
-from tomo_polysplat.render.renderer import VOXEL_CUTOFF
 from tomo_polysplat.settings import Settings
 
-__all__ = ["misfit", "random_box", "roughness", "total_variation", "weighted_huber", "weighted_l1"]
+__all__ = ["misfit", "roughness", "total_variation", "weighted_huber", "weighted_l1"]
 
 
 def misfit(
@@ -43,21 +40,9 @@ def weighted_huber(
     return value.sum() / weight.sum().clamp(min=1e-12)
 
 
-def random_box(whole: VoxelBox, edge: int, rng: np.random.Generator) -> VoxelBox:
-    """A box of ``edge`` voxels an edge anywhere in the volume; its shape is always the same."""
-    nz, ny, nx = (min(edge, n) for n in whole.shape)
-    z, y, x = (int(rng.integers(0, n - m + 1)) for n, m in zip(whole.shape, (nz, ny, nx)))
-    return whole.part((z, y, x), (nz, ny, nx))
-
-
-def roughness(gaussians: Gaussians, scene: FitScene, settings: Settings, box: VoxelBox) -> torch.Tensor:
-    """Total variation of the volume in a box."""
-    lower = gaussians.position.new_tensor(box.first)
-    upper = gaussians.position.new_tensor(box.first + (np.array(box.shape[::-1]) - 1) * box.spacing)
-    with torch.no_grad():
-        reach = VOXEL_CUTOFF * gaussians.log_scale.amax(dim=1, keepdim=True).exp()
-        near = ((gaussians.position + reach >= lower) & (gaussians.position - reach <= upper)).all(dim=1)
-    volume = scene.attenuation(gaussians.select(near.nonzero()[:, 0]), box)
+def roughness(gaussians: Gaussians, scene: FitScene, settings: Settings) -> torch.Tensor:
+    """Total variation of the volume."""
+    volume = scene.attenuation(gaussians, scene.box)
     return total_variation(volume, settings.tv_clip, scene.tv_corners, settings.bone_level)
 
 

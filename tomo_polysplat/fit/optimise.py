@@ -14,7 +14,6 @@ import torch
 
 from tomo_polysplat.fit.checkpoint import Checkpoint, Snapshot
 from tomo_polysplat.fit.choose_step import make_step
-from tomo_polysplat.fit.loss import random_box
 from tomo_polysplat.fit.metal_numbers import number_metals
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
@@ -79,9 +78,7 @@ class _Fitter:
         rng: np.random.Generator,
     ) -> None:
         self.gaussians, self.rays, self.scene, self.settings, self.rng = gaussians, rays, scene, settings, rng
-        # Its shape is that of every box.
-        box = random_box(scene.box, scene.tv_box, np.random.default_rng(0))
-        self.step = make_step(gaussians, spacing, rays, scene, settings, batch=batch, box=box)
+        self.step = make_step(gaussians, spacing, rays, scene, settings, batch=batch)
         self.batch, self.order = batch, np.empty(0, int)
         self.relocated = 0
         self.relocation_due = False
@@ -96,7 +93,7 @@ class _Fitter:
             if self.relocation_due:
                 self._relocate()
             views = self._next_views(self.batch)
-            self.step(views, random_box(self.scene.box, self.scene.tv_box, self.rng), share)
+            self.step(views, share)
             clock.done += 1
             made += 1
             if made == steps:

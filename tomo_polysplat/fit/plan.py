@@ -42,14 +42,15 @@ PASSES = 10.0
 # larger ones too (128^2, twice the passes: steel wires 26.4 to 28.3, soft tissue 44.2 to 45.4), but not the fan-beam
 # slices (22 000 seeds, 1.5 times the passes: 39.6 to 39.6, 37.7 to 37.5): theirs go with the root.
 _LONGER, _LONGER_PLANAR = (1.5, 9000), (2.0, 36_000)
-# Voxels along an edge of the box that is smoothed. What a box seldom meets is smoothed by leaps, which upset the
-# optimiser's sense of scale (teeth, 128^3 voxels: 39.1, 39.7 and 40.2 dB with 32, 64 and 128).
-_TV_BOX, _TV_BOX_PLANAR = {"cpu": 48, "cuda": 128}, 256
 # Voxels take 40 % of a step. Smoothed at every other step, twice as much, volumes are the same in 10 to 30 % less time
 # (twelve scans of 32^3 to 64^3 on a CPU: -0.03 dB without metal and 0.0 everywhere in the mean, -0.17 at most; seven
-# of 64^3 and 128^3 on an H200: 0.0). In slices, where they take less, a casting of 128^2 lost 0.1 dB, and where a GPU's
-# box holds an eighth of the volume, four of 256^3 lost 0.1 to 0.4.
-_TV_EVERY = 2
+# of 64^3 and 128^3 on an H200: 0.0), and larger ones, which would take most of it, less often yet. Too seldom, in a
+# CPU's 300 steps or a GPU's 900, they are smoothed by leaps, which upset the optimiser's sense of scale (pins, 64^3,
+# 300 steps: 35.7, 35.6 and 35.1 dB at every second, fourth and eighth). In slices, where they take less, a casting of
+# 128^2 lost 0.1 dB by every other step.
+_TV_EVERY, _TV_RARELY = 2, {"cpu": 4, "cuda": 8}
+# Voxels that a step can smooth while it does the rest.
+_TV_VOXELS, _TV_VOXELS_PLANAR = {"cpu": 140_000, "cuda": 4_200_000}, 65_536
 # Smallest deviation of a Gaussian in voxels. Where a volume has fewer Gaussians than the detector could tell apart,
 # each shows more of an edge: half as thick (H200, six scenes of 128^3 to 256^3) 0.8 dB more everywhere in the mean,
 # 0.05 without metal. Where they are many (40^3), and in slices, that changed nothing or lost 0.1 dB.
@@ -84,10 +85,8 @@ class Plan:
     views_per_step : int
     passes : float
         Times that every view is used.
-    tv_box : int
-        Edge in voxels of the random box whose total variation a step takes.
     tv_every : int
-        In every how many steps it does.
+        In every how many steps the volume's total variation is taken.
     tv_corners : pair of float
         Difference of neighbouring voxels, in soft references, up to which it counts in full: of soft matter, and where
         one of the two is bone-like or denser.
@@ -113,7 +112,6 @@ class Plan:
     smallest_scale: float
     views_per_step: int
     passes: float
-    tv_box: int
     tv_every: int
     tv_corners: tuple[float, float]
     curves: int
@@ -155,9 +153,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     most = _MOST_VIEWS_PLANAR if problem.planar else _MOST_VIEWS[device]
     longer = _longer(_cells(support, problem) / spacing**problem.dimensions, problem.planar)
     passes, views, reason = _length(problem.geometry.views, settings, most, longer)
-    box = settings.tv_box or (_TV_BOX_PLANAR if problem.planar else _TV_BOX[device])
-    at_each = problem.planar or (device == "cuda" and box < max(start.shape))
-    every = settings.tv_every or (1 if at_each else _TV_EVERY)
+    every = settings.tv_every or _tv_every(math.prod(start.shape), problem.planar, device)
     curves, needed = _curves(start, first * problem.depth, problem.polychromatic, settings)
     blurred, told = _blurred(start, first * problem.depth, settings)
     corners, texture = tv_corners(relative, matter.adapted(settings), problem.agreement, light)
@@ -172,7 +168,6 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
         smallest,
         views,
         passes,
-        box,
         every,
         corners,
         curves,
@@ -192,7 +187,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
         "seed_spacing_voxels": f"{spacing:.2f}: {because}",
         "smallest_scale": f"{smallest:g} voxels: {thin}",
         "views_per_step": f"{views} of {problem.geometry.views}: {reason}",
-        "smoothed_box": _smoothed(box, every, start, settings),
+        "smoothed": _smoothed(every, settings),
         "texture": texture,
         "detector_blur": told,
         "passes": f"{passes:g} over the views at most, fewer where {settings.held_out:.1%} of the rays, held"
@@ -301,11 +296,15 @@ def finest_spacing(problem: Problem) -> tuple[float, str]:
     return 1.3, "1.3 voxels"
 
 
-def _smoothed(box: int, every: int, start: np.ndarray | torch.Tensor, settings: Settings) -> str:
-    whole = box >= max(start.shape)
-    where = "all of the volume" if whole else f"a box of {box} voxels an edge, elsewhere in each step"
-    when = f", in one step of {every}" if every > 1 else ""
-    return f"{where}{when}: {'asked for' if settings.tv_box else 'what a step has time for'}"
+def _tv_every(voxels: int, planar: bool, device: str) -> int:
+    """In every how many steps a volume is smoothed."""
+    at_once = _TV_VOXELS_PLANAR if planar else _TV_VOXELS[device]
+    return min(max(-(-voxels // at_once), 1 if planar else _TV_EVERY), _TV_RARELY[device])
+
+
+def _smoothed(every: int, settings: Settings) -> str:
+    when = f"in one step of {every}" if every > 1 else "in every step"
+    return f"the volume, {when}: {'asked for' if settings.tv_every else 'what steps have time for'}"
 
 
 def _longer(seeds: float, planar: bool) -> float:

@@ -29,7 +29,7 @@ def work(plan: Plan, problem: Problem, settings: Settings, gaussians: int) -> st
     images = "1 image" if plan.curves == 1 else f"{plan.curves} images"
     return (
         f"{gaussians} Gaussians x {max(1.0, pixels):.0f} pixels x {views} views ="
-        f" {gaussians * max(1.0, pixels) * views:.2g} pairs a pass, of {images}; the smoothed box {steps} times"
+        f" {gaussians * max(1.0, pixels) * views:.2g} pairs a pass, of {images}; the volume {steps} times"
     )
 
 
@@ -51,12 +51,12 @@ def alternatives(plan: Plan, problem: Problem, settings: Settings, gaussians: in
         "passes": f"{2 * plan.passes:g} for {plan.passes:g}: twice the time",
         "patience": f"{patience_of(settings, plan.passes)} passes without improvement end it sooner",
         "edges": "sharp or blurred: without two short fits, of about a pass over the views each, that tell which",
-        "tv_weight": "0: no smoothed box, which on a CPU takes about half of the time",
+        "tv_weight": "0: nothing is smoothed, which on a CPU takes about half of the time",
     }
     if plan.views_per_step > 1:
         fewer = plan.views_per_step // 2
         told["views_per_step"] = (
-            f"{fewer}: as many pairs, the smoothed box {plan.views_per_step / fewer:.2g} times as often"
+            f"{fewer}: as many pairs, the volume smoothed {plan.views_per_step / fewer:.2g} times as often"
         )
     if problem.polychromatic:
         told["curves"] = (

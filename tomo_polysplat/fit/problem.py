@@ -211,7 +211,6 @@ class Problem:
             settings.cutoff,
             settings.metal_tail,
             plan.blurred,
-            plan.tv_box,
             plan.tv_corners,
             closed,
             plan.tv_every,

@@ -49,15 +49,13 @@ class FitScene:
         Share of the metal around a voxel that some point of it has to come near to; see ``render.metal_edges``.
     blurring : bool
         Whether rays are seen through the detector's blur; see ``physics.detector_blur``.
-    tv_box : int
-        Edge in voxels of the random box whose total variation a step takes.
     tv_corners : pair of float
         Difference of neighbouring voxels, in soft references, up to which it counts in full: of soft matter, and where
         one of the two is bone-like or denser.
     closed : bool
         Whether all matter lies within the voxels, so that no Gaussian may leave them; see ``fit.inside``.
     tv_every : int
-        In every how many steps that total variation is taken, and counts as many times.
+        In every how many steps the volume's total variation is taken, and counts as many times.
     smallest_scale : float
         Smallest deviation of a Gaussian, in voxels, or in spacings of the seeds where these are closer.
     solid_number : callable or None
@@ -74,7 +72,6 @@ class FitScene:
     cutoff: float
     metal_tail: float
     blurring: bool
-    tv_box: int
     tv_corners: tuple[float, float]
     closed: bool
     tv_every: int

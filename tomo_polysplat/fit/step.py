@@ -12,7 +12,6 @@ from tomo_polysplat.fit.loss import misfit, roughness
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.similarity import dissimilarity
-from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.detector_blur import LARGEST_BLUR
 from tomo_polysplat.settings import Settings
@@ -59,8 +58,8 @@ class Step(Protocol):
     done: int
     largest: list[float]
 
-    def __call__(self, views: np.ndarray, box: VoxelBox, share: float) -> None:
-        """Step towards the rays of these views and a smooth box; ``share`` of the run is done, 0 to 1."""
+    def __call__(self, views: np.ndarray, share: float) -> None:
+        """Step towards the rays of these views and a smooth volume; ``share`` of the run is done, 0 to 1."""
 
     def read(self) -> tuple[float, float, int]:
         """Since the last call: mean misfit of the fitted rays and of those held out, and pairs skipped.
@@ -148,7 +147,7 @@ class EagerStep:
         for memory in self.optimiser.state.values():
             memory["step"].fill_(steps)
 
-    def __call__(self, views: np.ndarray, box: VoxelBox, share: float) -> None:
+    def __call__(self, views: np.ndarray, share: float) -> None:
         """One step; see `Step`."""
         for group in self.optimiser.param_groups:
             group["lr"] = group["rate"] * self.settings.final_rate**share
@@ -156,7 +155,7 @@ class EagerStep:
         chosen, measured, weight, aside = self.rays.batch(views)
         predicted, skipped = self.scene.projections(self.gaussians, chosen)
         fitted = misfit(predicted, measured, weight, self.settings)
-        loss = fitted + self._regularisation(predicted, measured, weight, box)
+        loss = fitted + self._regularisation(predicted, measured, weight)
         self.optimiser.zero_grad(set_to_none=True)
         # On this thread: autograd's own would be woken and waited for at every step.
         with torch.autograd.set_multithreading_enabled(False):
@@ -187,13 +186,13 @@ class EagerStep:
         return fitted / steps, held_out_mean(held_out, weight, self.rays.typical_weight), round(skipped)
 
     def _regularisation(
-        self, predicted: torch.Tensor, measured: torch.Tensor, weight: torch.Tensor, box: VoxelBox
+        self, predicted: torch.Tensor, measured: torch.Tensor, weight: torch.Tensor
     ) -> torch.Tensor | float:
         """What is added to the misfit: total variation, and the dissimilarity of the projections if asked for."""
         settings = self.settings
         total: torch.Tensor | float = 0.0
         if weight_now := smoothing(settings, self.scene, self._done):
-            total = total + weight_now * roughness(self.gaussians, self.scene, settings, box)
+            total = total + weight_now * roughness(self.gaussians, self.scene, settings)
         if settings.ssim_weight:
             total = total + settings.ssim_weight * dissimilarity(predicted, measured, weight)
         return total

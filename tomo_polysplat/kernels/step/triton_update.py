@@ -91,7 +91,7 @@ def _update_kernel(
     position_1, log_scale_1, rotation_1, attenuation_1, own_1,
     position_2, log_scale_2, rotation_2, attenuation_2, own_2,
     scale, curves, grad_position, grad_scale, grad_rotation, grad_weight,
-    box_position, box_scale, box_rotation, grad_output, grad_shared, pull, rates, control, count,
+    volume_position, volume_scale, volume_rotation, grad_output, grad_shared, pull, rates, control, count,
     low, high, least_u, most_u, epsilon,
     DIMS: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -101,7 +101,7 @@ def _update_kernel(
     square = tl.zeros([BLOCK], tl.float32)
     for k in tl.static_range(3):
         at = n * 3 + k
-        gradient = _both(grad_position, box_position, at, live)
+        gradient = _both(grad_position, volume_position, at, live)
         square += gradient * gradient
         rate = tl.load(rates) * share
         p = _adam(position, position_1, position_2, at, live, gradient, rate, root, epsilon)
@@ -109,7 +109,7 @@ def _update_kernel(
     tl.store(pull + n, tl.load(pull + n, mask=live, other=0.0) + tl.sqrt(square), mask=live)
     for k in tl.static_range(DIMS):
         at = n * DIMS + k
-        gradient = _both(grad_scale, box_scale, n * 3 + k, live)
+        gradient = _both(grad_scale, volume_scale, n * 3 + k, live)
         gradient *= tl.load(scale + n * 3 + k, mask=live, other=0.0)
         rate = tl.load(rates + 1) * share
         p = _adam(log_scale, log_scale_1, log_scale_2, at, live, gradient, rate, root, epsilon)
@@ -117,7 +117,7 @@ def _update_kernel(
     turning = tl.load(control + 3).to(tl.float32)
     for k in tl.static_range(4):
         at = n * 4 + k
-        gradient = _both(grad_rotation, box_rotation, at, live)
+        gradient = _both(grad_rotation, volume_rotation, at, live)
         rate = tl.load(rates + 2) * share * turning
         p = _adam(rotation, rotation_1, rotation_2, at, live, gradient, rate, root, epsilon)
         tl.store(rotation + at, p, mask=live)
@@ -161,7 +161,7 @@ def update(
     moments: dict[str, tuple[torch.Tensor, torch.Tensor]],
     drawn: tuple[torch.Tensor, torch.Tensor | None],
     of_rays: tuple[torch.Tensor, ...],
-    of_box: tuple[torch.Tensor, ...],
+    of_volume: tuple[torch.Tensor, ...],
     state: tuple[torch.Tensor, ...],
     bounds: Bounds,
     blurring: bool,
@@ -176,7 +176,7 @@ def update(
     moments : dict of pairs of tensors
     drawn : tuple
         Deviations (n, 3) and the curves given to `activate`.
-    of_rays, of_box : tuple of tensors
+    of_rays, of_volume : tuple of tensors
         Gradients of position, deviation, rotation and weights, as the projection's and the voxeliser's
         adjoints give them.
     state : tuple of tensors
@@ -196,7 +196,7 @@ def update(
         _update_kernel[(triton.cdiv(count, _BLOCK),)](
             *(parameters[k] for k in names), parameters["shared_material"], group,
             *(moments[k][0] for k in names), *(moments[k][1] for k in names),
-            scale, scale if curves is None else curves, *of_rays, *of_box, grad_shared, pull, rates, control,
+            scale, scale if curves is None else curves, *of_rays, *of_volume, grad_shared, pull, rates, control,
             count, low, high, least, most, bounds.epsilon,
             DIMS=parameters["log_scale"].shape[1], CHANNELS=1 if curves is None else 3, BLOCK=_BLOCK,
             num_warps=4,

@@ -35,8 +35,8 @@ def _along(volume, at, value, index, length, stride, live, ceiling, dense, by_co
 def _variation_kernel(
     volume, grad, largest, nz, ny, nx, ceiling, dense, by_corner, by_dense_corner, factor, BLOCK: tl.constexpr
 ):  # fmt: skip
-    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    size = nz * ny * nx
+    at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    size = tl.cast(nz, tl.int64) * ny * nx
     live = at < size
     line = at // nx
     x, y, z = at - line * nx, line % ny, line // ny
