@@ -10,6 +10,11 @@ __all__ = ["MAIN_SHARE", "main_level", "mass_level"]
 # Of the mass that is no denser than so many times the level of half of it, the share below the main matter's
 # attenuation. Too low a reference smooths too much (walls of a voxel, one energy: 20.8 dB with half the mass, 21.6).
 _NOT_METAL, MAIN_SHARE = 3.0, 0.7
+# That level is metal's where it is so many times that of the matter below a third of it, and voxels within the factor
+# of this, with all their neighbours, are so many times as many as those above. Discs of 64^2 voxels with rods that hold
+# 55 to 77 % of the mass came to 2.7 to 25 times, solids in noise, foams, needles and wires to less than 0.2, one
+# in foam a twentieth as dense to 1.8; a start of few views has too many streaks to tell.
+_FAR, _ALIKE, _MANY = 6.0, 1.5, 2.0
 
 
 def mass_level(volume: np.ndarray | torch.Tensor, share: float = 0.5) -> float:
@@ -23,6 +28,31 @@ def mass_level(volume: np.ndarray | torch.Tensor, share: float = 0.5) -> float:
 
 
 def main_level(volume: np.ndarray | torch.Tensor) -> float:
-    """Attenuation of the main matter: above the level of half the mass where walls are too thin to show theirs."""
+    """Attenuation of the main matter: above the level of half the mass where walls are too thin to show theirs.
+
+    Metal may hold most of the mass: what most voxels are made of, and by far lighter, is the main matter then.
+    """
     values = torch.as_tensor(volume)
-    return mass_level(values[values <= _NOT_METAL * mass_level(values)], MAIN_SHARE)
+    level = mass_level(values)
+    if _is_metal(level, values):
+        return main_level(torch.where(values <= level / _NOT_METAL, values, 0.0))
+    return mass_level(values[values <= _NOT_METAL * level], MAIN_SHARE)
+
+
+def _is_metal(level: float, values: torch.Tensor) -> bool:
+    """Whether the level of half the mass is that of metal in lighter matter, which noise and streaks are not."""
+    light = mass_level(values[values <= level / _NOT_METAL])
+    if not 0 < _FAR * light < level:
+        return False
+    alike = (values > light / _ALIKE) & (values < light * _ALIKE) & (values <= level / _NOT_METAL)
+    return int(_inner(alike).sum()) > _MANY * int((values > level / _NOT_METAL).sum())
+
+
+def _inner(mask: torch.Tensor) -> torch.Tensor:
+    """Voxels whose neighbours along every axis are in the mask as they are."""
+    inner = mask.clone()
+    for axis, length in enumerate(mask.shape):
+        first, last = (mask.narrow(axis, k, length - 1) for k in (0, 1))
+        inner.narrow(axis, 0, length - 1).logical_and_(last)
+        inner.narrow(axis, 1, length - 1).logical_and_(first)
+    return inner
