@@ -95,7 +95,8 @@ def reconstruct(
     calibrate : bool or names among "scatter", "kvp", "filter"
         Fit these by a few short fits first, and use what fits the held-out rays better: a constant scattered
         signal, and the tube's voltage or its filters, which need ``soft_density``. True calibrates scatter, and
-        the voltage where the density is given. ``result.plan["calibration"]`` tells what came of it.
+        the voltage where the density is given. ``result.plan["calibration"]`` tells what came of it; what a time
+        budget leaves no room for is left as it is.
     soft_density : float, optional
         Known density in g/cm3 of what most of the object is made of, the first of ``materials``.
     callbacks : sequence of callables

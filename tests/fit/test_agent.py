@@ -48,7 +48,7 @@ def test_short_fits_begin_with_the_start_there_is_and_the_best_is_taken(dense, m
 
     def fit(problem, start, fitted, settings, *rest):
         seen.append((start, settings))
-        return SimpleNamespace(held_out=1.0 / len(seen))
+        return SimpleNamespace(held_out=1.0 / len(seen), cut=False)
 
     monkeypatch.setattr("tomo_polysplat.fit.agent.short_fit", fit)
     named = ("water", "bone", dense)
@@ -64,6 +64,16 @@ def test_short_fits_begin_with_the_start_there_is_and_the_best_is_taken(dense, m
         assert (
             best.metal_level == seen[-1][1].metal_level != settings.metal_level and "agent" in told["agent"]
         )
+
+
+def test_short_fits_that_the_time_budget_ends_tell_no_agent():
+    scan, device = fan(), torch.device("cpu")
+    named = ("water", "bone", "I")
+    problem = Problem.of(scan.projections.swapaxes(0, 1), *geometries(scan), "cm", scan.spectrum, named)
+    settings, options = make_settings(), {"seed": 0, "time_budget": 1e-3}
+    start, _ = first_volume(problem, device, settings)
+    best, told = settings_for_agent(start, 1.0, problem, settings, device, options)
+    assert best is settings and "too short" in told["agent"]
 
 
 def test_metal_that_was_named_starts_as_itself():

@@ -1,5 +1,6 @@
 """What a calibration is asked for, what it finds on a small scan, and what it leaves alone."""
 
+import time
 from functools import cache
 
 import numpy as np
@@ -8,7 +9,7 @@ import torch
 from small_scans import geometries, reconstruct
 
 import tomo_polysplat as tps
-from tomo_polysplat.fit.calibration import Calibration, _judge, with_fitted
+from tomo_polysplat.fit.calibration import Calibration, _judge, calibrated, with_fitted
 from tomo_polysplat.fit.first_volume import first_volume
 from tomo_polysplat.fit.plan import make_plan
 from tomo_polysplat.fit.problem import Problem
@@ -90,6 +91,38 @@ def test_a_known_density_brings_the_voltage_back():
     assert found["accepted"] == {"kvp": True}
     assert 81 * found["fitted"]["kvp"] == pytest.approx(90, abs=4.5)
     assert result.energy_kev == result.spectrum.effective_energy > wrong.effective_energy
+
+
+def test_a_short_fit_that_the_time_budget_ends_tells_nothing():
+    scan = fan(0.05)
+    result = reconstruct(scan, valid=scan.valid, calibrate=True, soft_density=1.19, time_budget=1e-3)
+    found = result.plan["calibration"]
+    assert found["accepted"] == {"scatter": False, "kvp": False} and found["fitted"] == {}
+    assert found["why"].count("the time budget is too short to tell") == 2 and len(found["trials"]) == 1
+
+
+@pytest.mark.parametrize(
+    "seconds, cut, made",
+    [((0, 0), (False, True), 2), ((0.2, 0), (False, False), 1), ((0, 0), (False, False), 2)],
+)
+def test_a_stage_is_taken_where_its_short_fits_had_their_time(seconds, cut, made, monkeypatch):
+    """The second would be taken for half the error of the first."""
+    trials = []
+
+    def fit(problem, start, fitted, *rest, **steps):
+        trials.append(fitted)
+        number = len(trials) - 1
+        time.sleep(seconds[number])
+        return ShortFit(fitted, 0.5**number, 1.0, np.zeros((3, 0)), np.zeros(0), np.zeros(0), cut=cut[number])
+
+    monkeypatch.setattr("tomo_polysplat.fit.calibration.short_fit", fit)
+    monkeypatch.setattr("tomo_polysplat.fit.calibration.first_volume", lambda *scan: (None, ""))
+    monkeypatch.setattr("tomo_polysplat.fit.calibration.estimate_scatter", lambda *rays: 0.05)
+    problem, wanted = problem_of(fan(0.0), SPECTRUM), Calibration(("scatter",), None)
+    found = calibrated(problem, wanted, make_settings(), torch.device("cpu"), 0, 0.6)
+    taken = made == 2 and not any(cut)
+    assert found["accepted"] == {"scatter": taken} and found["fitted"] == ({"scatter": 0.05} if taken else {})
+    assert len(trials) == made and ("too short" in found["why"]) != taken
 
 
 @pytest.mark.parametrize("kvp, density, factors", [(210, 3.0, (1.0, 225 / 210)), (33, 0.3, (30 / 33, 1.0))])

@@ -76,10 +76,12 @@ def settings_for_agent(
     # differs, would otherwise decide on the blur as well.
     alike: dict[str, Any] = {"held_out": 0.0, "blur": 0.0, "learning_rate_blur": 0.0}
     seed, seconds = options["seed"], options["time_budget"]
-    misfits = [
-        short_fit(problem, start, {}, replace(choice, **alike), device, seed, seconds, _STEPS).held_out
-        for choice in choices
-    ]
+    misfits = []
+    for choice in choices:
+        one = short_fit(problem, start, {}, replace(choice, **alike), device, seed, seconds, _STEPS)
+        if one.cut:
+            return settings, {"agent": "as without an edge: the time budget is too short to tell"}
+        misfits.append(one.held_out)
     best = choices[int(np.argmin(misfits))]
     words = ["as without an edge", *(f"the agent above {level:.3g} soft references" for level in levels)]
     tried = ", ".join(f"{misfit:.4g} {word}" for misfit, word in zip(misfits, words))

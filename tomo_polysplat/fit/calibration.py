@@ -9,6 +9,7 @@ density of the object's main matter, where that is known.
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -31,6 +32,9 @@ __all__ = ["Calibration", "calibrated", "with_fitted"]
 logger = logging.getLogger(__name__)
 
 _ROUNDS = 2
+# Of the seconds that a reconstruction may take, the share for all short fits with their start volumes.
+_SHARE_OF_BUDGET = 0.6
+_TOO_SHORT = "the time budget is too short to tell"
 # Steps of a short fit that tells a density: it is 0.7 to 1.5 % low after 120 (teeth, pins, lung), 0.3 to 0.5 after 240.
 _STEPS_FOR_DENSITY = 240
 # Scatter below this share of the open beam, and densities closer than this, are left as they are.
@@ -137,19 +141,16 @@ def calibrated(
         ``held_out_before`` and ``held_out_after``; ``trials``: every short fit; ``why`` in words.
     """
 
-    steps = {} if wanted.soft_density is None else {"fewest_steps": _STEPS_FOR_DENSITY}
-
-    def trial(fitted: Mapping[str, float]) -> ShortFit:
-        physics = with_fitted(problem, fitted)
-        start, _ = first_volume(physics, device, settings)
-        return short_fit(physics, start, dict(fitted), settings, device, seed, time_budget, **steps)
-
-    first = best = trial({})
-    trials, accepted, why = [first], {}, []
+    trials = _Trials(problem, wanted, settings, device, seed, time_budget)
+    first = best = trials.made_under({})
+    accepted, why = {}, []
     for name in sorted(wanted.names, key=lambda name: name != "scatter"):
-        stage = _stage(name, best, wanted, problem, trial)
-        trials += stage
-        accepted[name], reason = _judge(name, best, stage, problem)
+        try:
+            trials.require_time()
+            stage = _stage(name, best, wanted, problem, trials.another)
+            accepted[name], reason = _judge(name, best, stage, problem)
+        except _Untold as untold:
+            accepted[name], reason = False, f"not accepted: {untold}"
         why.append(f"{name}: {reason}")
         if accepted[name]:
             best = _last(name, stage)
@@ -159,9 +160,61 @@ def calibrated(
         "accepted": accepted,
         "held_out_before": first.held_out,
         "held_out_after": best.held_out,
-        "trials": [one.record() for one in trials],
+        "trials": [one.record() for one in trials.made],
         "why": "; ".join(why),
     }
+
+
+class _Untold(Exception):
+    """Short fits that tell nothing, and why."""
+
+
+class _Trials:
+    """Short fits under one physics after another, for as long as the time budget has room for them."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        wanted: Calibration,
+        settings: Settings,
+        device: torch.device,
+        seed: int,
+        time_budget: float | None,
+    ) -> None:
+        self._problem, self._settings, self._device, self._seed = problem, settings, device, seed
+        self._steps = () if wanted.soft_density is None else (_STEPS_FOR_DENSITY,)
+        self._budget, self._begun = time_budget, time.perf_counter()
+        self.made: list[ShortFit] = []
+
+    def made_under(self, fitted: Mapping[str, float]) -> ShortFit:
+        """A short fit, cut or not."""
+        physics, settings, device = with_fitted(self._problem, fitted), self._settings, self._device
+        start, _ = first_volume(physics, device, settings)
+        rest = (self._seed, self._budget, *self._steps)
+        self.made.append(short_fit(physics, start, dict(fitted), settings, device, *rest))
+        return self.made[-1]
+
+    def another(self, fitted: Mapping[str, float]) -> ShortFit:
+        """A short fit that the time budget leaves room for.
+
+        Raises
+        ------
+        _Untold
+            If there is none.
+        """
+        self.require_time()
+        one = self.made_under(fitted)
+        if one.cut:
+            raise _Untold(_TOO_SHORT)
+        return one
+
+    def require_time(self) -> None:
+        """See to it that no short fit so far was cut, and that one more, as long as they were, can be made."""
+        if self._budget is None:
+            return
+        spent, number = time.perf_counter() - self._begun, len(self.made)
+        if self.made[-1].cut or spent * (number + 1) / number > _SHARE_OF_BUDGET * self._budget:
+            raise _Untold(_TOO_SHORT)
 
 
 def _stage(

@@ -56,6 +56,8 @@ class ShortFit:
         Areal densities in g/cm2 of some of the rays.
     measured, weight : (rays,) arrays
         Their P, and the inverse of its deviation, 1 for a ray without noise.
+    cut : bool
+        Whether the time budget ended it, so that it tells nothing.
     """
 
     fitted: dict[str, float]
@@ -64,6 +66,7 @@ class ShortFit:
     areal: np.ndarray
     measured: np.ndarray
     weight: np.ndarray
+    cut: bool = False
 
     def record(self) -> dict[str, float]:
         """Its numbers, for the plan."""
@@ -115,7 +118,7 @@ def short_fit(
         sample = _sample(outcome.gaussians, scene, rays, seed)
     errors = [entry["held_out"] or entry["loss"] for entry in outcome.history] or [np.inf]
     main = main_density(density, settings.metal_level * plan.reference)
-    return ShortFit(fitted, float(min(errors)), main, *sample)
+    return ShortFit(fitted, float(min(errors)), main, *sample, cut=cut_short(outcome))
 
 
 def fitted_shortly(
