@@ -114,3 +114,22 @@ def test_detector_responses():
         Detector.energy_integrating("CsI", 0.0)
     with pytest.raises(ValueError, match="sensor"):
         Detector.photon_counting(thickness_cm=0.1)
+
+
+@pytest.mark.parametrize(
+    "one, other, same",
+    [
+        ("aluminum", "aluminium", True),
+        ("Al", "Aluminium", True),
+        ({"Al": 1.0}, "aluminium", True),
+        ("titanium", "aluminium", False),
+        # The density of the first material is what an object that is made of it is measured by.
+        ({"Al": 0.5, "Cu": 0.5}, "aluminium", False),
+        ("graphite carbon", "carbon", False),
+    ],
+)
+def test_materials_are_the_same_however_they_are_spelt(one, other, same):
+    first, second = Materials(one, "bone", "iron"), Materials(other, "bone", "iron")
+    assert (first == second) == same and (first != second) != same
+    assert not same or hash(first) == hash(second)
+    assert Materials("H2O", "Al", {"Fe": 1.0}) == Materials() != ("water", "aluminium", "iron")

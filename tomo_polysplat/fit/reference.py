@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.model.seed_samples import box_mean
-from tomo_polysplat.physics.materials import MaterialLike, Materials, density
+from tomo_polysplat.physics.materials import MaterialLike, Materials, known_density
 from tomo_polysplat.physics.solids import number_of_solid
 from tomo_polysplat.physics.water import transmitted_energy
 from tomo_polysplat.settings import Settings
@@ -163,8 +163,5 @@ def _main_solid(relative: torch.Tensor, settings: Settings, lighter: float) -> f
 
 def _first_density(material: MaterialLike, level: float) -> float:
     """Density in g/cm3 of the first material as soft matter; that of an object mostly of it if nobody knows it."""
-    try:
-        known = density(material) if isinstance(material, str) else level
-    except ValueError:
-        known = level
+    known = known_density(material) or level
     return known if known > _SOLID else 1.0

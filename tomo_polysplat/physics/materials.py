@@ -18,7 +18,15 @@ import numpy as np
 from tomo_polysplat.checks import fail, require_array, require_number
 from tomo_polysplat.physics.mixtures import ALIASES, NAMED
 
-__all__ = ["MaterialLike", "Materials", "composition", "density", "mass_attenuation", "require_energies"]
+__all__ = [
+    "MaterialLike",
+    "Materials",
+    "composition",
+    "density",
+    "known_density",
+    "mass_attenuation",
+    "require_energies",
+]
 
 MaterialLike = str | Mapping[str, float]
 ENERGY_RANGE_KEV = (0.1, 800.0)
@@ -73,6 +81,18 @@ def density(material: str) -> float:
             return value
     composition(material)  # an unknown name is a different mistake from a formula without a density
     raise fail("material", "one with a known density", repr(material), "give (cm, g/cm3) instead of cm")
+
+
+def known_density(material: MaterialLike) -> float | None:
+    """Nominal density in g/cm3 of a material, also as the only part of a mixture, or None where `density` has none."""
+    if not isinstance(material, str):
+        if len(material) != 1:
+            return None
+        (material,) = material
+    try:
+        return density(material)
+    except ValueError:
+        return None
 
 
 def require_energies(argument: str, energies_kev: Any) -> np.ndarray:
@@ -175,7 +195,7 @@ def _mixture_attenuation(fractions: tuple[tuple[str, float], ...], energies: byt
     return total
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Materials:
     """The three base materials whose attenuation curves a scene mixes.
 
@@ -206,8 +226,17 @@ class Materials:
     def __iter__(self) -> Iterator[MaterialLike]:
         return iter((self.soft, self.middle, self.dense))
 
+    def __eq__(self, other: object) -> bool:
+        """Whether they are the same matter, however it is spelt: of the same elements and the same density."""
+        if not isinstance(other, Materials):
+            return NotImplemented
+        return self._matter() == other._matter()
+
     def __hash__(self) -> int:
-        return hash(tuple(composition(material) for material in self))
+        return hash(self._matter())
+
+    def _matter(self) -> tuple[Any, ...]:
+        return tuple((composition(material), known_density(material)) for material in self)
 
     @classmethod
     def of(cls, value: Materials | Sequence[MaterialLike] | None) -> Materials:
