@@ -10,6 +10,7 @@ import torch
 from small_scans import QUICK, fan, reconstruct, relative
 
 from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.step import EagerStep
 from tomo_polysplat.kernels.device import one_torch_thread
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 
@@ -56,6 +57,22 @@ def test_the_volume_of_a_callback_is_the_volume_so_far():
     assert len(volumes) == 2 and not np.array_equal(*volumes)
     nearest = min(relative(volume, result.volume) for volume in volumes)
     assert nearest < 1e-5
+
+
+@pytest.mark.parametrize("metal", [True, False])
+def test_a_fit_that_stops_being_finite_returns_its_best_state(metal, monkeypatch):
+    made = EagerStep.__call__
+
+    def spoil(step, *what):
+        made(step, *what)
+        if step.done == 7:  # In the second pass.
+            with torch.no_grad():
+                step.gaussians.position[((step.gaussians.group > 0) == metal).nonzero()[0, 0]] = torch.nan
+
+    monkeypatch.setattr(EagerStep, "__call__", spoil)
+    result = reconstruct(fan(), settings=QUICK | {"passes": 5.0})
+    assert result.plan["stop"] == "the fit stopped being finite"
+    assert len(result.history) == 2 and np.isfinite(result.volume).all() and result.volume.max() > 0.1
 
 
 @pytest.mark.parametrize("answer", [True, np.True_])

@@ -107,8 +107,10 @@ class _Fitter:
     def _end_pass(self, share: float) -> tuple[float, float, int]:
         # Once a pass does: in its few steps a Gaussian does not get far beyond the volume.
         self.scene.keep_within(self.gaussians)
-        flatten(self.gaussians, self.scene, self.settings, share)
-        number_metals(self.gaussians, self.scene, self.settings, share)
+        # What is not finite any more is nowhere to look at, and `Watch` ends the run.
+        if self.gaussians.finite():
+            flatten(self.gaussians, self.scene, self.settings, share)
+            number_metals(self.gaussians, self.scene, self.settings, share)
         return self.step.read()
 
     def snapshot(self, best: Gaussians | None, numbers: dict[str, Any]) -> Snapshot:
