@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from small_scans import fan, reconstruct
 
 from tomo_polysplat.fit.noise import photons_per_ray
 
@@ -60,3 +61,19 @@ def test_too_few_rays_say_nothing(shape):
 
 def test_nothing_usable_says_nothing():
     assert photons_per_ray(np.full((20, 4, 64), np.nan, np.float32)) == np.inf
+
+
+def test_of_many_rays_every_so_many_rows_tell_as_well(monkeypatch):
+    scan = poisson(disc(1.0, rows=41), 1e4)
+    whole, some = photons_per_ray(scan), photons_per_ray(scan[:, ::8])
+    monkeypatch.setattr("tomo_polysplat.fit.noise._MOST", scan.size)
+    assert photons_per_ray(scan) == whole
+    monkeypatch.setattr("tomo_polysplat.fit.noise._MOST", scan.size // 8 + 1)
+    assert photons_per_ray(scan) == some == pytest.approx(1e4, rel=0.15)
+
+
+def test_the_noise_of_a_scan_is_looked_at_once(monkeypatch):
+    seen = []
+    monkeypatch.setattr("tomo_polysplat.fit.problem.photons_per_ray", lambda rays: seen.append(rays) or 5e4)
+    result = reconstruct(fan(), calibrate=True)
+    assert len(seen) == 1 and result.plan["photons_per_ray"].startswith("5e+04")

@@ -59,6 +59,7 @@ class _Known:
     copies: dict[torch.device, torch.Tensor] = field(default_factory=dict)
     closed: tuple[bool, str] | None = None
     agreement: list[float | None] | None = None
+    photons: float | None = None
     solid: bool = False
 
 
@@ -184,6 +185,12 @@ class Problem:
                 logger.warning("Texture is not told from noise: %s", problem)
                 self._known.agreement = [None] * len(bodies)
         return self._known.agreement
+
+    def _photons(self, device: torch.device) -> float:
+        """Photons of an unattenuated ray, told once a scan; see ``fit.noise``."""
+        if self._known.photons is None:
+            self._known.photons = photons_per_ray(self.measured(device))
+        return self._known.photons
 
     def _closed(self, device: torch.device) -> tuple[bool, str]:
         """Whether no matter lies beside the volume, and words that say so."""
@@ -313,7 +320,7 @@ class Problem:
 
     def rays(self, plan: Plan, settings: Settings, device: torch.device) -> Rays:
         """The measured rays on the device."""
-        photons = float("inf") if settings.loss == "l1" else photons_per_ray(self.measured(device))
+        photons = float("inf") if settings.loss == "l1" else self._photons(device)
         plan.reasons["photons_per_ray"] = f"{photons:.3g}, from the scatter of neighbouring pixels"
         views = detector_views(self.geometry, self.planar)
         values = self.measured(device)
