@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from tomo_polysplat.fit.choose_step import make_step, why_eager
+from tomo_polysplat.fit.feed import StreamedFeed
 from tomo_polysplat.fit.step import EagerStep
 
 sys.path.append(str(Path(__file__).parents[1] / "kernels"))
@@ -108,6 +109,18 @@ def test_a_graph_steps_like_autograd(kind, polychromatic, changes):
 
 
 @pytest.mark.gpu
+def test_streamed_views_are_those_asked_for_whatever_is_still_on_its_way():
+    views, rng, found = torch.rand(7, 331, 413), np.random.default_rng(0), []
+    feed = StreamedFeed(views, torch.device("cuda", 0), 3)
+    for k in range(20):
+        chosen = rng.permutation(7)[: 3 - k % 2]
+        slots = feed.place(chosen)
+        found.append((chosen, feed.projections[slots[0] : slots[-1] + 1].clone()))
+        feed.used()
+    assert all(torch.equal(placed.cpu(), views[chosen]) for chosen, placed in found)
+
+
+@pytest.mark.gpu
 def test_projections_on_the_host_give_the_same_steps():
     """Views streamed to the GPU step by step, against views that are there."""
     ends = []
@@ -115,7 +128,7 @@ def test_projections_on_the_host_give_the_same_steps():
         problem = fit_problem("cone", True, "cuda", "triton")
         if streamed:
             rays = problem[2]
-            rays.device, rays.projections = torch.device("cuda", 0), rays.projections.cpu().pin_memory()
+            rays.device, rays.projections = torch.device("cuda", 0), rays.projections.cpu()
         step = graph_step(*problem, BATCH)
         for k in range(9):
             step(np.array([k % 5, (k + 2) % 5]), 0.1 * k)

@@ -7,6 +7,8 @@ from typing import Protocol
 import numpy as np
 import torch
 
+from tomo_polysplat.parallel import copy_array
+
 __all__ = ["Feed", "ResidentFeed", "StreamedFeed", "feed"]
 
 
@@ -52,22 +54,31 @@ class ResidentFeed:
 
 
 class StreamedFeed:
-    """Two sets of slots in turn: one is filled from page-locked memory while the other is read."""
+    """Two sets of slots in turn: one is filled, through page-locked memory of its size, while the other is read.
+
+    The projections themselves are not locked: torch does that in a copy of up to twice their size, which it keeps.
+    """
 
     def __init__(self, projections: torch.Tensor, device: torch.device, batch: int) -> None:
-        self._host = projections if projections.is_pinned() else projections.pin_memory()
-        self._batch, self._turn = batch, 0
-        self.projections = torch.empty((2 * batch, *projections.shape[1:]), device=device)
+        self._host, self._batch, self._turn = projections, batch, 0
+        shape = (2 * batch, *projections.shape[1:])
+        self._locked = torch.empty(shape, dtype=projections.dtype, pin_memory=True)
+        self.projections = torch.empty(shape, device=device)
         self._stream = torch.cuda.Stream(device)
         self._free = [torch.cuda.Event(), torch.cuda.Event()]
+        self._left = [torch.cuda.Event(), torch.cuda.Event()]
 
     def place(self, views: np.ndarray) -> np.ndarray:
         """Slots that the views are copied to; see `Feed`."""
         slots = self._turn * self._batch + np.arange(len(views))
+        # What this turn locked before must have left; at once where it was never recorded.
+        self._left[self._turn].synchronize()
         with torch.cuda.stream(self._stream):
             self._stream.wait_event(self._free[self._turn])
             for slot, view in zip(slots.tolist(), views.tolist()):
-                self.projections[slot].copy_(self._host[view], non_blocking=True)
+                copy_array(self._locked[slot].numpy(), self._host[view].numpy())
+                self.projections[slot].copy_(self._locked[slot], non_blocking=True)
+            self._left[self._turn].record(self._stream)
         torch.cuda.current_stream(self.projections.device).wait_stream(self._stream)
         return slots
 
