@@ -102,7 +102,8 @@ class Settings:
     tv_weight: float = 0.04
     """Weight of the total variation per voxel, in soft references."""
     tv_factor: float = 0.0
-    """So many times that weight is taken; 0 leaves it to the plan, which asks held-out rays in slices."""
+    """So many times that weight is taken; 0 leaves it to the plan, which asks held-out rays in slices and of thin
+    objects."""
     tv_clip: float = 5.0
     """Attenuation above this many soft references does not count as variation, which would erode metal; what is lighter
     than metal, castings of aluminium too, is smoothed."""
