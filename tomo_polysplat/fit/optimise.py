@@ -6,7 +6,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ import torch
 
 from tomo_polysplat.fit.checkpoint import Checkpoint, Snapshot
 from tomo_polysplat.fit.choose_step import make_step
+from tomo_polysplat.fit.learning_rates import hurried
 from tomo_polysplat.fit.metal_numbers import number_metals
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
@@ -28,18 +29,6 @@ __all__ = ["FitOutcome", "FitState", "fit"]
 
 logger = logging.getLogger(__name__)
 
-# The learning rates of place and size are for this many steps. Fewer steps take larger ones, by the root of how few
-# they are, up to twice (pins, 64^3, 160 steps: 25.8 dB as they are, 27.0 with 1.5 times).
-_STEPS, _MOST_HURRY = 450, 2.0
-# That of turns is for so many, and goes with the square, up to so many times: in 300 steps a Gaussian would hardly turn
-# (40^3: pepper 30.9 to 31.4 dB, teeth 39.3 to 39.7, lung 33.0 to 33.3), while in 900 the same rate upsets metal (teeth,
-# 256^3: 58.6 to 57.0 dB everywhere with three times the rate).
-_STEPS_OF_TURNS, _MOST_HURRIED_TURNS = 900, 7.0
-# That of Gaussians' own material numbers is for so many, and goes with the root, too. What rays say of a number is
-# little beside what they say of edges that Gaussians blur, and a blurred edge looks like matter of a larger number: a
-# number goes on rising for as long as it is fitted. With the inverse instead of the root bone is a little better and
-# enamel, farther from where it starts, worse (rods of bone, 800 steps: 40.9 for 40.2 dB; teeth, 256^3: 45.0 for 45.5).
-_STEPS_OF_NUMBERS, _MOST_HURRIED_NUMBERS = 300, 2.0
 # A pass over fewer views than this makes the steps of one over as many.
 _FEWEST_VIEWS = 10
 
@@ -259,7 +248,7 @@ def fit(
         return FitOutcome(gaussians, reason="nothing to fit: the start volume is empty")
     batch = min(views_per_step, len(rays.views))
     steps = max(1, math.ceil(settings.passes * _views_of_a_pass(rays) / batch))
-    fitter = _Fitter(gaussians, spacing, rays, scene, _hurried(settings, steps), batch, rng)
+    fitter = _Fitter(gaussians, spacing, rays, scene, hurried(settings, steps), batch, rng)
     # From now on: what compiling or recording the step took is no part of the run that the learning rates follow.
     clock = Clock(steps, deadline)
     outcome = FitOutcome(gaussians)
@@ -289,20 +278,6 @@ def _used_up(clock: Clock, settings: Settings) -> str:
 
 def _views_of_a_pass(rays: Rays) -> int:
     return max(len(rays.views), _FEWEST_VIEWS)
-
-
-def _hurried(settings: Settings, steps: int) -> Settings:
-    """The settings with learning rates for a run of so many steps."""
-    factor = min(max(1.0, math.sqrt(_STEPS / steps)), _MOST_HURRY)
-    turns = min(max(1.0, (_STEPS_OF_TURNS / steps) ** 2), _MOST_HURRIED_TURNS)
-    numbers = min(math.sqrt(_STEPS_OF_NUMBERS / steps), _MOST_HURRIED_NUMBERS)
-    return replace(
-        settings,
-        learning_rate_position=factor * settings.learning_rate_position,
-        learning_rate_scale=factor * settings.learning_rate_scale,
-        learning_rate_rotation=turns * settings.learning_rate_rotation,
-        learning_rate_material=numbers * settings.learning_rate_material,
-    )
 
 
 def _is_true(answer: Any) -> bool:
