@@ -17,6 +17,7 @@ from tomo_polysplat.fit.beginning import Begun, Wishes, begin, physics
 from tomo_polysplat.fit.calibration import Calibration
 from tomo_polysplat.fit.checkpoint import Checkpoint
 from tomo_polysplat.fit.optimise import FitOutcome, FitState, fit
+from tomo_polysplat.fit.pixel_question import pixel_question
 from tomo_polysplat.fit.plan import Plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.scene import FitScene
@@ -199,12 +200,14 @@ def _fitted(
         # A volume that takes most of the budget still needs a fit: then the end is late.
         left = max(started + budget - time.perf_counter(), 0.0)
         deadline = started + budget - min(scene.seconds_of_basis(begun.gaussians), 0.5 * left)
+    settings = plan.adapted(wishes.settings)
+    question = pixel_question(plan, begun.gaussians, scene, settings, problem.geometry.views, budget)
     return fit(
         begun.gaussians,
         plan.spacing * problem.voxel,
         begun.rays,
         scene,
-        replace(plan.adapted(wishes.settings), passes=plan.passes),
+        replace(settings, passes=plan.passes),
         views_per_step=plan.views_per_step,
         rng=np.random.default_rng(wishes.seed),
         started=started,
@@ -212,6 +215,7 @@ def _fitted(
         volume=_volume_of(scene, plan, problem, flipped),
         callbacks=[lambda state: report(state.share, state.describe()), *wishes.callbacks],
         checkpoint=saved,
+        question=question,
     )
 
 

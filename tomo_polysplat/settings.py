@@ -99,6 +99,9 @@ class Settings:
     """Deviations beyond which a residual counts absolutely (95 % efficient for Gaussian noise: Huber 1964)."""
     ssim_weight: float = 0.0
     """Weight of 1 - SSIM of the projections (the paper uses 0.25)."""
+    pixel_rays: int = 0
+    """Rays a pixel and axis over which the light is averaged; 1: infinitely thin ones; 0 leaves it to the plan, which
+    asks the rays of metal on a CPU."""
     tv_weight: float = 0.04
     """Weight of the total variation per voxel, in soft references."""
     tv_factor: float = 0.0

@@ -213,8 +213,8 @@ def _plan(parts: dict[str, Any]) -> Plan:
     plan = Plan(**parts)
     counts = (plan.views_per_step, plan.tv_every)
     amounts = (plan.reference, plan.first, plan.spacing, plan.smallest_scale, plan.tv_factor)
-    above_zero = min(*amounts, *counts) > 0
-    whole = all(isinstance(n, int) for n in counts)
+    above_zero = min(*amounts, *counts) > 0 and plan.pixel_rays >= 0
+    whole = all(isinstance(n, int) for n in (*counts, plan.pixel_rays))
     corners = len(plan.tv_corners) == 2 and all(
         isinstance(corner, (int, float)) and corner >= 0 for corner in plan.tv_corners
     )

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
+import itertools
 import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,7 @@ from tomo_polysplat.fit.checkpoint import Checkpoint, Snapshot
 from tomo_polysplat.fit.choose_step import make_step
 from tomo_polysplat.fit.learning_rates import hurried
 from tomo_polysplat.fit.metal_numbers import number_metals
+from tomo_polysplat.fit.pixel_question import PixelQuestion
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.soft_matter import flatten
@@ -68,7 +71,7 @@ class _Fitter:
     ) -> None:
         self.gaussians, self.rays, self.scene, self.settings, self.rng = gaussians, rays, scene, settings, rng
         self.step = make_step(gaussians, spacing, rays, scene, settings, batch=batch)
-        self.batch, self.order = batch, np.empty(0, int)
+        self.spacing, self.batch, self.order = spacing, batch, np.empty(0, int)
         self.relocated = 0
         self.relocation_due = False
 
@@ -91,6 +94,17 @@ class _Fitter:
                 made = 0
         if made:
             yield self._end_pass(1.0)
+
+    def ahead(self, clock: Clock, passes: int) -> list[tuple[float, float, int]]:
+        """What so many more passes gave, as `passes` tells it."""
+        return list(itertools.islice(self.passes(clock), passes))
+
+    def branch(self, pixel_rays: int) -> _Fitter:
+        """The same run from here on, with so many rays a pixel and axis, on Gaussians of its own."""
+        scene, rng = replace(self.scene, pixel_rays=pixel_rays), copy.deepcopy(self.rng)
+        other = _Fitter(self.gaussians.copy(), self.spacing, self.rays, scene, self.settings, self.batch, rng)
+        other.restore(self.snapshot(None, {}))
+        return other
 
     @torch.no_grad()
     def _end_pass(self, share: float) -> tuple[float, float, int]:
@@ -165,6 +179,7 @@ class _Run:
     clock: Clock
     started: float
     checkpoint: Checkpoint | None
+    question: PixelQuestion | None
 
     def keep(self, *, now: bool) -> None:
         """Offer the checkpoint the state between two passes."""
@@ -201,7 +216,7 @@ class _Run:
     ) -> None:
         """Pass by pass until something ends the run, which the outcome's reason then says."""
         outcome = self.outcome
-        for loss, held_out, skipped in self.fitter.passes(self.clock):
+        for loss, held_out, skipped in self._passes():
             outcome.skipped_pairs += skipped
             outcome.relocated = self.fitter.relocated
             state = self._state(loss, held_out, volume)
@@ -212,6 +227,19 @@ class _Run:
                 self.keep(now=True)
                 outcome.reason = "a callback ended it"
             if outcome.reason:
+                return
+
+    def _passes(self) -> Iterator[tuple[float, float, int]]:
+        """What each pass gave; where the question is asked, two at once, so that no checkpoint lies between them."""
+        passes = self.fitter.passes(self.clock)
+        while True:
+            if self.question is not None and self.question.due(self.clock.share()):
+                self.fitter, made = self.question.answered(self.fitter, self.clock)
+                passes = self.fitter.passes(self.clock)
+                yield made
+            elif (one := next(passes, None)) is not None:
+                yield one
+            else:
                 return
 
     def _state(self, loss: float, held_out: float, volume: Callable[[Gaussians], np.ndarray]) -> FitState:
@@ -235,13 +263,14 @@ def fit(
     volume: Callable[[Gaussians], np.ndarray],
     callbacks: Sequence[Callable[[FitState], Any]] = (),
     checkpoint: Checkpoint | None = None,
+    question: PixelQuestion | None = None,
 ) -> FitOutcome:
     """Fit Gaussians to rays.
 
     Stops after ``settings.passes`` over the views, at ``deadline`` (``time.perf_counter`` seconds), when the
     held-out rays have not improved for `patience_of` passes, when a callback returns True, or on
     KeyboardInterrupt; returns the Gaussians that `Watch` holds for the best. Where ``checkpoint``
-    holds a snapshot, ``gaussians`` are its own and the fit goes on from there.
+    holds a snapshot, ``gaussians`` are its own and the fit goes on from there. ``question`` is asked on the way.
     """
     if not len(gaussians):
         logger.warning("The start volume is empty: no Gaussians, a volume of zeros.")
@@ -253,7 +282,7 @@ def fit(
     clock = Clock(steps, deadline)
     outcome = FitOutcome(gaussians)
     watch: Watch[Gaussians] = Watch(patience_of(settings, settings.passes))
-    run = _Run(fitter, outcome, watch, clock, started, checkpoint)
+    run = _Run(fitter, outcome, watch, clock, started, checkpoint, question)
     run.restore()
     try:
         if not outcome.reason:

@@ -92,6 +92,8 @@ class Plan:
         one of the two is bone-like or denser.
     curves : int
         Material curves of the model: three, or the first alone, as for a monochromatic one.
+    pixel_rays : int
+        Rays a pixel and axis over which the light is averaged; 0 until `fit.pixel_question` has told.
     sharp : bool
         Whether seeds are thin across edges however close they are; `fit.sharpness` tells it by short fits.
     blurred : bool
@@ -116,6 +118,7 @@ class Plan:
     tv_corners: tuple[float, float]
     curves: int
     blurred: bool
+    pixel_rays: int = 0
     sharp: bool = False
     tv_factor: float = 1.0
     reasons: dict[str, Any] = field(default_factory=dict)
@@ -172,6 +175,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
         corners,
         curves,
         blurred,
+        settings.pixel_rays,
     )
     unit = "g/cm3" if problem.polychromatic else "per unit of length"
     plan.reasons = {
@@ -190,6 +194,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
         "smoothed": _smoothed(every, settings),
         "texture": texture,
         "detector_blur": told,
+        "pixel_rays": f"{settings.pixel_rays}: asked for",
         "passes": f"{passes:g} over the views at most, fewer where {settings.held_out:.1%} of the rays, held"
         f" out of the fit, have not improved for {patience_of(settings, passes)}",
     }

@@ -222,6 +222,7 @@ class Problem:
             closed,
             plan.tv_every,
             plan.smallest_scale,
+            max(plan.pixel_rays, 1),
             self._solid_number(plan, settings),
         )
 
@@ -297,7 +298,7 @@ class Problem:
             device,
             gaussians=len(gaussians),
             views=plan.views_per_step,
-            pixels=self.geometry.rows * self.geometry.columns,
+            pixels=self.geometry.rows * self.geometry.columns * max(plan.pixel_rays, 1) ** 2,
             voxels=math.prod(self.grid.shape),
             projections=values.nbytes if values.device.type == device.type else 0,
         )

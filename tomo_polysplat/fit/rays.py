@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,10 +11,12 @@ import torch
 
 from tomo_polysplat.kernels.views import DetectorViews
 
-__all__ = ["Rays"]
+__all__ = ["Rays", "batches_around"]
 
 # Rays whose weights are added up at once.
 _CHUNK = 1 << 22
+# Views that tell a fit's misfit, and those looked at together.
+_VIEWS, _AT_ONCE = 24, 8
 
 
 @dataclass
@@ -100,3 +103,12 @@ class Rays:
         mixed = torch.stack([(pixel + (view * 40503 + 12345)) & 0xFFFFFFFF for view in chosen.tolist()])
         mixed = ((mixed ^ (mixed >> 15)) * 2246822519) & 0xFFFFFFFF
         return (mixed >> 16) < self.threshold
+
+
+def batches_around(
+    rays: Rays, most: int = _VIEWS
+) -> Iterator[tuple[DetectorViews, torch.Tensor, torch.Tensor, torch.Tensor]]:
+    """What `Rays.batch` gives for so many of the views at most, evenly spread over the scan."""
+    views = np.unique(np.linspace(0, len(rays.views) - 1, min(most, len(rays.views))).astype(int))
+    for first in range(0, len(views), _AT_ONCE):
+        yield rays.batch(views[first : first + _AT_ONCE])

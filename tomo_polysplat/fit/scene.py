@@ -13,6 +13,7 @@ from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.detector_blur import blurred
+from tomo_polysplat.physics.pixel_light import averaged_light
 from tomo_polysplat.physics.quadrature import Quadrature
 from tomo_polysplat.physics.transmission import polychromatic_projection
 from tomo_polysplat.render.metal_edges import tail_factors, tails
@@ -58,6 +59,8 @@ class FitScene:
         In every how many steps the volume's total variation is taken, and counts as many times.
     smallest_scale : float
         Smallest deviation of a Gaussian, in voxels, or in spacings of the seeds where these are closer.
+    pixel_rays : int
+        Rays a pixel and axis over which the light is averaged; see ``physics.pixel_light``.
     solid_number : callable or None
         Material numbers of solids by their attenuation in soft references; None where that does not tell them.
     """
@@ -76,14 +79,18 @@ class FitScene:
     closed: bool
     tv_every: int
     smallest_scale: float
+    pixel_rays: int = 1
     solid_number: Callable[[np.ndarray], np.ndarray] | None = None
 
     def projections(self, gaussians: Gaussians, views: DetectorViews) -> tuple[torch.Tensor, int]:
         """(views, rows, columns) predicted -log(I/I0), and the pairs skipped at the source plane."""
         weights = gaussians.weights(self.reference_curve)
-        areal, skipped = project_gaussians(gaussians, weights, views, self.kernel, self.cutoff)
+        rays = views if self.pixel_rays == 1 else views.finer(self.pixel_rays)
+        areal, skipped = project_gaussians(gaussians, weights, rays, self.kernel, self.cutoff)
         areal = areal * self.areal_scale
         sharp = areal[0] if self.quadrature is None else polychromatic_projection(areal, self.quadrature)
+        if self.pixel_rays > 1:
+            sharp = averaged_light(sharp, views.rows, views.columns)
         return (blurred(sharp, gaussians.blur) if self.blurring else sharp), skipped
 
     def keep_within(self, gaussians: Gaussians) -> None:

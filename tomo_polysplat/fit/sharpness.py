@@ -18,9 +18,9 @@ import torch
 from tomo_polysplat.fit.loss import misfit
 from tomo_polysplat.fit.plan import Plan, finest_spacing
 from tomo_polysplat.fit.problem import Problem
-from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.rays import Rays, batches_around
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.fit.short_fit import batches_around, cut_short, fitted_shortly
+from tomo_polysplat.fit.short_fit import cut_short, fitted_shortly
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.initial import FEW_VIEWS

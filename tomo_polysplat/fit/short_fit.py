@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,15 +14,14 @@ from tomo_polysplat.fit.depth import weights_by_depth
 from tomo_polysplat.fit.optimise import FitOutcome, fit
 from tomo_polysplat.fit.plan import Plan, make_plan
 from tomo_polysplat.fit.problem import Problem
-from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.rays import Rays, batches_around
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.render.renderer import project_gaussians
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.levels import mass_level
 
-__all__ = ["ShortFit", "batches_around", "cut_short", "fitted_shortly", "main_density", "short_fit"]
+__all__ = ["ShortFit", "cut_short", "fitted_shortly", "main_density", "short_fit"]
 
 _PASSES = 2.0
 # A scan of few views is not seen in fewer steps.
@@ -31,7 +29,6 @@ _FEWEST_STEPS = 120
 # Of the seconds that a reconstruction may take, the share for each short fit.
 _SHARE_OF_BUDGET = 0.1
 _RAYS = 60_000
-_VIEWS, _AT_ONCE = 24, 8
 # The main matter's voxels: this share of those inside of it, the ones closest to each other.
 _CROWD = 0.3
 # As large a share of them has to lie inside. Walls a voxel or two thick look lighter than they are: those of a pepper
@@ -183,15 +180,6 @@ def main_density(density: np.ndarray, metal: float = math.inf) -> float:
     width = max(1, int(_CROWD * len(inside)))
     first = int(np.argmin(inside[width - 1 :] - inside[: len(inside) - width + 1]))
     return float(inside[first : first + width].mean())
-
-
-def batches_around(
-    rays: Rays, most: int = _VIEWS
-) -> Iterator[tuple[DetectorViews, torch.Tensor, torch.Tensor, torch.Tensor]]:
-    """What `Rays.batch` gives for so many of the views at most, evenly spread over the scan."""
-    views = np.unique(np.linspace(0, len(rays.views) - 1, min(most, len(rays.views))).astype(int))
-    for first in range(0, len(views), _AT_ONCE):
-        yield rays.batch(views[first : first + _AT_ONCE])
 
 
 def _sample(

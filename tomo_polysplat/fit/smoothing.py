@@ -25,9 +25,9 @@ from tomo_polysplat.fit.depth import weights_by_depth
 from tomo_polysplat.fit.loss import misfit
 from tomo_polysplat.fit.plan import Plan
 from tomo_polysplat.fit.problem import Problem
-from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.rays import Rays, batches_around
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.fit.short_fit import batches_around, cut_short, fitted_shortly
+from tomo_polysplat.fit.short_fit import cut_short, fitted_shortly
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.initial import FEW_VIEWS
