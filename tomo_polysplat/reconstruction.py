@@ -71,7 +71,9 @@ def reconstruct(
     ----------
     projections : array, shape (rows, views, columns), or (views, columns) for 2D geometries
         -log(I/I0) in ASTRA's order; in which order the views come changes nothing. Values that are not finite,
-        or that no logarithm takes, are not used, and counted; nor are the masked ones of a masked array.
+        or that no logarithm takes, are not used, and counted; nor are the masked ones of a masked array. The log
+        says when that is more than a fifth of them. Counts, transmissions and logarithms of the other sign or of
+        a wrong scale are refused where they show as such.
     proj_geom, vol_geom : dict
         ASTRA geometries, lengths in ``unit``; vol_geom's window must be in the same unit.
     spectrum : Spectrum, optional

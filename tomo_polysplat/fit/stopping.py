@@ -120,7 +120,7 @@ class Watch(Generic[_Fitted]):
         if not (math.isfinite(state.loss) and fitted.finite()):
             if self.best is None:
                 raise FloatingPointError(
-                    "the fit diverged in its first pass; see the log for rays out of range"
+                    "the fit diverged in its first pass: projections that are not -log(I/I0), or rates set too high"
                 )
             return "the fit stopped being finite"
         if self._note(state.loss, state.held_out):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,11 +13,16 @@ from tomo_polysplat.parallel import run_tasks, split_range
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.water_correction import undo_water_correction
 from tomo_polysplat.scan.geometry import projections_from_astra
+from tomo_polysplat.scan.line_integrals import require_line_integrals
 
 __all__ = ["uncorrected", "usable_rays"]
 
+logger = logging.getLogger(__name__)
+
 # No number above 0 has a logarithm beyond this in float64.
 _LARGEST_LOGARITHM = 745.0
+# A larger share of rays left out than this is said in the log: a mask may be of the other sense.
+_MOST_LEFT_OUT = 0.2
 
 
 def usable_rays(
@@ -40,13 +46,28 @@ def usable_rays(
         mask = require_array("valid", valid)
         require_shape("valid", mask, np.shape(projections), "of the projections")
         marked = ~(projections_from_astra(mask.astype(np.float32), proj_geom) > 0.5)
+    require_line_integrals(values, marked)
     parts = [(values[a:b], None if marked is None else marked[a:b]) for a, b in split_range(len(values), 64)]
     found = run_tasks(_take_out, parts)
     counts = {"rays": values.size} | {name: sum(part[name] for part in found) for name in found[0]}
-    if counts.pop("used") == 0:
+    used = counts.pop("used")
+    if used == 0:
         remedy = "give -log(I/I0), not intensities, and check the flat fields and the mask"
         raise fail("projections", "at least one usable ray", "none", remedy)
+    if used < (1 - _MOST_LEFT_OUT) * values.size:
+        _tell_left_out(counts, used)
     return values, counts
+
+
+def _tell_left_out(counts: Mapping[str, int], used: int) -> None:
+    reasons = {
+        name.removeprefix("rays_").replace("_", " "): n for name, n in counts.items() if name != "rays"
+    }
+    listed = ", ".join(f"{n} {reason}" for reason, n in reasons.items() if n)
+    remedy = (
+        "; False in valid= is for rays that must not be used" if counts.get("rays_marked_invalid") else ""
+    )
+    logger.warning("Only %d of %d rays are used: %s%s.", used, counts["rays"], listed, remedy)
 
 
 def _take_out(values: np.ndarray, marked: np.ndarray | None) -> dict[str, int]:

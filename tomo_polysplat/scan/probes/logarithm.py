@@ -6,10 +6,17 @@ import numpy as np
 
 from tomo_polysplat.scan.probes.measured import Finding, Measured
 
-__all__ = ["probe_logarithm"]
+__all__ = ["COUNTS", "REMEDIES", "SIGN", "TRANSMISSIONS", "probe_logarithm"]
 
 # Share of the columns at either end that are taken for air.
 _BORDER = 0.04
+
+COUNTS, TRANSMISSIONS, SIGN = "counts", "transmissions I/I0", "logarithms of the other sign"
+REMEDIES = {
+    COUNTS: "give the open-beam images, or pass -log(I / I0)",
+    TRANSMISSIONS: "pass -log of them, or input='transmission' where a file or TomoPy's options say what they are",
+    SIGN: "pass -log(I / I0)",
+}
 
 
 def probe_logarithm(measured: Measured) -> Finding:
@@ -23,15 +30,10 @@ def probe_logarithm(measured: Measured) -> Finding:
     if below <= 2 * above:
         return Finding("logarithm", "ok", f"taken: the object adds up to {above:.3g} to the air", "", numbers)
     if air > 30:
-        text, remedy = "the values are counts", "give the open-beam images, or pass -log(I / I0)"
+        kind, text = COUNTS, "the values are counts"
     elif air > 0.3:
-        text, remedy = (
-            "not taken: the values are transmissions I/I0",
-            "pass -log of them, or input='transmission'",
-        )
+        kind, text = TRANSMISSIONS, "not taken: the values are transmissions I/I0"
     else:
-        text, remedy = (
-            "the sign is turned: the object lowers the values below those of air",
-            "pass -log(I / I0)",
-        )
-    return Finding("logarithm", "defect", f"{text} (air {air:.3g}, object {float(low):.3g})", remedy, numbers)
+        kind, text = SIGN, "the sign is turned: the object lowers the values below those of air"
+    text = f"{text} (air {air:.3g}, object {float(low):.3g})"
+    return Finding("logarithm", "defect", text, REMEDIES[kind], numbers)

@@ -1,0 +1,116 @@
+"""Are these values -log(I/I0) at all? Counts, transmissions and turned signs are told before anything is fitted.
+
+:mod:`tomo_polysplat.scan.probes.logarithm` asks the same of a file, where a wrong answer costs nothing. This refuses,
+so that it must be certain: a view from within a hollow object also has less in its middle than at its ends.
+"""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from tomo_polysplat.checks import fail
+from tomo_polysplat.scan.probes.logarithm import COUNTS, REMEDIES, SIGN, TRANSMISSIONS
+
+__all__ = ["require_line_integrals"]
+
+logger = logging.getLogger(__name__)
+
+# Views and rows that are looked at, and fewer columns than these have no ends to tell air by.
+_VIEWS, _ROWS, _FEWEST_COLUMNS = 48, 16, 8
+# Share of the columns at either end that are taken for air, which is this flat and this alike at both ends.
+_BORDER, _FLAT = 0.04, 0.05
+# Air of transmissions is this close to 1, and an object takes so much of it away.
+_NEAR_ONE, _TAKEN = 0.05, 0.4
+# Air of counts is brighter than this. Only a filler is more than the second, or less than the third.
+_DIMMEST, _BRIGHTEST = 30.0, 1e9
+_BRIGHTEST_LOGARITHM = -745.0
+# Rays that see something have more than the first; no more than half of those are darker than the second, e^-100 of
+# the light. Counts and what else is large are told from a filler for bad rays by more different values than the third.
+_SOMETHING, _OPAQUE, _DIFFERENT = 0.3, 100.0, 16
+# Where the light of so many rays is e times that without an object, and hardly any ray is as much darker, that is no
+# noise and no flaw of the flat field.
+_SURE, _MANY, _FEW = 1.0, 0.02, 0.1
+
+
+def require_line_integrals(values: np.ndarray, marked: np.ndarray | None = None) -> None:
+    """Refuse what is certainly not -log(I/I0), and warn of what hardly is.
+
+    Parameters
+    ----------
+    values : (views, rows, columns) float32 array
+        Some may be neither finite nor sensible.
+    marked : bool array of that shape, optional
+        True for rays that are not to be used.
+
+    Raises
+    ------
+    ValueError
+        For counts, transmissions, logarithms of the other sign or of a wrong scale, with what to pass instead.
+    """
+    chosen = np.ix_(*(_spread(n, most) for n, most in zip(values.shape, (_VIEWS, _ROWS))))
+    some = values[chosen]
+    meant = (some > _BRIGHTEST_LOGARITHM) & (some < _BRIGHTEST)
+    some = np.where(meant if marked is None else meant & ~marked[chosen], some, np.nan)
+    if len(np.unique(some[some > _DIMMEST])) <= _DIFFERENT:
+        some[some > _DIMMEST] = np.nan
+    finite = some[np.isfinite(some)]
+    if not finite.size:
+        return
+    _require_some_light(finite)
+    air = _air(some)
+    if air is None:
+        return
+    low, high = (float(value) for value in np.percentile(finite, [1, 99]))
+    below, above = air - low, high - air
+    if below <= 2 * above or below < _SOMETHING:
+        return
+    kind, certain = _kind(finite, air, low)
+    seen = f"{air:.3g} beside the object and down to {low:.3g} behind it"
+    if certain:
+        raise fail("projections", "-log(I/I0), to which an object adds", f"{kind}: {seen}", REMEDIES[kind])
+    logger.warning(
+        "The projections do not look like -log(I/I0): %s. If they are %s, %s.", seen, kind, REMEDIES[kind]
+    )
+
+
+def _spread(count: int, most: int) -> np.ndarray:
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+
+
+def _require_some_light(finite: np.ndarray) -> None:
+    """Refuse a scan most of whose object no light passes: counts, or logarithms times a large number."""
+    dark = finite[finite > _OPAQUE]
+    # Noise in air is as often negative.
+    dim = np.count_nonzero((finite > _SOMETHING) & (finite <= _OPAQUE)) - np.count_nonzero(
+        finite < -_SOMETHING
+    )
+    if len(dark) <= max(dim, _DIFFERENT):
+        return
+    got = f"values around {np.median(dark):.3g}, as of {COUNTS} or of a wrong scale"
+    remedy = f"{REMEDIES[COUNTS]}; undo a factor that they were multiplied by"
+    raise fail("projections", "-log(I/I0), some 10 at most, not intensities", got, remedy)
+
+
+def _air(some: np.ndarray) -> float | None:
+    """The value at both ends of the columns, where it is flat and the same; else None."""
+    known = np.isfinite(some).mean(axis=(0, 1)) > 0.5
+    if np.count_nonzero(known) < _FEWEST_COLUMNS:
+        return None
+    profile = np.nanmedian(some[..., known], axis=(0, 1))
+    width = max(2, int(_BORDER * len(profile)))
+    ends = np.concatenate([profile[:width], profile[-width:]]).astype(np.float64)
+    air = float(np.median(ends))
+    spread = max(float(np.ptp(profile)), abs(air))
+    return air if float(np.ptp(ends)) <= _FLAT * spread else None
+
+
+def _kind(finite: np.ndarray, air: float, low: float) -> tuple[str, bool]:
+    """What the values look like, and whether that is certain."""
+    if air > _DIMMEST:
+        return COUNTS, True
+    if air > _SOMETHING:
+        return TRANSMISSIONS, abs(air - 1) < _NEAR_ONE and -_NEAR_ONE < low < 1 - _TAKEN
+    brighter, darker = float((finite < -_SURE).mean()), float((finite > _SURE).mean())
+    return SIGN, brighter > _MANY and darker < _FEW * brighter
