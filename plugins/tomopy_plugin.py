@@ -42,7 +42,7 @@ def polysplat(
     recon : float32 array, shape (slices, num_gridx, num_gridy)
         Receives the slices. What `init_recon` puts there is not used as a start.
     theta : float32 array, shape (views,)
-        Angles in radians.
+        Angles in radians; what looks like degrees is refused.
     **keywords
         ``num_gridx``, ``num_gridy`` and ``options``, a dict that is not modified:
 
@@ -106,8 +106,11 @@ def _require_one_geometry(own: dict[str, Any], solver: dict[str, Any]) -> None:
 def _parallel_beam(
     tomo: np.ndarray, recon: np.ndarray, theta: np.ndarray, centre: float, pixel_size: float | None
 ) -> tuple[dict[str, Any], dict[str, Any]]:
+    from tomo_polysplat.scan.angles import require_radians
     from tomo_polysplat.scan.layout import parallel_geometry, volume_geometry
 
+    # A geometry of vectors, which this becomes, has no angles to tell by.
+    theta = require_radians("theta", theta)
     size = 1.0 if pixel_size is None else pixel_size
     proj_geom, _ = parallel_geometry(theta, len(tomo), tomo.shape[2], centre, size)
     window = np.repeat(0.5 * size * np.array(recon.shape[::-1]), 2) * np.tile([-1, 1], 3)

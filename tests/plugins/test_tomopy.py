@@ -91,6 +91,15 @@ def test_sinograms_centres_and_a_view_for_the_result(tomopy, solver, cut):
     np.testing.assert_array_equal(sinograms, tomo.swapaxes(0, 1))
 
 
+def test_degrees_are_refused_and_many_turns_are_not(tomopy, solver):
+    tomo, theta, truth = measured()
+    with pytest.raises(ValueError, match="theta: expected radians.*look like degrees.*deg2rad"):
+        tomopy.recon(tomo, np.rad2deg(theta), algorithm=polysplat)
+    turns = theta + 2 * np.pi * np.arange(VIEWS)
+    recon = tomopy.recon(tomo, turns, algorithm=polysplat)
+    np.testing.assert_allclose(recon, truth, atol=0.08 * truth.max())
+
+
 def test_simultaneous_calls_under_load(tomopy, solver):
     """Many reconstructions at once, some of the same arrays, in chunks of every size."""
     tomo, theta, _ = measured()

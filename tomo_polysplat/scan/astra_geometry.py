@@ -11,6 +11,7 @@ import numpy as np
 
 from tomo_polysplat.checks import fail, require_array, require_choice, require_number
 from tomo_polysplat.parallel import contiguous
+from tomo_polysplat.scan.angles import require_radians
 from tomo_polysplat.scan.curved_detector import flat_geometry, flatten_projections
 from tomo_polysplat.scan.view_geometry import Geometry
 from tomo_polysplat.scan.volume_grid import VolumeGrid, require_count
@@ -74,7 +75,9 @@ def from_astra(proj_geom: Mapping[str, Any], vol_geom: Mapping[str, Any]) -> tup
     if "Vectors" in proj_geom or kind.endswith("_vec"):
         proj_geom["Vectors"] = _checked_vectors(proj_geom, kind)
     else:
-        proj_geom["ProjectionAngles"] = _checked_angles(proj_geom)
+        proj_geom["ProjectionAngles"] = require_radians(
+            "ProjectionAngles", _entry(proj_geom, "ProjectionAngles")
+        )
         _check_distances(proj_geom)
     vectors = geom_2vec(proj_geom)["Vectors"]
     if kind in _PLANAR_TYPES:
@@ -199,33 +202,6 @@ def _checked_vectors(proj_geom: Mapping[str, Any], kind: str) -> np.ndarray:
             "Vectors", "finite numbers", f"NaN or infinity in {bad.sum()} views, first {np.argmax(bad)}"
         )
     return vectors
-
-
-def _checked_angles(proj_geom: Mapping[str, Any]) -> np.ndarray:
-    angles = require_array("ProjectionAngles", _entry(proj_geom, "ProjectionAngles"), ndim=1).astype(
-        np.float64
-    )
-    if not np.isfinite(angles).all():
-        raise fail("ProjectionAngles", "finite numbers", f"{np.sum(~np.isfinite(angles))} NaN or infinite")
-    if _look_like_degrees(angles):
-        raise fail(
-            "ProjectionAngles",
-            "radians",
-            f"{angles.min():g} to {angles.max():g}, which look like degrees",
-            "use numpy.deg2rad(angles); if they are radians over many turns, take them modulo 2*pi",
-        )
-    return angles
-
-
-def _look_like_degrees(angles: np.ndarray) -> bool:
-    """More than two turns, and either a round arc in degrees or small steps that make no whole turns."""
-    if len(angles) < 2 or np.ptp(angles) <= 4 * np.pi:
-        return False
-    step = float(np.median(np.abs(np.diff(angles))))
-    arcs = np.ptp(angles) + np.array([0.0, step])  # without and with the end point
-    round_degrees = np.abs(arcs / 45 - np.round(arcs / 45)) < 1e-4
-    whole_turns = np.abs(arcs / (2 * np.pi) - np.round(arcs / (2 * np.pi))) < 0.02
-    return bool(round_degrees.any() or (step < 1.5 and not whole_turns.any()))
 
 
 def _check_distances(proj_geom: Mapping[str, Any]) -> None:
