@@ -22,6 +22,7 @@ from tomo_polysplat.fit.plan import Plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.soft_matter import describe_soft
+from tomo_polysplat.fit.unit_check import tell_impossible
 from tomo_polysplat.interrupts import postponed_interrupts
 from tomo_polysplat.kernels.device import one_torch_thread, usual_modes
 from tomo_polysplat.model.gaussians import Gaussians
@@ -254,8 +255,11 @@ def _result(outcome: FitOutcome, begun: Begun, problem: Problem, grid: VolumeGri
             "density": heights.cpu().numpy() * plan.reference,
             "u": gaussians.material().cpu().numpy(),
         }
+    curves = problem.all_curves(own, plan, about["settings"]["bone_level"])
+    if problem.polychromatic:
+        tell_impossible(curves, plan.reasons)
     return Result(
-        problem.all_curves(own, plan, about["settings"]["bone_level"]),
+        curves,
         grid,
         energy_kev=None if about["spectrum"] is None else about["spectrum"].effective_energy,
         materials=problem.materials,

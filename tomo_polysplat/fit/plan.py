@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -14,6 +13,7 @@ from tomo_polysplat.fit.depth import optical_depth
 from tomo_polysplat.fit.reference import SoftReference, lightness, soft_reference
 from tomo_polysplat.fit.stopping import patience_of
 from tomo_polysplat.fit.texture import tv_corners
+from tomo_polysplat.fit.unit_check import doubt_lengths
 from tomo_polysplat.model.seed_samples import box_mean, widened
 from tomo_polysplat.physics.detector_blur import describe_blur
 from tomo_polysplat.settings import Settings
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from tomo_polysplat.fit.problem import Problem
 
 __all__ = ["PASSES", "Plan", "finest_spacing", "make_plan"]
-
-logger = logging.getLogger(__name__)
 
 # Seeds along the longest edge: a ray through few large voxels tells what is inside them, and an object's outline
 # in a handful of Gaussians would leave its mass wrong.
@@ -144,8 +142,6 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     """
     matter = soft_reference(start, problem, settings, problem.solid)
     reference, first = matter.value, matter.first
-    if matter.wrong_unit:
-        logger.warning("The unit of length looks wrong; densities are measured by %s.", matter.why)
     relative = torch.as_tensor(start) / (reference * problem.depth)
     light = lightness(relative, matter.adapted(settings).metal_level)
     level = settings.support_level * min(1.0, light / _LIGHT)
@@ -198,6 +194,8 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
         "passes": f"{passes:g} over the views at most, fewer where {settings.held_out:.1%} of the rays, held"
         f" out of the fit, have not improved for {patience_of(settings, passes)}",
     }
+    if matter.wrong_unit:
+        doubt_lengths(plan.reasons, f"densities are measured by {matter.why}")
     return plan
 
 

@@ -1,0 +1,44 @@
+"""Densities that no matter has, of a wrong unit of length or size of a pixel, or of the wrong materials."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import numpy as np
+
+__all__ = ["doubt_lengths", "tell_impossible"]
+
+logger = logging.getLogger(__name__)
+
+# Osmium's, in g/cm3, and the voxels that a piece has which is more than one that is too high by chance.
+_DENSEST_SOLID, _FEWEST = 22.6, 8
+
+
+def doubt_lengths(reasons: dict[str, Any], words: str) -> None:
+    """Say, once a reconstruction, in the log and as ``reasons["lengths"]`` why lengths look wrong."""
+    if "lengths" not in reasons:
+        reasons["lengths"] = f"doubtful: {words}"
+        logger.warning("The unit of length or the size of a pixel looks wrong: %s.", words)
+
+
+def tell_impossible(curves: np.ndarray, reasons: dict[str, Any]) -> None:
+    """Doubt the lengths of a volume with a piece in it that is denser than any solid.
+
+    Parameters
+    ----------
+    curves : (3, nz, ny, nx) array
+        Densities in g/cm3 of the material curves.
+    reasons : dict
+        The plan's.
+    """
+    if sum(float(curve.max(initial=0.0)) for curve in curves) <= _DENSEST_SOLID:
+        return
+    voxels, densest = 0, 0.0
+    for z in range(curves.shape[1]):  # The sum of whole curves would take another volume of memory.
+        density = curves[:, z].sum(axis=0)
+        voxels += int(np.count_nonzero(density > _DENSEST_SOLID))
+        densest = max(densest, float(density.max(initial=0.0)))
+    if voxels >= _FEWEST:
+        words = f"{voxels} voxels have more than {_DENSEST_SOLID:g} g/cm3, up to {densest:.3g}, which no solid has"
+        doubt_lengths(reasons, f"{words}; else name what is heavier than the densest of materials=")
