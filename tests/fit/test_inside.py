@@ -56,6 +56,30 @@ def test_a_holder_on_few_rays_is_matter_beside():
     assert not matter_is_inside(torch.from_numpy(values), geometry, GRID)[0]
 
 
+def a_ball(geometry, radius):
+    """Chords of a ball around the origin, by every ray of a cone beam."""
+    row, column = np.mgrid[: geometry.rows, : geometry.columns][..., None]
+    rays = [
+        geometry.corner[v] + row * geometry.v[v] + column * geometry.u[v] - geometry.origin[v]
+        for v in range(geometry.views)
+    ]
+    along = np.stack([r / np.linalg.norm(r, axis=-1, keepdims=True) for r in rays])
+    distance = np.linalg.norm(np.cross(along, geometry.origin[:, None, None]), axis=-1)
+    return (2 * np.sqrt(np.clip(radius**2 - distance**2, 0, None))).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    "half, height, told", [(0.8, 0.8, False), (0.3, 0.8, True), (0.1, 0.1, True), (0.8, 0.2, False)]
+)
+def test_a_volume_smaller_than_the_object_is_told(half, height, told, caplog):
+    """But not one of fewer slices, which is a part that was chosen."""
+    grid = VolumeGrid((5, 7, 7), [-half, -half, -height], [half, half, height])
+    geometry = scanner("cone", rows=31, columns=41)
+    values = a_ball(geometry, 0.75) + 0.01 * np.random.default_rng(0).normal(size=geometry.shape)
+    why = matter_is_inside(torch.from_numpy(values.astype(np.float32)), geometry, grid)[1]
+    assert ("reaches beyond it" in why) == told == ("Make the volume larger" in caplog.text)
+
+
 def test_a_detector_that_sees_no_more_than_the_volume_tells_nothing():
     values = torch.zeros(11, 1, 3)
     assert not matter_is_inside(values, scanner("cone", rows=1, columns=3), GRID)[0]

@@ -19,7 +19,8 @@ _VIEWS, _LINES = 24, 64
 _FEWEST = 0.01
 # Rays beside the volume see nothing when all but this share of them stay below this part of a typical ray.
 _SHARE, _NOTHING = 0.01, 0.1
-# Of the views and rows, the share in which matter reaches both ends of the detector if the object is truncated.
+# Of the views and rows, the share in which matter reaches both ends of the detector if the object is truncated, or is
+# seen next to the volume if that is too small.
 _MOST = 0.5
 
 
@@ -47,6 +48,12 @@ def matter_is_inside(projections: torch.Tensor, geometry: Geometry, grid: Volume
             return False, "not kept within the volume: the object reaches beyond the detector on both sides"
         return False, "not kept within the volume: too few rays pass beside it to say what lies there"
     if float(np.quantile(values[beside], 1 - _SHARE)) > _NOTHING * typical:
+        if _cut(values, beside, typical):
+            logger.warning(
+                "The object reaches beyond the volume: rays next to it see matter, which ends up in the volume, too"
+                " dense towards its border. Make the volume larger, or check its window and the geometry."
+            )
+            return False, "not kept within the volume: the object reaches beyond it"
         return False, "not kept within the volume: rays beside it see matter"
     return True, "kept within the volume: rays beside it see nothing"
 
@@ -61,6 +68,22 @@ def _truncated(projections: torch.Tensor, views: np.ndarray, rows: np.ndarray, t
     """Whether rays at both ends of the detector's rows see matter in most views."""
     ends = projections[:, :, [0, -1]].cpu().numpy()[np.ix_(views, rows)]
     return bool((np.nan_to_num(ends).min(axis=-1) > _NOTHING * typical).mean() > _MOST) if typical else False
+
+
+def _cut(values: np.ndarray, beside: np.ndarray, typical: float) -> bool:
+    """Whether rays next to the volume see matter in most views and rows that see both it and what is beside it.
+
+    A turntable or a holder is seen by few of them. Rows above and below the volume have no say: part of a longer object
+    may be all that is wanted.
+    """
+    crossing = np.isfinite(values) & ~beside
+    near = np.zeros_like(beside)
+    near[..., 1:] |= crossing[..., :-1]
+    near[..., :-1] |= crossing[..., 1:]
+    near &= beside
+    told = near.any(axis=-1)
+    seen = (near & (np.nan_to_num(values) > _NOTHING * typical)).any(axis=-1)
+    return bool(told.any() and seen[told].mean() > _MOST)
 
 
 def _crosses(geometry: Geometry, grid: VolumeGrid, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
