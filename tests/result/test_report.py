@@ -124,3 +124,10 @@ def test_the_page_stands_alone(tmp_path, flat):
     assert "&lt;no spectrum&gt; &amp; none wanted" in page and "<no spectrum>" not in page
     assert "26.0" in page, "20 log10(0.2 / 0.01) dB against the truth"
     assert "All slices are shown from 0 to 0.22 1/cm" in page
+
+
+def test_a_volume_of_two_slices_has_a_page_without_the_comparison(tmp_path, caplog):
+    truth, metal = phantom((2, 9, 10))
+    result = Result(truth[None], VolumeGrid((2, 9, 10), [-1, -1, -1], [1, 1, 1]), "cm")
+    result.report(tmp_path / "page.html", truth=truth, metal_mask=metal)
+    assert "not compared" in (tmp_path / "page.html").read_text() and "Not compared" in caplog.text

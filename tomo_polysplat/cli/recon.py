@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +28,8 @@ from tomo_polysplat.interrupts import postponed_interrupts
 if TYPE_CHECKING:
     from tomo_polysplat.result.result import Result
     from tomo_polysplat.scan.scan import Scan
+
+logger = logging.getLogger(__name__)
 
 NAME = "recon"
 HELP = "reconstruct a scan into a volume of attenuation in 1/length"
@@ -87,11 +90,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Reconstruct, and write what was asked for."""
+    from tomo_polysplat.physics.spectrum import require_energy_of
+
     _require_outputs(arguments)
     scan = scan_from(arguments, spectrum_from(arguments))
     spectrum = None if arguments.mono else scan.spectrum
-    if arguments.energy is not None and spectrum is None:
-        raise fail("--energy", "a spectrum, from the file or from --kvp", "none")
+    if arguments.energy is not None:
+        if spectrum is None:
+            raise fail("--energy", "a spectrum, from the file or from --kvp", "none")
+        require_energy_of("--energy", arguments.energy, spectrum)
     _require_room(arguments, scan)
     print(scan)
     with ProgressBar() as progress:
@@ -176,12 +183,13 @@ def _write(result: Result, scan: Scan, arguments: argparse.Namespace) -> None:
     save = result.save_npy if output.suffix.lower() == ".npy" else result.save
     save(output, overwrite=overwrite)
     print(f"wrote {output}")
-    errors = _errors(result, scan)
     if arguments.tiff is not None:
         result.save_tiff(arguments.tiff, overwrite=overwrite)
         print(f"wrote {arguments.tiff}")
+    errors = _errors(result, scan)
     if arguments.report is not None:
-        known = {"truth": scan.truth, "metal_mask": scan.metal_mask} if _same_energy(result, scan) else {}
+        comparable = errors is not None and _same_energy(result, scan)
+        known = {"truth": scan.truth, "metal_mask": scan.metal_mask} if comparable else {}
         result.report(arguments.report, overwrite=overwrite, **known)
         print(f"wrote {arguments.report}")
     if errors is not None:
@@ -193,7 +201,7 @@ def _write(result: Result, scan: Scan, arguments: argparse.Namespace) -> None:
 
 
 def _errors(result: Result, scan: Scan) -> dict[str, Any] | None:
-    """Figures of merit at the energy of the truth, where the scan carries one."""
+    """Figures of merit at the energy of the truth, where the scan carries one that the volume can be compared with."""
     if scan.truth is None:
         return None
     from tomo_polysplat.result.metrics import compare
@@ -201,7 +209,12 @@ def _errors(result: Result, scan: Scan) -> dict[str, Any] | None:
     energy = _truth_energy(scan)
     volume = result.volume if result.is_monochromatic or energy is None else result.attenuation(energy)
     name = "mono" if result.is_monochromatic else "polysplat"
-    return {"name": name, "seconds": result.seconds, **compare(volume, scan.truth, scan.metal_mask)}
+    try:
+        found = compare(volume, scan.truth, scan.metal_mask)
+    except ValueError as error:
+        logger.warning("Not compared with the truth: %s", error)
+        return None
+    return {"name": name, "seconds": result.seconds, **found}
 
 
 def _truth_energy(scan: Scan) -> float | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import logging
 import os
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from tomo_polysplat.result.result import Result
 
 __all__ = ["image", "page", "write_report"]
+
+logger = logging.getLogger(__name__)
 
 PAGE = """<!DOCTYPE html>
 <html lang="en">
@@ -116,7 +119,11 @@ def _errors(
         return []
     from tomo_polysplat.result.metrics import compare
 
-    entry = {"name": OURS, "seconds": result.seconds, **compare(volume, truth, metal)}
+    try:
+        entry = {"name": OURS, "seconds": result.seconds, **compare(volume, truth, metal)}
+    except ValueError as error:  # of a volume two voxels high, say, which the page still shows
+        logger.warning("Not compared with the truth: %s", error)
+        return _section("Against the truth", {"not compared": str(error)})
     rows = dict(zip(tables.headings(result.unit)[1:], tables.cells(entry)[1:]))
     return _section("Against the truth", rows)
 
