@@ -45,8 +45,8 @@ class AstraOptions:
     """
 
     def __init__(self, **options: Any) -> None:
-        solver_options(options, OWN_OPTIONS)
-        self.options = options
+        own, solver = solver_options(options, OWN_OPTIONS)
+        self.options = own | solver
         self.number = next(_numbers)
         _living[self.number] = self
 

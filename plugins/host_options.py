@@ -7,7 +7,7 @@ from typing import Any
 
 from tomo_polysplat.checks import fail, require_choice
 
-__all__ = ["SOLVER_OPTIONS", "solver_options"]
+__all__ = ["SOLVER_OPTIONS", "solver_options", "spectrum_of", "split_options"]
 
 TUBE_OPTIONS = ("kvp", "anode", "filters", "detector")
 PASSED_ON = (
@@ -36,6 +36,17 @@ def solver_options(
     ValueError, TypeError
         For an unknown name, or a spectrum described twice or in part.
     """
+    own, solver, tube = split_options(options, own_names)
+    return own, solver | spectrum_of(tube)
+
+
+def split_options(
+    options: Mapping[str, Any], own_names: Iterable[str]
+) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+    """The adapter's own options, the solver's, and those of a tube, of which no spectrum is made yet.
+
+    Parameters and errors are those of :func:`solver_options`.
+    """
     if not isinstance(options, Mapping):
         raise fail("options", "a dict", repr(type(options).__name__), error=TypeError)
     own_names = tuple(own_names)
@@ -44,12 +55,17 @@ def solver_options(
     own = {name: options[name] for name in own_names if name in options}
     solver = {name: options[name] for name in PASSED_ON if name in options}
     tube = {name: options[name] for name in TUBE_OPTIONS if options.get(name) is not None}
-    if tube:
-        from tomo_polysplat.physics.spectrum import Spectrum
+    if tube and "kvp" not in tube:
+        raise fail("options['kvp']", f"the tube voltage beside {', '.join(tube)}", "none")
+    if tube and solver.get("spectrum") is not None:
+        raise fail("options['spectrum']", "none beside kvp", "both", "give one of them")
+    return own, solver, tube
 
-        if "kvp" not in tube:
-            raise fail("options['kvp']", f"the tube voltage beside {', '.join(tube)}", "none")
-        if solver.get("spectrum") is not None:
-            raise fail("options['spectrum']", "none beside kvp", "both", "give one of them")
-        solver["spectrum"] = Spectrum.from_tube(**tube)
-    return own, solver
+
+def spectrum_of(tube: Mapping[str, Any]) -> dict[str, Any]:
+    """The keyword ``spectrum`` of a tube's options; nothing without a tube."""
+    if not tube:
+        return {}
+    from tomo_polysplat.physics.spectrum import Spectrum
+
+    return {"spectrum": Spectrum.from_tube(**tube)}

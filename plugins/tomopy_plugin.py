@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 import tomo_polysplat
-from tomo_polysplat.checks import fail, require_choice, require_shape
-from tomo_polysplat.plugins.host_options import solver_options
+from tomo_polysplat.checks import fail, require_choice, require_number, require_shape
+from tomo_polysplat.plugins.host_options import spectrum_of, split_options
 from tomo_polysplat.plugins.tomopy_chunks import ChunkCollector
 
 __all__ = ["polysplat"]
@@ -61,17 +61,20 @@ def polysplat(
 
     """
     options = keywords.pop("options", None)
-    options = {} if options is None else np.asarray(options, dtype=object).item()
+    if isinstance(options, np.ndarray) and options.ndim == 0:  # what TomoPy makes of a dict
+        options = options.item()
     grid = tuple(int(keywords.pop(f"num_grid{axis}", size)) for axis, size in zip("xy", recon.shape[-2:]))
     require_shape("init_recon", recon, (*recon.shape[:-2], *grid), "(..., num_gridx, num_gridy)")
     for name, value in keywords.items():
         raise fail(name, "no such keyword", repr(value), "see options of tomo_polysplat.polysplat")
-    own, solver = solver_options(options, OWN_OPTIONS)
-    _require_one_geometry(own, solver)
+    own, solver, tube = split_options({} if options is None else options, OWN_OPTIONS)
+    _require_one_geometry(own, solver, polychromatic=bool(tube) or solver.get("spectrum") is not None)
     whole = _chunks.add(tomo, center, recon)
     if whole is None:
         return
     tomo, center, recon = whole
+    solver |= spectrum_of(tube)
+    _require_kinds(own, solver)
     if own.get("proj_geom") is not None:
         if not np.allclose(center, tomo.shape[2] / 2):
             raise fail("center", "None beside proj_geom", f"{center[0]:g}", "proj_geom places the axis")
@@ -90,7 +93,21 @@ def polysplat(
         _solve(tomo[part], recon[part], *geometry, own, shared)
 
 
-def _require_one_geometry(own: dict[str, Any], solver: dict[str, Any]) -> None:
+def _require_kinds(own: dict[str, Any], solver: dict[str, Any]) -> None:
+    """Refuse before the work what would only fail after it, or by arithmetic."""
+    from tomo_polysplat.physics.spectrum import require_energy_of
+
+    if own.get("energy_kev") is not None:
+        require_energy_of("options['energy_kev']", own["energy_kev"], solver.get("spectrum"))
+    if own.get("on_result") is not None and not callable(own["on_result"]):
+        raise fail("options['on_result']", "a function of a Result", repr(own["on_result"]), error=TypeError)
+    if solver.get("time_budget") is not None:
+        solver["time_budget"] = require_number("options['time_budget']", solver["time_budget"], above=0)
+    if own.get("pixel_size") is not None:
+        require_number("options['pixel_size']", own["pixel_size"], above=0)
+
+
+def _require_one_geometry(own: dict[str, Any], solver: dict[str, Any], *, polychromatic: bool) -> None:
     """Refuse a geometry that is stated in part or twice, and fill in the unit that goes with it."""
     stated = own.get("proj_geom") is not None
     if stated != (own.get("vol_geom") is not None):
@@ -101,6 +118,9 @@ def _require_one_geometry(own: dict[str, Any], solver: dict[str, Any]) -> None:
         solver.setdefault("unit", "cm")
     elif solver.setdefault("unit", "pixel") != "pixel":
         raise fail("options['pixel_size']", f"the size of a pixel in {solver['unit']}", "none")
+    elif polychromatic:
+        remedy = "a spectrum needs real lengths: pass it, and options['unit'] where that is not cm"
+        raise fail("options['pixel_size']", "the size of a pixel beside a spectrum", "none", remedy)
 
 
 def _parallel_beam(

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from types import ModuleType
 
 import h5py
@@ -12,8 +13,8 @@ import tomo_polysplat
 from tomo_polysplat.cli import main
 from tomo_polysplat.physics.materials import Materials, mass_attenuation
 from tomo_polysplat.result.result import Result
-from tomo_polysplat.scan.geometry import from_astra
-from tomo_polysplat.scan.io import load_scan
+from tomo_polysplat.scan.geometry import VolumeGrid, from_astra, to_astra
+from tomo_polysplat.scan.io import load_scan, save_scan
 
 SIMULATE = ["simulate", "pins", "--size", "10", "--views", "8"]
 
@@ -143,6 +144,12 @@ def test_check_describes_a_scan(scan_file, capsys):
         (["-o", "scan.h5"], "pass --overwrite"),
         (["-o", "nowhere/x.h5"], "existing folder"),
         (["-o", "x.h5", "--filter", "Al:0.1"], "--filter: expected --kvp"),
+        (["-o", "x.h5", "--detector", "film"], "--detector: expected --kvp"),
+        (["-o", "x.h5", "--anode", "Xx"], "--anode: expected --kvp"),
+        (["-o", "x.h5", "--spectrum", "s.txt", "--detector", "film"], "--detector beside it"),
+        (["-o", "x.h5", "--spectrum", "s.txt", "--anode", "W"], "--spectrum: expected none of --kvp"),
+        (["-o", "x.h5", "--energy", "60000"], "--energy: expected keV between"),
+        (["-o", "x.h5", "--energy", "-4"], "--energy: expected a finite number > 0"),
         (["-o", "x.h5", "--kvp", "90", "--filter", "Al"], "--filter: expected MATERIAL:CM"),
         (["-o", "x.h5", "--kvp", "90", "--detector", "film"], "--detector: expected counting"),
         (["-o", "x.h5", "--kvp", "9000"], "kV"),
@@ -159,6 +166,29 @@ def test_bad_input_is_one_line_and_status_2(scan_file, solver, capsys, monkeypat
     errors = capsys.readouterr().err
     assert message in errors and errors.count("\n") == 1 and "Traceback" not in errors
     assert not solver, "the solver ran before the mistake was found"
+
+
+def test_what_cannot_be_compared_with_the_truth_is_written_all_the_same(
+    scan_file, tmp_path, solver, capsys, caplog
+):
+    """Two slices have no window of structural similarity."""
+    scan = load_scan(scan_file)
+    geometry, grid = from_astra(scan.proj_geom, scan.vol_geom)
+    grid = VolumeGrid((2, 10, 10), grid.lower * [1, 1, 0.2], grid.upper * [1, 1, 0.2])
+    flat = replace(scan, vol_geom=to_astra(geometry, grid)[1], truth=scan.truth[4:6], metal_mask=None)
+    save_scan(flat, tmp_path / "flat.h5")
+    out, page, slices, figures = (tmp_path / name for name in ("out.h5", "r.html", "slices", "out.json"))
+    options = ["-o", out, "--report", page, "--tiff", slices, "--json", figures]
+    assert main(["recon", *map(str, [tmp_path / "flat.h5", *options])]) == 0
+    assert all(path.exists() for path in (out, page, slices))
+    assert json.loads(figures.read_text())["errors"] is None
+    assert "Not compared with the truth" in caplog.text
+
+
+@pytest.mark.parametrize("options, told", [([], True), (["--filter", "Al:0.1"], False)])
+def test_a_tube_without_a_filter_is_told(scan_file, tmp_path, solver, caplog, options, told):
+    assert main(["recon", str(scan_file), "-o", str(tmp_path / "x.h5"), "--kvp", "90", *options]) == 0
+    assert ("--filter Al:0.1" in caplog.text) == told
 
 
 def test_a_missing_or_damaged_scan_is_status_2(tmp_path, capsys):

@@ -29,7 +29,7 @@ def add_spectrum_options(parser: argparse.ArgumentParser) -> None:
     """The x-ray spectrum: a tube with filters and a detector, or a table."""
     group = parser.add_argument_group("spectrum (used instead of the file's)")
     group.add_argument("--kvp", type=float, metavar="KV", help="tube voltage in kV")
-    group.add_argument("--anode", default="W", help="anode: W, Mo, Rh, Ag or Cu (default: W)")
+    group.add_argument("--anode", help="anode: W, Mo, Rh, Ag or Cu (default: W)")
     group.add_argument(
         "--filter",
         action="append",
@@ -39,7 +39,6 @@ def add_spectrum_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--detector",
-        default="counting",
         metavar="KIND",
         help="counting, or integrating:SCINTILLATOR:CM such as integrating:CsI:0.06 (default: counting)",
     )
@@ -52,16 +51,19 @@ def spectrum_from(arguments: argparse.Namespace) -> Spectrum | None:
     """The spectrum that the options describe, or None."""
     from tomo_polysplat.physics.spectrum import Spectrum
 
+    tube = {name: value for name in ("anode", "filter", "detector") if (value := getattr(arguments, name))}
     if arguments.spectrum is not None:
-        if arguments.kvp is not None or arguments.filter:
-            raise fail("--spectrum", "no --kvp or --filter beside it", "both")
+        if tube or arguments.kvp is not None:
+            raise fail("--spectrum", "none of --kvp, --anode, --filter, --detector beside it", "both")
         return Spectrum(*_two_columns(arguments.spectrum), label=Path(arguments.spectrum).name)
     if arguments.kvp is None:
-        if arguments.filter:
-            raise fail("--filter", "--kvp with it", "no --kvp")
+        for name in tube:
+            raise fail(f"--{name}", "--kvp with it", "no --kvp")
         return None
     filters = dict(_filter(text) for text in arguments.filter)
-    return Spectrum.from_tube(arguments.kvp, arguments.anode, filters, _detector(arguments.detector))
+    return Spectrum.from_tube(
+        arguments.kvp, arguments.anode or "W", filters or None, _detector(arguments.detector or "counting")
+    )
 
 
 def _two_columns(path: str) -> tuple[Any, Any]:

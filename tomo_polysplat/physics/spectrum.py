@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,7 +13,9 @@ from tomo_polysplat.physics.detector import Detector
 from tomo_polysplat.physics.materials import density, mass_attenuation, require_energies
 from tomo_polysplat.physics.tube_tables import tube_counts
 
-__all__ = ["Filters", "Spectrum"]
+__all__ = ["Filters", "Spectrum", "require_energy_of"]
+
+logger = logging.getLogger(__name__)
 
 # material -> thickness in cm, or (thickness in cm, density in g/cm3)
 Filters = Mapping[str, float | tuple[float, float]]
@@ -84,7 +87,8 @@ class Spectrum:
         filters : mapping, optional
             Everything between anode and sample as ``{material: cm}``, or ``{material: (cm, g/cm3)}`` for one
             without a known density. The tube's own window belongs here too, such as ``{"Be": 0.05, "Al":
-            0.1}``: without any, the tube is bare and most of its photons are too soft for any sample.
+            0.1}``: without any, the tube is bare and most of its photons are too soft for any sample. The log
+            warns of that unless it is asked for, by ``{}``.
         detector : Detector, optional
             Response; None counts every photon.
 
@@ -95,6 +99,13 @@ class Spectrum:
         """
         kvp = require_number("kvp", kvp)
         tube = cls(*tube_counts(kvp, anode), label=f"{kvp:g} kVp {anode} tube")
+        if filters is None:
+            logger.warning(
+                "No filter was given: the %s is bare, of %.0f keV in the mean. Pass what lies between anode and sample,"
+                " its window too, as filters={'Al': 0.1} or --filter Al:0.1 in cm; filters={} if there is nothing.",
+                tube.label,
+                tube.effective_energy,
+            )
         spectrum = tube.filtered({} if filters is None else filters)
         return spectrum.detected(Detector.photon_counting() if detector is None else detector)
 
@@ -206,3 +217,20 @@ class Spectrum:
 
     def __repr__(self) -> str:
         return f"<Spectrum {self.describe()}>"
+
+
+def require_energy_of(argument: str, kev: Any, spectrum: Spectrum | None) -> float:
+    """An energy in keV at which a volume that was fitted under a spectrum is known.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For none within the tables, no spectrum, or another energy than a spectrum's only one.
+    """
+    energy = require_number(argument, kev, above=0.0)
+    if spectrum is None:
+        raise fail(argument, "a spectrum beside it", f"{energy:g} keV alone", "pass the scan's spectrum")
+    if spectrum.is_monochromatic and abs(energy - spectrum.energies[0]) > 1e-6 * energy:
+        raise fail(argument, f"{spectrum.energies[0]:g} keV, the spectrum's only energy", f"{energy:g}")
+    require_energies(argument, [energy])
+    return energy
