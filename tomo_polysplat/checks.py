@@ -5,13 +5,17 @@ Every failure names the argument, says what was expected and what was got, and h
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
-__all__ = ["fail", "require_array", "require_choice", "require_number", "require_shape"]
+__all__ = ["did_you_mean", "fail", "require_array", "require_choice", "require_number", "require_shape"]
+
+# Characters. A whole file may be handed over as a name, and comparing that would take long.
+_LONGEST_NAME = 60
 
 
 def fail(
@@ -58,8 +62,20 @@ def require_choice(argument: str, value: Any, choices: Iterable[str], remedy: st
     known = list(choices)
     # An array is no name, and comparing it with one gives an array.
     if not isinstance(value, str) or value not in known:
-        raise fail(argument, f"one of {', '.join(known)}", repr(value), remedy)
+        meant = did_you_mean(value, known)
+        raise fail(
+            argument, f"one of {', '.join(known)}", repr(value), "; ".join(filter(None, (meant, remedy)))
+        )
     return value
+
+
+def did_you_mean(value: Any, known: Iterable[str]) -> str:
+    """``"did you mean ...?"`` with the names that are close to what was given, or nothing."""
+    if not isinstance(value, str) or len(value) > _LONGEST_NAME:
+        return ""
+    names = {name.lower(): name for name in known}
+    close = difflib.get_close_matches(value.lower(), names, n=3, cutoff=0.6)
+    return f"did you mean {' or '.join(names[name] for name in close)}?" if close else ""
 
 
 def require_array(argument: str, value: Any, ndim: int | None = None, remedy: str = "") -> np.ndarray:

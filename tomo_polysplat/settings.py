@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
-from tomo_polysplat.checks import fail, require_choice, require_number
+from tomo_polysplat.checks import did_you_mean, fail, require_choice, require_number
 
 __all__ = ["PRESETS", "Settings", "make_settings"]
 
@@ -163,17 +163,29 @@ PRESETS: dict[str, dict[str, Any]] = {
     "balanced": {},
     "best": {"passes": 30.0},
 }
+_DEFAULT_QUALITY = "balanced"
 
 
-def make_settings(quality: str = "balanced", changes: Mapping[str, Any] | Settings | None = None) -> Settings:
-    """The settings of a preset with some of them changed by name."""
-    if isinstance(changes, Settings):
-        return changes
+def make_settings(
+    quality: str = _DEFAULT_QUALITY, changes: Mapping[str, Any] | Settings | None = None
+) -> Settings:
+    """The settings of a preset with some of them changed by name.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For an unknown quality, name or value, and for a quality beside whole settings, which leave it nothing to say.
+    """
     require_choice("quality", quality, PRESETS)
+    if isinstance(changes, Settings):
+        if quality != _DEFAULT_QUALITY:
+            remedy = "whole settings hold all that a quality sets: pass a dict of single ones beside it"
+            raise fail("quality", "none beside a Settings object", repr(quality), remedy)
+        return changes
     if changes is not None and not isinstance(changes, Mapping):
         raise fail("settings", "Settings or a dict of their names", repr(changes), error=TypeError)
-    known = {field.name for field in fields(Settings)}
+    known = sorted(field.name for field in fields(Settings))
     for name in changes or {}:
         if name not in known:
-            raise fail("settings", f"names among {', '.join(sorted(known))}", repr(name))
+            raise fail("settings", f"names among {', '.join(known)}", repr(name), did_you_mean(name, known))
     return replace(Settings(), **{**PRESETS[quality], **(changes or {})})

@@ -7,7 +7,6 @@ mixtures add by mass.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -15,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from tomo_polysplat.checks import fail, require_array, require_number
+from tomo_polysplat.checks import did_you_mean, fail, require_array, require_number
 from tomo_polysplat.physics.mixtures import ALIASES, NAMED
 
 __all__ = [
@@ -178,10 +177,7 @@ def _suggestion(name: str) -> str:
     if name.capitalize() in _element_symbols():
         return f"did you mean {name.capitalize()}?"
     known = sorted({*NAMED, *ALIASES, *_element_symbols(), *xraydb.get_materials()})
-    close = difflib.get_close_matches(name.lower(), known, n=3, cutoff=0.6)
-    return (
-        f"did you mean {' or '.join(close)}?" if close else "element symbols are case-sensitive, as in ZrO2"
-    )
+    return did_you_mean(name, known) or "element symbols are case-sensitive, as in ZrO2"
 
 
 @lru_cache(maxsize=64)
@@ -245,7 +241,7 @@ class Materials:
             return cls()
         if isinstance(value, Materials):
             return value
-        if isinstance(value, (str, Mapping)) or len(value) != 3:
+        if isinstance(value, (str, Mapping)) or not hasattr(value, "__len__") or len(value) != 3:
             raise fail("materials", "three materials (soft, middle, dense)", repr(value))
         return cls(*value)
 
