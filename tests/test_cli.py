@@ -131,6 +131,18 @@ def test_recon_reads_counts_with_the_options_given(tmp_path, solver):
     assert Result.load(tmp_path / "o.h5").unit == "mm" and solver[0]["shape"] == (2, 4, 9)
 
 
+def test_a_spectrum_without_the_size_of_a_pixel_is_refused_by_its_flag(tmp_path, solver, capsys):
+    path = tmp_path / "scan.h5"
+    with h5py.File(path, "w") as file:
+        file["exchange/data"] = np.random.default_rng(0).random((4, 2, 9))
+        file["exchange/theta"] = [0.0, 45, 90, 135]
+        file["exchange/data"].attrs["values"] = "attenuation"
+    command = ["recon", str(path), "-o", str(tmp_path / "o.h5"), "--centre", "4.5", "--input", "attenuation"]
+    assert main([*command, "--kvp", "90", "--filter", "Al:0.1"]) == 2
+    assert "--pixel-size: expected the size of a pixel" in capsys.readouterr().err and not solver
+    assert main(command) == 0
+
+
 def test_check_describes_a_scan(scan_file, capsys):
     assert main(["check", str(scan_file)]) == 0
     printed = capsys.readouterr().out
@@ -142,7 +154,11 @@ def test_check_describes_a_scan(scan_file, capsys):
     [
         (["-o", "x.foo"], "--output: expected a name ending in"),
         (["-o", "scan.h5"], "pass --overwrite"),
-        (["-o", "nowhere/x.h5"], "existing folder"),
+        (["-o", "nowhere/x.h5"], "--output: expected a file in an existing folder"),
+        (["-o", "x.h5", "--report", "."], "--report: expected a file"),
+        (["-o", "x.h5", "--json", "nowhere/x.json"], "--json: expected a file in an existing folder"),
+        (["-o", "x.h5", "--tiff", "scan.h5"], "--tiff: expected a folder"),
+        (["-o", "x.h5", "--spectrum", "none.txt"], "--spectrum: expected an existing file"),
         (["-o", "x.h5", "--filter", "Al:0.1"], "--filter: expected --kvp"),
         (["-o", "x.h5", "--detector", "film"], "--detector: expected --kvp"),
         (["-o", "x.h5", "--anode", "Xx"], "--anode: expected --kvp"),

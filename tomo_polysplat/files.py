@@ -68,19 +68,21 @@ def replacing(path: str | os.PathLike, *, overwrite: bool, needed_bytes: int = 0
             temporary.unlink()
 
 
-def require_replaceable(target: Path, overwrite: bool, remedy: str = "pass overwrite=True") -> None:
+def require_replaceable(
+    target: Path, overwrite: bool, remedy: str = "pass overwrite=True", argument: str = "path"
+) -> None:
     """Refuse a file that could not be written: a folder, one in a missing folder, or one that must stay."""
     if target.is_dir():
-        raise fail("path", "a file", f"the folder {target}", error=IsADirectoryError)
+        raise fail(argument, "a file", f"the folder {target}", error=IsADirectoryError)
     if not target.parent.is_dir():
         raise fail(
-            "path", "a file in an existing folder", str(target), "create the folder", FileNotFoundError
+            argument, "a file in an existing folder", str(target), "create the folder", FileNotFoundError
         )
     if target.exists() and not overwrite:
-        raise fail("path", "a new file", f"{target}, which exists", remedy, FileExistsError)
+        raise fail(argument, "a new file", f"{target}, which exists", remedy, FileExistsError)
 
 
-def require_writable(folder: str | os.PathLike) -> None:
+def require_writable(folder: str | os.PathLike, argument: str = "path") -> None:
     """Refuse a folder in which no file can be made, by making one: permissions alone do not tell."""
     try:
         with tempfile.TemporaryFile(dir=Path(folder)):
@@ -88,7 +90,7 @@ def require_writable(folder: str | os.PathLike) -> None:
     except OSError as error:
         remedy = "change its permissions or choose another folder"
         raise fail(
-            "path", "a folder that can be written to", f"{folder} ({error})", remedy, type(error)
+            argument, "a folder that can be written to", f"{folder} ({error})", remedy, type(error)
         ) from error
 
 
@@ -169,11 +171,11 @@ def require_plausible_size(name: str, declared_bytes: int, stored_bytes: int) ->
         )
 
 
-def existing_file(path: str | os.PathLike) -> Path:
+def existing_file(path: str | os.PathLike, argument: str = "path") -> Path:
     """`path` as a Path to a file that exists and is not empty."""
     file = Path(path)
     if not file.is_file():
-        raise fail("path", "an existing file", str(file), error=FileNotFoundError)
+        raise fail(argument, "an existing file", str(file), error=FileNotFoundError)
     if file.stat().st_size == 0:
-        raise fail("path", "a file with contents", f"{file}, which is empty")
+        raise fail(argument, "a file with contents", f"{file}, which is empty")
     return file

@@ -33,8 +33,10 @@ def run(arguments: argparse.Namespace) -> int:
     folder = Path(arguments.output)
     folder.mkdir(parents=True, exist_ok=True)
     for name in FILES:
-        require_replaceable(folder / name, arguments.overwrite, "pass --overwrite or another folder")
-    require_writable(folder)
+        require_replaceable(
+            folder / name, arguments.overwrite, "pass --overwrite or another folder", "--output"
+        )
+    require_writable(folder, "--output")
     with ProgressBar() as progress:
         outcome = run_demo(folder, device=arguments.device, seed=arguments.seed, progress=progress)
     print(as_text(outcome["methods"], "cm"))

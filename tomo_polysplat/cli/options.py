@@ -69,7 +69,7 @@ def spectrum_from(arguments: argparse.Namespace) -> Spectrum | None:
 def _two_columns(path: str) -> tuple[Any, Any]:
     import numpy as np
 
-    file = existing_file(path)
+    file = existing_file(path, "--spectrum")
     with open(file, encoding="utf-8") as stream:
         table = np.loadtxt((line.replace(",", " ") for line in stream), ndmin=2)
     if table.shape[1] != 2:

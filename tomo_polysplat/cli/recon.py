@@ -26,6 +26,7 @@ from tomo_polysplat.files import require_replaceable, require_room_for, require_
 from tomo_polysplat.interrupts import postponed_interrupts
 
 if TYPE_CHECKING:
+    from tomo_polysplat.physics.spectrum import Spectrum
     from tomo_polysplat.result.result import Result
     from tomo_polysplat.scan.scan import Scan
 
@@ -90,15 +91,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Reconstruct, and write what was asked for."""
-    from tomo_polysplat.physics.spectrum import require_energy_of
-
     _require_outputs(arguments)
     scan = scan_from(arguments, spectrum_from(arguments))
-    spectrum = None if arguments.mono else scan.spectrum
-    if arguments.energy is not None:
-        if spectrum is None:
-            raise fail("--energy", "a spectrum, from the file or from --kvp", "none")
-        require_energy_of("--energy", arguments.energy, spectrum)
+    spectrum = _spectrum_of(scan, arguments)
     _require_room(arguments, scan)
     print(scan)
     with ProgressBar() as progress:
@@ -131,6 +126,21 @@ def run(arguments: argparse.Namespace) -> int:
     return INTERRUPTED if interrupted else 0
 
 
+def _spectrum_of(scan: Scan, arguments: argparse.Namespace) -> Spectrum | None:
+    """The spectrum to fit under, with the lengths and the energy that it needs."""
+    from tomo_polysplat.physics.spectrum import require_energy_of
+
+    spectrum = None if arguments.mono else scan.spectrum
+    if spectrum is not None and scan.unit == "pixel":
+        remedy = "a spectrum needs real lengths: pass it with --unit, or --mono to ignore the spectrum"
+        raise fail("--pixel-size", "the size of a pixel beside a spectrum", "none", remedy)
+    if arguments.energy is not None:
+        if spectrum is None:
+            raise fail("--energy", "a spectrum, from the file or from --kvp", "none")
+        require_energy_of("--energy", arguments.energy, spectrum)
+    return spectrum
+
+
 def _require_outputs(arguments: argparse.Namespace) -> None:
     """Find out before the work, not after it, that a result could not be written."""
     from tomo_polysplat.result.files import require_slices_folder
@@ -139,15 +149,17 @@ def _require_outputs(arguments: argparse.Namespace) -> None:
         raise fail("--output", f"a name ending in {', '.join(OUTPUT_SUFFIXES)}", arguments.output)
     if arguments.resume and arguments.checkpoint is None:
         raise fail("--resume", "--checkpoint with it", "none")
-    for path in (arguments.output, arguments.report, arguments.json):
-        if path is not None:
-            require_replaceable(Path(path), arguments.overwrite, "pass --overwrite")
-            require_writable(Path(path).parent)
+    for name in ("output", "report", "json"):
+        if (path := getattr(arguments, name)) is not None:
+            require_replaceable(Path(path), arguments.overwrite, "pass --overwrite", f"--{name}")
+            require_writable(Path(path).parent, f"--{name}")
     if arguments.checkpoint is not None:
         remedy = "pass --resume to go on from it, or remove it"
-        require_replaceable(Path(arguments.checkpoint), arguments.resume, remedy)
+        require_replaceable(Path(arguments.checkpoint), arguments.resume, remedy, "--checkpoint")
     if arguments.tiff is not None:
-        require_slices_folder(arguments.tiff, overwrite=arguments.overwrite, remedy="pass --overwrite")
+        require_slices_folder(
+            arguments.tiff, overwrite=arguments.overwrite, remedy="pass --overwrite", argument="--tiff"
+        )
     named = ("scan", "output", "report", "json", "tiff", "checkpoint")
     files = [Path(path).resolve() for name in named if (path := getattr(arguments, name)) is not None]
     if len(set(files)) < len(files):

@@ -42,8 +42,8 @@ def run(arguments: argparse.Namespace) -> int:
     from tomo_polysplat.simulate.scenes import simulate_scan
 
     output = Path(arguments.output)
-    require_replaceable(output, arguments.overwrite, "pass --overwrite")
-    require_writable(output.parent)
+    require_replaceable(output, arguments.overwrite, "pass --overwrite", "--output")
+    require_writable(output.parent, "--output")
     # The truth with its metal, and views of about as many pixels as a side of the volume has voxels.
     require_room(output.parent, 5 * arguments.size**3 + 4 * arguments.views * arguments.size**2)
     scan = simulate_scan(

@@ -164,22 +164,26 @@ def save_npy(result: Result, path: str | os.PathLike, *, overwrite: bool = False
 
 
 def require_slices_folder(
-    folder: str | os.PathLike, *, overwrite: bool, remedy: str = "pass overwrite=True"
+    folder: str | os.PathLike,
+    *,
+    overwrite: bool,
+    remedy: str = "pass overwrite=True",
+    argument: str = "folder",
 ) -> list[Path]:
     """The slices in a folder; refused are slices that must stay, and folders that cannot be written to."""
     target = Path(folder)
     if target.exists() and not target.is_dir():
-        raise fail("folder", "a folder", f"the file {target}", error=NotADirectoryError)
+        raise fail(argument, "a folder", f"the file {target}", error=NotADirectoryError)
     present = sorted(target.glob("slice_*.tif"))
     if present and not overwrite:
         raise fail(
-            "folder",
+            argument,
             "one without slices",
             f"{len(present)} in {target}",
             remedy,
             FileExistsError,
         )
-    require_writable(existing_parent(target))
+    require_writable(existing_parent(target), argument)
     return present
 
 
