@@ -29,7 +29,7 @@ from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.parallel import kept_threads
 from tomo_polysplat.physics.detector_blur import describe_blur
 from tomo_polysplat.physics.materials import Materials
-from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.physics.spectrum import Spectrum, require_spectrum
 from tomo_polysplat.physics.water_correction import describe_polynomial
 from tomo_polysplat.progress import progress_reports
 from tomo_polysplat.result.result import Result
@@ -80,11 +80,12 @@ def reconstruct(
     spectrum : Spectrum, optional
         Detected spectrum. None, or a single energy, fits a monochromatic model.
     materials : Materials or three names, optional
-        The soft, middle and dense material whose curves the model mixes; water, aluminium, iron by default.
+        The soft, middle and dense material whose curves the model mixes; water, aluminium, iron by default. One
+        energy has no use for them, which the log says.
     unit : {"cm", "mm", "um", "m", "pixel"}
         Unit of length of the geometries; the volume comes in 1/unit. "pixel" goes with no spectrum only.
     quality : {"fast", "balanced", "best"}
-        Preset of the settings.
+        Preset of the settings; none beside a whole ``Settings`` object.
     time_budget : float, optional
         Seconds after which the best result so far is returned.
     seed : int
@@ -135,6 +136,7 @@ def reconstruct(
     """
     started = time.perf_counter()
     wishes = Wishes.of(quality, settings, time_budget, seed, device, callbacks)
+    spectrum = require_spectrum("spectrum", spectrum)
     geometry, grid = from_astra(proj_geom, vol_geom)
     values, counts = usable_rays(projections, proj_geom, valid)
     values = uncorrected(values, water_correction, spectrum)

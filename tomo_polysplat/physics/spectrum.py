@@ -13,7 +13,7 @@ from tomo_polysplat.physics.detector import Detector
 from tomo_polysplat.physics.materials import density, mass_attenuation, require_energies
 from tomo_polysplat.physics.tube_tables import tube_counts
 
-__all__ = ["Filters", "Spectrum", "require_energy_of"]
+__all__ = ["Filters", "Spectrum", "require_energy_of", "require_spectrum"]
 
 logger = logging.getLogger(__name__)
 
@@ -234,3 +234,17 @@ def require_energy_of(argument: str, kev: Any, spectrum: Spectrum | None) -> flo
         raise fail(argument, f"{spectrum.energies[0]:g} keV, the spectrum's only energy", f"{energy:g}")
     require_energies(argument, [energy])
     return energy
+
+
+def require_spectrum(argument: str, value: Any) -> Spectrum | None:
+    """A spectrum, or None; a voltage, a name or a dict is none.
+
+    Raises
+    ------
+    TypeError
+        With how to make one.
+    """
+    if value is None or isinstance(value, Spectrum):
+        return value
+    remedy = "make one, as Spectrum.from_tube(90, filters={'Al': 0.1}) or Spectrum(energies_kev, weights)"
+    raise fail(argument, "a Spectrum or None", repr(value), remedy, TypeError)

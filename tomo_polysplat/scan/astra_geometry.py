@@ -63,6 +63,9 @@ def from_astra(proj_geom: Mapping[str, Any], vol_geom: Mapping[str, Any]) -> tup
     """
     from astra import geom_2vec
 
+    if _is_volume(proj_geom) and not _is_volume(vol_geom):
+        remedy = "the projection geometry comes first"
+        raise fail("proj_geom, vol_geom", "geometries in this order", "them exchanged", remedy)
     kind = _type_of(proj_geom)
     if not isinstance(vol_geom, Mapping) or "GridRowCount" not in vol_geom:
         raise fail("vol_geom", "a dict from astra.create_vol_geom", repr(vol_geom), "", TypeError)
@@ -88,6 +91,10 @@ def from_astra(proj_geom: Mapping[str, Any], vol_geom: Mapping[str, Any]) -> tup
     _check_source(geometry, grid)
     _log.debug("%s", geometry.describe())
     return geometry, grid
+
+
+def _is_volume(geometry: Any) -> bool:
+    return isinstance(geometry, Mapping) and "GridRowCount" in geometry and "type" not in geometry
 
 
 def to_astra(geometry: Geometry, grid: VolumeGrid) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -32,6 +32,7 @@ def usable_rays(
 
     Parameters and errors are those of :func:`tomo_polysplat.reconstruct`.
     """
+    projections, valid = _on_host(projections), _on_host(valid)
     if isinstance(projections, np.ma.MaskedArray):
         valid = ~np.ma.getmaskarray(projections) & (
             True if valid is None else require_array("valid", valid) > 0
@@ -57,6 +58,11 @@ def usable_rays(
     if used < (1 - _MOST_LEFT_OUT) * values.size:
         _tell_left_out(counts, used)
     return values, counts
+
+
+def _on_host(values: Any) -> Any:
+    """A tensor without its gradients and on the host, which NumPy cannot read otherwise; anything else as it is."""
+    return values.detach().cpu() if hasattr(values, "detach") else values
 
 
 def _tell_left_out(counts: Mapping[str, int], used: int) -> None:

@@ -15,7 +15,7 @@ from tomo_polysplat.checks import fail, require_choice, require_number
 from tomo_polysplat.parallel import run_tasks
 from tomo_polysplat.physics.detector import Detector
 from tomo_polysplat.physics.materials import density, mass_attenuation
-from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.physics.spectrum import Spectrum, require_spectrum
 from tomo_polysplat.scan.scan import Scan
 from tomo_polysplat.simulate import (
     scene_broccoli,
@@ -148,6 +148,7 @@ def simulate_scan(
     arc = require_number("arc_degrees", arc_degrees, above=0.0)
     angles = np.deg2rad(arc) * np.arange(_count("views", views)) / views
     proj_geom, vol_geom = circular_orbit(geometry, chosen.half_width, size, rows, columns, angles)
+    spectrum = require_spectrum("spectrum", spectrum)
     if spectrum is None:
         spectrum = Spectrum.from_tube(
             kvp, filters={"Al": 0.1} if filters is None else filters, detector=detector
