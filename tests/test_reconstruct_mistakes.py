@@ -5,10 +5,11 @@ import logging
 import numpy as np
 import pytest
 import torch
-from small_scans import QUICK, fan, reconstruct
+from small_scans import QUICK, fan, geometries, reconstruct
 
 import tomo_polysplat as tps
 from tomo_polysplat.checks import did_you_mean, require_choice
+from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.settings import Settings, make_settings
 
 REFUSED = {
@@ -80,3 +81,21 @@ def test_materials_that_one_energy_has_no_use_for_are_told(materials, told, capl
     with caplog.at_level(logging.WARNING):
         reconstruct(fan(False), spectrum=None, materials=materials)
     assert ("are not used: there is one energy" in caplog.text) == told
+
+
+@pytest.mark.parametrize(
+    "materials, told",
+    [
+        (("iron", "aluminium", "water"), True),
+        (("titanium", "water", "aluminium"), True),
+        (("water", "iodine", "iron"), False),
+        (("iron", "copper", "gold"), False),
+        (("bone", "water", "water"), False),
+        (None, False),
+    ],
+)
+def test_materials_from_dense_to_soft_are_told(materials, told, caplog):
+    scan = fan(False)
+    with caplog.at_level(logging.WARNING):
+        Problem.of(np.moveaxis(scan.projections, 1, 0), *geometries(scan), "cm", scan.spectrum, materials)
+    assert ("soft, middle, dense, in this order" in caplog.text) == told

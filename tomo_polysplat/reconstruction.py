@@ -103,7 +103,7 @@ def reconstruct(
         the voltage where the density is given. ``result.plan["calibration"]`` tells what came of it; what a time
         budget leaves no room for is left as it is.
     soft_density : float, optional
-        Known density in g/cm3 of what most of the object is made of, the first of ``materials``.
+        Known density in g/cm3, at most 25, of what most of the object is made of, the first of ``materials``.
     callbacks : sequence of callables
         Each gets a :class:`~tomo_polysplat.fit.optimise.FitState` once a pass over the views; returning True
         ends the fit.

@@ -50,6 +50,7 @@ def test_what_is_asked_for(asked, names):
         (True, None, None, "a spectrum"),
         (False, 1.0, SPECTRUM, "calibrate beside it"),
         (True, -1.0, SPECTRUM, "soft_density"),
+        (True, 1190.0, SPECTRUM, "kg/m3"),
         ("kvp", 1.0, tps.Spectrum(np.linspace(10, 25, 40), np.ones(40)), "x-ray tube"),
     ],
 )

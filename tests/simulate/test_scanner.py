@@ -70,3 +70,9 @@ def test_starved_pixels_are_finite_and_marked():
 def test_impossible_scanners_are_refused(setting):
     with pytest.raises(ValueError, match=next(iter(setting))):
         Scanner(**setting)
+
+
+@pytest.mark.parametrize("scatter", [5.0, 1.01, -0.1])
+def test_scatter_is_a_share_of_the_open_beam(scatter):
+    with pytest.raises(ValueError, match=r"scatter: .*<= 1.*0\.05 for 5 %"):
+        Scanner(scatter=scatter)

@@ -43,6 +43,8 @@ _LEAST_SCATTER, _LEAST_CHANGE = 2e-3, 0.02
 _MARGIN = 0.03
 # A known density is taken at its word unless the rays contradict it by as much.
 _CONTRADICTION = 0.1
+# Nothing is denser, in g/cm3.
+_DENSEST = 25.0
 # Factors of the tube voltage and of the filters that are looked at.
 _BOUNDS = {"kvp": (0.8, 1.25), "filter": (0.4, 2.5)}
 _CHANGES: dict[str, Callable[[Spectrum, float], Spectrum]] = {"kvp": with_voltage, "filter": with_filtration}
@@ -77,7 +79,10 @@ class Calibration:
         if spectrum is None:
             raise fail("calibrate", "a spectrum to calibrate", "none")
         if soft_density is not None:
-            soft_density = require_number("soft_density", soft_density, above=0.0)
+            remedy = "in g/cm3: divide by 1000 what is in kg/m3"
+            soft_density = require_number(
+                "soft_density", soft_density, above=0.0, at_most=_DENSEST, remedy=remedy
+            )
         if isinstance(calibrate, (bool, np.bool_)):
             names: tuple[str, ...] = ("scatter",) if soft_density is None else ("scatter", "kvp")
         else:

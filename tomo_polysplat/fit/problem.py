@@ -114,11 +114,7 @@ class Problem:
         require_choice("unit", unit, LENGTH_UNITS)
         if spectrum is not None and spectrum.is_monochromatic:
             spectrum = None
-        curves: Materials | None = Materials.of(materials)
-        if spectrum is None:
-            if materials is not None:
-                logger.warning("The materials %s are not used: there is one energy.", materials)
-            curves = None
+        curves = Materials.under(materials, None if spectrum is None else spectrum.effective_energy)
         planar = geometry.planar and grid.planar
         # A plane beside the slice is another plane.
         planar = planar and bool(grid.lower[2] <= geometry.corner[0, 2] <= grid.upper[2])

@@ -7,6 +7,7 @@ mixtures add by mass.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -27,9 +28,13 @@ __all__ = [
     "require_energies",
 ]
 
+logger = logging.getLogger(__name__)
+
 MaterialLike = str | Mapping[str, float]
 ENERGY_RANGE_KEV = (0.1, 800.0)
 _HEAVIEST = 98  # atomic number of the last element with tables
+# In mass attenuation. Of bone and soft matter, which may be named in any order, it is 2.4 at 40 keV.
+_BY_FAR = 3.0
 _FRACTION_TOLERANCE = 0.01  # published compositions are rounded
 
 
@@ -198,7 +203,7 @@ class Materials:
     A Gaussian's material ``u`` in [0, 1] stands for the curve
     ``(1-u)^2 soft + 2u(1-u) middle + u^2 dense``. The defaults suit tissue, bone and the common metals; a
     material with an absorption edge inside the spectrum (Ag, I, Ba) should be one of the three where it
-    occurs.
+    occurs. The first is what most of the object is made of, the last the heaviest.
 
     Parameters
     ----------
@@ -244,6 +249,25 @@ class Materials:
         if isinstance(value, (str, Mapping)) or not hasattr(value, "__len__") or len(value) != 3:
             raise fail("materials", "three materials (soft, middle, dense)", repr(value))
         return cls(*value)
+
+    @classmethod
+    def under(
+        cls, value: Materials | Sequence[MaterialLike] | None, energy_kev: float | None
+    ) -> Materials | None:
+        """Those for a spectrum of this effective energy; None for one energy, which has no use for any.
+
+        The log tells of materials that are not used, and of the densest in the first place.
+        """
+        materials = cls.of(value)
+        if energy_kev is None:
+            if value is not None:
+                logger.warning("The materials %s are not used: there is one energy.", list(materials))
+            return None
+        first, *others = materials.mass_attenuation([energy_kev])[:, 0]
+        if first > _BY_FAR * max(others):
+            words = "takes away most x-rays: they are soft, middle, dense, in this order"
+            logger.warning("The first of the materials %s %s.", list(materials), words)
+        return materials
 
     def mass_attenuation(self, energies_kev: Any) -> np.ndarray:
         """Curves ``(3, n)`` in cm2/g, float64, of soft, middle and dense at ``n`` energies in keV."""

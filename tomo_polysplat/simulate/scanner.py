@@ -68,7 +68,7 @@ class Scanner:
     electronic_noise : float
         Standard deviation of the read-out noise, in counts.
     scatter : float
-        Constant scattered signal, as a fraction of ``photons``.
+        Constant scattered signal, as a fraction of ``photons``, at most 1.
     noise : bool
         False for the exact mean signal.
     seed : int
@@ -84,7 +84,8 @@ class Scanner:
         # NumPy draws Poisson numbers as 64-bit integers.
         require_number("photons", self.photons, above=0.0, at_most=1e18)
         require_number("electronic_noise", self.electronic_noise, at_least=0.0)
-        require_number("scatter", self.scatter, at_least=0.0)
+        remedy = "a share of the open beam: 0.05 for 5 %"
+        require_number("scatter", self.scatter, at_least=0.0, at_most=1.0, remedy=remedy)
         require_number("seed", self.seed, at_least=0)
 
     def counts(self, passed: np.ndarray, view: int) -> np.ndarray:
