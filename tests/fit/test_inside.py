@@ -80,6 +80,15 @@ def test_a_volume_smaller_than_the_object_is_told(half, height, told, caplog):
     assert ("reaches beyond it" in why) == told == ("Make the volume larger" in caplog.text)
 
 
+@pytest.mark.parametrize("upper, told", [([0.061, 0.061, 0.061], True), ([1.0, 1.0, 0.15], False)])
+def test_a_volume_that_no_ray_meets_is_told(upper, told, caplog):
+    """Not a thin slice that rays meet, though none of those that are looked at."""
+    geometry = scanner("cone", rows=256, columns=130)
+    grid = VolumeGrid((1, 7, 7), [0.06, 0.06, 0.06], upper)
+    why = matter_is_inside(torch.zeros(geometry.shape), geometry, grid)[1]
+    assert ("no ray meets" in why) == told == ("No ray meets the volume" in caplog.text)
+
+
 def test_a_detector_that_sees_no_more_than_the_volume_tells_nothing():
     values = torch.zeros(11, 1, 3)
     assert not matter_is_inside(values, scanner("cone", rows=1, columns=3), GRID)[0]

@@ -46,6 +46,12 @@ def matter_is_inside(projections: torch.Tensor, geometry: Geometry, grid: Volume
                 " there ends up in the volume, which is too dense towards its border. Make the volume larger."
             )
             return False, "not kept within the volume: the object reaches beyond the detector on both sides"
+        if not len(through) and _missed(geometry.select(some), grid):
+            logger.warning(
+                "No ray meets the volume: check its window, the unit of length and the geometry, which may differ by a"
+                " large factor."
+            )
+            return False, "not kept within the volume: no ray meets it"
         return False, "not kept within the volume: too few rays pass beside it to say what lies there"
     if float(np.quantile(values[beside], 1 - _SHARE)) > _NOTHING * typical:
         if _cut(values, beside, typical):
@@ -62,6 +68,11 @@ def _typical(values: np.ndarray) -> float:
     """The median of rays that see something."""
     top = values.max(initial=0.0)
     return float(np.median(values[values >= 0.1 * top])) if top > 0 else 0.0
+
+
+def _missed(geometry: Geometry, grid: VolumeGrid) -> bool:
+    """Whether no ray meets the volume, which those that were looked at may have missed alone."""
+    return not _crosses(geometry, grid, np.arange(geometry.rows), np.arange(geometry.columns)).any()
 
 
 def _truncated(projections: torch.Tensor, views: np.ndarray, rows: np.ndarray, typical: float) -> bool:
