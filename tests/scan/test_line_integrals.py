@@ -92,10 +92,11 @@ def test_odd_scans_are_scans(case, caplog):
     assert not caplog.text
 
 
-def test_what_may_be_either_is_said(caplog):
+@pytest.mark.parametrize("share", [0.3, 0.1])
+def test_what_may_be_either_is_said(share, caplog):
     """A little more light behind the object than beside it: the sign, or a flat field of other light."""
     with caplog.at_level(logging.WARNING, NAME):
-        require_line_integrals(-0.3 * shadow())
+        require_line_integrals(-share * shadow())
     assert "do not look like -log" in caplog.text and "other sign" in caplog.text
 
 

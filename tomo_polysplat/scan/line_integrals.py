@@ -29,6 +29,8 @@ _BRIGHTEST_LOGARITHM = -745.0
 # Rays that see something have more than the first; no more than half of those are darker than the second, e^-100 of
 # the light. Counts and what else is large are told from a filler for bad rays by more different values than the third.
 _SOMETHING, _OPAQUE, _DIFFERENT = 0.3, 100.0, 16
+# So much more light behind the object than beside it is worth a warning.
+_LITTLE = 0.1
 # Where the light of so many rays is e times that without an object, and hardly any ray is as much darker, that is no
 # noise and no flaw of the flat field.
 _SURE, _MANY, _FEW = 1.0, 0.02, 0.1
@@ -59,12 +61,12 @@ def require_line_integrals(values: np.ndarray, marked: np.ndarray | None = None)
     if not finite.size:
         return
     _require_some_light(finite)
-    air = _air(some)
+    low, high = (float(value) for value in np.percentile(finite, [1, 99]))
+    air = _air(some, high - low)
     if air is None:
         return
-    low, high = (float(value) for value in np.percentile(finite, [1, 99]))
     below, above = air - low, high - air
-    if below <= 2 * above or below < _SOMETHING:
+    if below <= 2 * above or below < (_SOMETHING if air > _SOMETHING else _LITTLE):
         return
     kind, certain = _kind(finite, air, low)
     seen = f"{air:.3g} beside the object and down to {low:.3g} behind it"
@@ -93,8 +95,8 @@ def _require_some_light(finite: np.ndarray) -> None:
     raise fail("projections", "-log(I/I0), some 10 at most, not intensities", got, remedy)
 
 
-def _air(some: np.ndarray) -> float | None:
-    """The value at both ends of the columns, where it is flat and the same; else None."""
+def _air(some: np.ndarray, span: float) -> float | None:
+    """The value at both ends of the columns, where it is flat and the same beside the span of all; else None."""
     known = np.isfinite(some).mean(axis=(0, 1)) > 0.5
     if np.count_nonzero(known) < _FEWEST_COLUMNS:
         return None
@@ -102,8 +104,7 @@ def _air(some: np.ndarray) -> float | None:
     width = max(2, int(_BORDER * len(profile)))
     ends = np.concatenate([profile[:width], profile[-width:]]).astype(np.float64)
     air = float(np.median(ends))
-    spread = max(float(np.ptp(profile)), abs(air))
-    return air if float(np.ptp(ends)) <= _FLAT * spread else None
+    return air if float(np.ptp(ends)) <= _FLAT * max(span, abs(air)) else None
 
 
 def _kind(finite: np.ndarray, air: float, low: float) -> tuple[str, bool]:
