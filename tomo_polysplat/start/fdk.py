@@ -10,12 +10,14 @@ from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.backproject import accumulate, voxel_maps
 from tomo_polysplat.start.filters import FILTERS, filter_rows
 from tomo_polysplat.start.orbit import Orbit, find_orbit
-from tomo_polysplat.start.weights import object_radius, pixel_weights, ray_offsets, redundancy
+from tomo_polysplat.start.weights import object_fan, pixel_weights, ray_arcs, ray_offsets
 
 __all__ = ["fdk", "fits_fdk"]
 
 # Views filtered and backprojected together: few enough to stay in cache, enough to share out over threads.
 _CHUNK = 32
+# Of an arc, radians.
+_ROUNDING = 1e-9
 
 
 def fits_fdk(geometry: Geometry, grid: VolumeGrid) -> tuple[bool, str]:
@@ -34,12 +36,14 @@ def fits_fdk(geometry: Geometry, grid: VolumeGrid) -> tuple[bool, str]:
         if not offsets.min(axis=1).max() < 0 < offsets.max(axis=1).min():
             return False, "the detector does not reach the shadow of the axis of rotation"
         return True, f"{reason}, full turn"
-    arc = np.rad2deg(orbit.arc)
+    arc, step = np.rad2deg(orbit.arc), orbit.steps.max()
     needed = np.pi
     if geometry.beam == "cone":
-        reach = min(np.abs(offsets).max(), object_radius(grid, orbit)) / orbit.radius
-        needed += 2 * np.arcsin(min(reach, 1.0))
-    if orbit.arc + orbit.steps.max() < needed:
+        seen = np.arcsin(min(np.abs(offsets).max() / orbit.radius, 1.0))
+        fan = 2 * min(seen, object_fan(grid, orbit))
+        # A fan narrower than half a step is as good as a parallel beam.
+        needed += fan if fan > 0.5 * step else 0.0
+    if orbit.arc + step < needed - _ROUNDING:
         return False, f"{arc:.0f} degrees of arc where {np.rad2deg(needed):.0f} are needed"
     return True, f"{reason}, {arc:.0f} degrees of arc"
 
@@ -94,7 +98,7 @@ def fdk(
 def _fdk_cpu(
     projections: np.ndarray, geometry: Geometry, grid: VolumeGrid, orbit: Orbit, filter_name: str
 ) -> np.ndarray:
-    share = redundancy(geometry, orbit, grid)
+    arcs = ray_arcs(geometry, orbit, grid)
     before, after = _shadow_margins(geometry, grid)
     maps = voxel_maps(geometry, grid)
     # Columns are counted from the first one kept, so that the map must move by as many.
@@ -104,7 +108,7 @@ def _fdk_cpu(
         chunk = slice(start, min(start + _CHUNK, geometry.views))
 
         def prepare(a: int, b: int) -> np.ndarray:
-            weighted = projections[a:b] * pixel_weights(geometry, orbit, share, slice(a, b))
+            weighted = projections[a:b] * pixel_weights(geometry, orbit, arcs, slice(a, b))
             return filter_rows(weighted, filter_name, before, after)
 
         parts = split_range(chunk.stop - chunk.start, cpu_threads())

@@ -20,7 +20,7 @@ import numpy as np
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.orbit import Orbit
 
-__all__ = ["object_radius", "pixel_weights", "ray_offsets", "redundancy"]
+__all__ = ["object_fan", "object_radius", "pixel_weights", "ray_arcs", "ray_offsets"]
 
 
 def ray_offsets(geometry: Geometry, orbit: Orbit, columns: Sequence[int] | None = None) -> np.ndarray:
@@ -45,48 +45,77 @@ def object_radius(grid: VolumeGrid, orbit: Orbit) -> float:
     return float(np.hypot(*(grid.centre[:2] - orbit.axis)) + 0.5 * grid.extent[:2].max())
 
 
-def redundancy(geometry: Geometry, orbit: Orbit, grid: VolumeGrid) -> np.ndarray:
-    """Weight of each ray among the measurements of the same line, (views, columns).
+def object_fan(grid: VolumeGrid, orbit: Orbit) -> float:
+    """Angle at the source between the axis and the rim of that object; 0 in a parallel beam."""
+    return float(np.arcsin(min(object_radius(grid, orbit) / orbit.radius, 1.0)))
 
-    The weights of a line's measurements sum to 1. A full turn measures every line twice: half each, or, where
-    the detector is too short on one side, a smooth passage to the side that sees all (half-fan scans; the
-    idea is Wang's, Med. Phys. 29, 1634, 2002, doi:10.1118/1.1489043). Part of a turn in a cone beam takes
-    Parker's weights (Med. Phys. 9, 254, 1982, doi:10.1118/1.595078) over all of the arc.
+
+def ray_arcs(geometry: Geometry, orbit: Orbit, grid: VolumeGrid) -> np.ndarray:
+    """Part of half a turn that each ray stands for among all of its distance from the axis, (views, columns) radians.
+
+    That is its view's share of the arc times a weight; the weights of a line's measurements sum to 1. A full turn
+    measures every line twice: half each, or, where the detector is too short on one side, a smooth passage to the
+    side that sees all (half-fan scans; the idea is Wang's, Med. Phys. 29, 1634, 2002, doi:10.1118/1.1489043). Part
+    of a turn in a cone beam takes Parker's weights (Med. Phys. 9, 254, 1982, doi:10.1118/1.595078) over all of the
+    arc.
     """
     offsets = ray_offsets(geometry, orbit)
+    steps = orbit.steps[:, None]
     if orbit.full:
         low, high = offsets.min(axis=1).max(), offsets.max(axis=1).min()
         overlap = min(-low, high)
         pitch = (high - low) / max(geometry.columns - 1, 1)
         if overlap >= object_radius(grid, orbit) or abs(high + low) < 2 * pitch:
-            return np.full_like(offsets, 0.5)
+            return np.broadcast_to(0.5 * steps, offsets.shape)
         side = 1.0 if high > -low else -1.0
-        return 0.5 + 0.5 * np.sin(0.5 * np.pi * np.clip(side * offsets / overlap, -1.0, 1.0))
+        return steps * (0.5 + 0.5 * np.sin(0.5 * np.pi * np.clip(side * offsets / overlap, -1.0, 1.0)))
     if geometry.beam == "parallel":
-        return np.ones_like(offsets)
-    return _parker(orbit, np.arcsin(np.clip(offsets / orbit.radius, -1.0, 1.0)))
+        return np.broadcast_to(steps, offsets.shape)
+    fan = np.arcsin(np.clip(offsets / orbit.radius, -1.0, 1.0))
+    return _parker(orbit, fan, min(float(np.abs(fan).max()), object_fan(grid, orbit)))
 
 
-def _parker(orbit: Orbit, fan: np.ndarray) -> np.ndarray:
-    """Parker's weights for rays at angle ``fan`` from the axis, (views, columns)."""
-    margin = 0.5 * (orbit.arc - np.pi)
-    angle = orbit.angles[:, None]
-    fan = np.clip(fan, -0.999 * margin, 0.999 * margin)
-    rising = np.clip(angle / (margin - fan), 0.0, 2.0)
-    falling = np.clip((orbit.arc - angle) / (margin + fan), 0.0, 2.0)
-    return np.sin(0.25 * np.pi * np.minimum(rising, falling)) ** 2
+def _parker(orbit: Orbit, fan: np.ndarray, widest: float) -> np.ndarray:
+    """Parker's weights times shares of the arc for rays at angle ``fan`` from the axis, (views, columns).
+
+    The weights are integrated over each view's share instead of being taken at its middle: the narrower the fan,
+    the steeper they rise, and where it is narrower than a step they are a box. Arcs that lack part of a step, such
+    as those from 0 to 180 degrees without the last view, are complete once either end takes half of it.
+    """
+    lack = np.clip(np.pi + 2 * widest - orbit.arc, 0.0, orbit.steps.max())
+    arc = orbit.arc + lack
+    order = np.argsort(orbit.angles, kind="stable")
+    shares = orbit.steps[order]
+    shares[[0, -1]] += 0.5 * lack
+    ends = np.cumsum(shares)
+    high = np.empty_like(shares)
+    high[order] = ends
+    low = np.empty_like(shares)
+    low[order] = ends - shares
+    low, high = low[:, None], high[:, None]
+    margin = max(0.5 * (arc - np.pi), 0.0)
+    fan = np.clip(fan, -margin, margin)
+    rising = _risen(high, margin - fan) - _risen(low, margin - fan)
+    falling = _risen(arc - low, margin + fan) - _risen(arc - high, margin + fan)
+    return np.maximum(rising + falling - (high - low), 0.0)
 
 
-def pixel_weights(geometry: Geometry, orbit: Orbit, share: np.ndarray, views: slice) -> np.ndarray:
+def _risen(to: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Integral from 0 on of ``sin^2(pi/4 x/half)`` up to ``x = 2 half`` and of 1 beyond."""
+    share = np.minimum(np.maximum(to, 0.0) / np.maximum(2 * half, 1e-12), 1.0)
+    return np.where(share < 1, half * (share - np.sin(np.pi * share) / np.pi), to - half)
+
+
+def pixel_weights(geometry: Geometry, orbit: Orbit, arcs: np.ndarray, views: slice) -> np.ndarray:
     """All that multiplies some of the projections before the filter, (views, rows, columns) float32.
 
-    ``share`` is `redundancy`; the ramp for pixels of size 1 brings a division by the pixel's width.
+    ``arcs`` is `ray_arcs`; the ramp for pixels of size 1 brings a division by the pixel's width.
     """
     part = geometry.select(views)
     width = np.linalg.norm(part.u, axis=1)
     normal = np.cross(part.u, part.v)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    scale = (orbit.steps[views] / width)[:, None, None] * share[views][:, None, :]
+    scale = (arcs[views] / width[:, None])[:, None, :]
     if part.beam == "parallel":
         beam = part.origin / np.linalg.norm(part.origin, axis=1, keepdims=True)
         obliquity = np.abs(np.einsum("vk,vk->v", normal, beam))
