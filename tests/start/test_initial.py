@@ -58,6 +58,20 @@ def test_bad_pixels_are_counted_and_do_little_harm(views):
     assert relative_error(volume, expected, slice(None)) < 0.05
 
 
+def test_a_start_that_is_not_finite_does_not_pass_on(monkeypatch, caplog):
+    geometry, grid = scan(60)
+    projections = chords(geometry, SPHERES)
+    empty = np.full(grid.shape, np.nan, np.float32)
+    monkeypatch.setattr(initial, "fdk", lambda *_, **__: empty)
+    volume, info = initial_volume(projections, geometry, grid)
+    assert info["method"] == "sirt" and "not finite" in info["reason"] and "not finite" in caplog.text
+    inside = distance(grid, (0, 0, 0)) < 22
+    assert relative_error(volume, truth(grid, SPHERES), inside) < 0.15
+    monkeypatch.setattr(initial, "sirt", lambda *_, **__: empty)
+    with pytest.raises(ValueError, match="projections: expected .*finite start"):
+        initial_volume(projections, geometry, grid)
+
+
 def test_a_large_start_is_made_coarse_and_keeps_its_place(monkeypatch):
     geometry, grid = scan(20)
     projections = chords(geometry, SPHERES)

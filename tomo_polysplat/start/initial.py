@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from tomo_polysplat.checks import require_array, require_shape
+from tomo_polysplat.checks import fail, require_array, require_shape
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.fdk import fdk, fits_fdk
 from tomo_polysplat.start.on_gpu import fdk_on_gpu
@@ -68,7 +68,7 @@ def initial_volume(
     valid: np.ndarray | None = None,
     device: str = "cpu",
 ) -> tuple[np.ndarray, dict[str, Any]]:
-    """Reconstruct quickly: filtered backprojection where it fits, else a few passes of SIRT.
+    """Reconstruct quickly: filtered backprojection where it fits and is finite, else a few passes of SIRT.
 
     Parameters
     ----------
@@ -88,6 +88,11 @@ def initial_volume(
     info : dict
         ``method`` ("fdk" or "sirt"), ``reason`` and ``invalid_pixels`` (not used, and for FDK interpolated
         from their row). The reason also says how many voxels were left empty because a source plane is near.
+
+    Raises
+    ------
+    ValueError
+        If shapes disagree, no pixel is valid, or the volume does not come out finite by either method.
     """
     projections = require_array("projections", projections, ndim=3)
     require_shape("projections", projections, geometry.shape, "(views, rows, columns)")
@@ -98,18 +103,28 @@ def initial_volume(
     if not usable.any():
         raise ValueError("projections: expected some valid pixels, got none")
     fits, reason = _method(geometry, grid)
-    method, invalid = ("fdk" if fits else "sirt"), int((~usable).sum())
-    _log.info("Start from %s: %s; %d invalid pixels.", method.upper(), reason, invalid)
+    invalid, volume = int((~usable).sum()), None
     if fits:
         # Smooth: the noise of a sharp filter would be seeded as if it were matter.
-        filled = fill_invalid(projections, usable)
-        volume = fdk(filled, geometry, grid, filter_name="hann", device=device)
-    else:
-        volume = _sirt_start(np.where(usable, projections, np.nan), geometry, grid)
+        volume = fdk(fill_invalid(projections, usable), geometry, grid, filter_name="hann", device=device)
+        if not np.isfinite(volume).all():
+            fits, reason = False, f"filtered backprojection is not finite ({reason})"
+            _log.warning("The start is made by SIRT: %s.", reason)
+    method = "fdk" if fits else "sirt"
+    _log.info("Start from %s: %s; %d invalid pixels.", method.upper(), reason, invalid)
+    if volume is None or not fits:
+        volume = _finite(_sirt_start(np.where(usable, projections, np.nan), geometry, grid))
     beyond, near = _beyond_sources(geometry, grid)
     if beyond is not None:
         volume = np.where(beyond, np.float32(0), volume)
     return volume, {"method": method, "reason": reason + near, "invalid_pixels": invalid}
+
+
+def _finite(volume: np.ndarray) -> np.ndarray:
+    if not np.isfinite(volume).all():
+        remedy = "give -log(I/I0), with NaN for rays that are not to be used"
+        raise fail("projections", "values of which a finite start can be made", "NaN or infinity", remedy)
+    return volume
 
 
 def _beyond_sources(geometry: Geometry, grid: VolumeGrid) -> tuple[np.ndarray | None, str]:
