@@ -180,8 +180,13 @@ def test_binning_moves_pixel_centres_to_the_mean(factor):
     row = from_astra(scan_2d("fanflat"), astra.create_vol_geom(4, 5))[0].binned(2)
     assert row.shape == (5, 1, 5)
     assert row.planar
-    with pytest.raises(ValueError, match="binning factor"):
-        geometry.binned(8)
+    apart = geometry.binned(factor, 1)
+    assert (apart.rows, apart.columns) == (7, 12 // factor)
+    expected = (fine + 0.5) / (factor, 1) - 0.5
+    np.testing.assert_allclose(apart.project_points(points), expected, atol=1e-10)
+    for factors in ((8,), (13, 1), (1, 8)):
+        with pytest.raises(ValueError, match="binning factor"):
+            geometry.binned(*factors)
 
 
 def test_a_geometry_is_a_value():

@@ -103,6 +103,33 @@ def test_a_planar_start_of_odd_size_is_made_coarse(monkeypatch):
     assert relative_error(volume, truth(grid, DISCS), inside) < 0.12
 
 
+def few_rows(rows, columns, views, cone):
+    """A helix, or a stack of slices."""
+    angles = np.linspace(0, (4 if cone else 1) * np.pi, views, endpoint=False)
+    if not cone:
+        return astra.create_proj_geom("parallel3d", 50 / columns, 1.0, rows, columns, angles)
+    plain = astra.create_proj_geom("cone", 90 / columns, 4.0, rows, columns, angles, 120.0, 60.0)
+    vectors = astra.geom_2vec(plain)["Vectors"]
+    vectors[:, [2, 5]] += np.linspace(-4, 4, views)[:, None]
+    return astra.create_proj_geom("cone_vec", rows, columns, vectors)
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "views", "cone"), [(2, 181, 75, True), (3, 180, 21, False), (7, 90, 21, False)]
+)
+def test_few_rows_are_made_coarse_along_columns_only(rows, columns, views, cone, monkeypatch):
+    proj_geom = few_rows(rows, columns, views, cone)
+    slices, end = (10, 10) if cone else (rows, 0.5 * rows)
+    geometry, grid = from_astra(proj_geom, astra.create_vol_geom(90, 90, slices, -24, 24, -24, 24, -end, end))
+    monkeypatch.setattr(initial, "_MOST_STEPS", 5e3 * views)
+    volume, info = initial_volume(chords(geometry, SPHERES[:1]), geometry, grid)
+    assert info["method"] == "sirt" and volume.shape == grid.shape
+    expected = truth(grid, SPHERES[:1])
+    seen = (distance(grid, (0, 0, 0)) < 23) & (np.abs(grid.axes()[2])[:, None, None] < 4)
+    assert relative_error(volume, expected, seen) < 0.15
+    assert volume[seen].mean() == pytest.approx(expected[seen].mean(), rel=0.03)
+
+
 def test_filling_is_linear_along_the_row():
     row = np.array([[[np.nan, 1.0, 2.0, np.nan, np.nan, 5.0, np.nan], [np.nan] * 7]], np.float32)
     filled = fill_invalid(row, np.isfinite(row))

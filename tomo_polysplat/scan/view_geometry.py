@@ -122,15 +122,17 @@ class Geometry:
         """The same scanner in the coordinates ``(x - centre) / length``."""
         return self.shifted(-np.asarray(centre, dtype=np.float64)).scaled(1.0 / length)
 
-    def binned(self, factor: int) -> Geometry:
-        """The detector with ``factor`` x ``factor`` pixels joined to one.
+    def binned(self, factor: int, row_factor: int | None = None) -> Geometry:
+        """The detector with ``factor`` columns and as many rows, or ``row_factor``, joined to one.
 
         The columns and rows left over at the far ends are dropped. A detector of one row keeps its row.
         """
         factor = require_count("binning factor", factor)
-        row_factor = 1 if self.rows == 1 else factor
+        row_factor = factor if row_factor is None else require_count("binning factor of rows", row_factor)
+        row_factor = 1 if self.rows == 1 else row_factor
         if factor > self.columns or row_factor > self.rows:
-            raise fail("binning factor", f"at most {min(self.rows, self.columns)}", f"{factor}")
+            most = f"at most {self.columns} columns and {self.rows} rows"
+            raise fail("binning factor", most, f"{factor} and {row_factor}")
         # The centre of the joined pixel is the mean of the centres of its parts.
         corner = self.corner + 0.5 * (factor - 1) * self.u + 0.5 * (row_factor - 1) * self.v
         rows, columns = self.rows // row_factor, self.columns // factor

@@ -30,6 +30,8 @@ _SOURCE_MARGIN = 2.0
 # Steps along rays in one pass of SIRT beyond which a coarser volume and detector do for a start: a few
 # seconds for all passes on two CPU cores.
 _MOST_STEPS = 4e7
+# Rows of the detector, and slices, that a coarse one keeps at least.
+_FEWEST_ROWS = 4
 
 
 def initial_volume_on(
@@ -145,19 +147,20 @@ def _sirt_start(projections: np.ndarray, geometry: Geometry, grid: VolumeGrid) -
     """SIRT from zero, on a grid and a detector coarse enough to take seconds."""
     from scipy.ndimage import zoom
 
-    views = geometry.views
-    steps = float(np.prod(geometry.shape)) * max(grid.shape)
+    views, slices = geometry.views, grid.shape[0]
     factor = 1
-    while steps > _MOST_STEPS and 16 * factor <= min(geometry.columns, *grid.shape[1:]):
-        factor, steps = 2 * factor, steps / (8 if geometry.rows > 1 else 4)
+    while _steps(geometry, grid, factor) > _MOST_STEPS and 16 * factor <= min(
+        geometry.columns, *grid.shape[1:]
+    ):
+        factor *= 2
     passes = int(np.clip(_PASSES_TIMES_VIEWS // views, *_PASSES))
-    factors = np.array([1 if n == 1 else factor for n in grid.shape])
+    factors = np.array([_along_axis(factor, slices), factor, factor])
     counts = -(-np.array(grid.shape) // factors)
     coarse = VolumeGrid(tuple(counts), grid.lower, grid.lower + (counts * factors)[::-1] * grid.voxel_size)
-    row_factor = factor if geometry.rows > 1 else 1
+    row_factor = _along_axis(factor, geometry.rows)
     volume = sirt(
         _binned(projections, row_factor, factor),
-        geometry.binned(factor),
+        geometry.binned(factor, row_factor),
         coarse,
         passes=passes,
         subsets=max(1, views // _VIEWS_PER_SUBSET),
@@ -166,6 +169,17 @@ def _sirt_start(projections: np.ndarray, geometry: Geometry, grid: VolumeGrid) -
         return volume
     nz, ny, nx = grid.shape
     return zoom(volume, factors, order=1, mode="nearest", grid_mode=True)[:nz, :ny, :nx]
+
+
+def _along_axis(factor: int, count: int) -> int:
+    """By how much rows or slices are made coarser, where columns are by ``factor``: there may be few of them."""
+    return min(factor, max(1, count // _FEWEST_ROWS))
+
+
+def _steps(geometry: Geometry, grid: VolumeGrid, factor: int) -> float:
+    """Steps along rays in one pass of SIRT."""
+    pixels = float(np.prod(geometry.shape)) / (factor * _along_axis(factor, geometry.rows))
+    return pixels * max(grid.shape) / factor
 
 
 def _binned(projections: np.ndarray, row_factor: int, factor: int) -> np.ndarray:
