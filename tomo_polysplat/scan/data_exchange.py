@@ -23,7 +23,7 @@ import numpy as np
 
 from tomo_polysplat.checks import fail, require_array, require_choice, require_shape
 from tomo_polysplat.scan.centre import estimate_centre
-from tomo_polysplat.scan.defects import attenuation, fill_invalid, flat_and_dark
+from tomo_polysplat.scan.defects import attenuation, flat_and_dark
 from tomo_polysplat.scan.dxchange_host import read_block
 from tomo_polysplat.scan.hdf5 import (
     find_array,
@@ -174,7 +174,7 @@ def _geometry(
     theta = _angles(file, views, options.theta)
     centre = options.centre
     if centre is None:
-        centre = estimate_centre(fill_invalid(projections, valid), theta, valid)
+        centre = estimate_centre(projections, theta, valid)
     notes |= {"centre": float(centre), "centre_estimated": options.centre is None}
     pixel_size, unit = _pixel_size(file, options)
     proj_geom, vol_geom = parallel_geometry(theta, rows, columns, centre, pixel_size)
