@@ -1,6 +1,9 @@
 """Counts into line integrals: exact where they can be trusted, marked and counted where not."""
 
+import time
+
 import numpy as np
+import pytest
 
 from tomo_polysplat.scan.defects import attenuation, fill_invalid, flat_and_dark
 
@@ -41,3 +44,33 @@ def test_holes_are_filled_linearly_along_the_detector_row():
     expected[1, 2] = 0
     np.testing.assert_allclose(filled, expected)
     assert (damaged[~valid] == -77).all(), "the input was changed"
+
+
+@pytest.mark.parametrize("dtype", ["f4", "f8", ">f4", "f2"])
+@pytest.mark.parametrize("share", [0.02, 0.4, 0.97])
+def test_holes_are_filled_as_numpy_interpolates(dtype, share):
+    """Bit for bit, in whatever order the array lies; NaN where there was no measurement does not spread."""
+    rng = np.random.default_rng(3)
+    valid = rng.random((7, 5, 23)) >= share
+    values = np.where(valid, rng.normal(size=valid.shape), np.nan).astype(dtype).transpose(1, 0, 2)
+    valid = valid.transpose(1, 0, 2)
+    filled = fill_invalid(values, valid)
+    column = np.arange(23)
+    for row in np.ndindex(5, 7):
+        good = valid[row]
+        expected = np.interp(column, column[good], values[row][good]) if good.any() else np.zeros(23)
+        np.testing.assert_array_equal(filled[row], expected.astype(filled.dtype))
+
+
+def test_a_dead_column_costs_little():
+    """Ten thousand rows are bridged in milliseconds; as many calls from Python take a twentieth of a second."""
+    values = np.ones((10_000, 64), np.float32)
+    valid = np.ones(values.shape, bool)
+    valid[:, 9] = False
+    fill_invalid(values[:1], valid[:1])  # compiles
+    seconds = []
+    for _ in range(3):
+        begun = time.perf_counter()
+        fill_invalid(values, valid)
+        seconds.append(time.perf_counter() - begun)
+    assert min(seconds) < 0.02

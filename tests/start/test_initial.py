@@ -5,9 +5,10 @@ import pytest
 import torch
 from start_phantoms import DISCS, SPHERES, chords, distance, relative_error, truth
 
+from tomo_polysplat.scan.defects import fill_invalid
 from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.start import initial
-from tomo_polysplat.start.initial import fill_invalid, initial_volume, initial_volume_on
+from tomo_polysplat.start.initial import initial_volume, initial_volume_on
 from tomo_polysplat.start.on_gpu import fill_rows
 
 astra = pytest.importorskip("astra")

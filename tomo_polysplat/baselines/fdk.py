@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from tomo_polysplat.scan.defects import fill_invalid
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start import fdk as start
-from tomo_polysplat.start.initial import fill_invalid
 
 __all__ = ["fdk"]
 

@@ -8,8 +8,8 @@ from tomo_polysplat.baselines.fdk import fdk
 from tomo_polysplat.baselines.metal_trace import find_metal, replace_trace
 from tomo_polysplat.baselines.water_bhc import water_corrected
 from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.scan.defects import fill_invalid
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
-from tomo_polysplat.start.initial import fill_invalid
 
 __all__ = ["limar"]
 

@@ -9,10 +9,10 @@ from tomo_polysplat.baselines.fdk import fdk
 from tomo_polysplat.baselines.metal_trace import MetalTrace, find_metal, forward_project, replace_trace
 from tomo_polysplat.baselines.water_bhc import water_corrected
 from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.scan.defects import fill_invalid
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.bridged import THIN, normalising_volume
-from tomo_polysplat.start.initial import fill_invalid
 from tomo_polysplat.start.levels import mass_level
 
 __all__ = ["nmar"]

@@ -7,6 +7,7 @@ import logging
 import numpy as np
 
 from tomo_polysplat.checks import fail, require_shape
+from tomo_polysplat.parallel import cpu_threads, run_tasks, split_range
 
 __all__ = ["attenuation", "fill_invalid", "flat_and_dark"]
 
@@ -98,14 +99,26 @@ def fill_invalid(projections: np.ndarray, valid: np.ndarray | None) -> np.ndarra
     """Projections with every invalid ray replaced, linearly between the valid ones of its detector row.
 
     For methods that cannot leave a ray out, such as filtered backprojection. The last axis is the detector
-    column; rows without a valid ray become 0. Returns the input itself when there is nothing to replace.
+    column; beyond the outermost valid ray a row goes on as it ends, and rows without one become 0.
+
+    Parameters
+    ----------
+    projections : float array, shape (..., columns)
+    valid : bool array of that shape, or None
+        None means that all are.
+
+    Returns
+    -------
+    float array, shape of `projections`
+        The input itself when there is nothing to replace, else a copy, float64 unless the input is float32.
     """
     if valid is None or valid.all():
         return projections
-    filled = projections.copy()
-    column = np.arange(projections.shape[-1])
-    for index in np.argwhere(~valid.all(axis=-1)):
-        row = tuple(index)
-        good = valid[row]
-        filled[row] = np.interp(column, column[good], projections[row][good]) if good.any() else 0
+    from tomo_polysplat.scan.filling import fill_rows_in_place
+
+    columns = projections.shape[-1]
+    filled = np.array(projections, np.float32 if projections.dtype == np.float32 else np.float64, order="C")
+    rows, usable = filled.reshape(-1, columns), np.ascontiguousarray(valid, bool).reshape(-1, columns)
+    parts = split_range(len(rows), 4 * cpu_threads())
+    run_tasks(fill_rows_in_place, [(rows[a:b], usable[a:b]) for a, b in parts])
     return filled

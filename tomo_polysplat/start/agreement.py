@@ -8,9 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from tomo_polysplat.scan.defects import fill_invalid
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.fdk import fdk, fits_fdk
-from tomo_polysplat.start.initial import FEW_VIEWS, fill_invalid
+from tomo_polysplat.start.initial import FEW_VIEWS
 from tomo_polysplat.start.on_gpu import fdk_on_gpu
 
 __all__ = ["halves_agree"]

@@ -9,13 +9,14 @@ import numpy as np
 import torch
 
 from tomo_polysplat.checks import fail, require_array, require_shape
+from tomo_polysplat.scan.defects import fill_invalid
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.fdk import fdk, fits_fdk
 from tomo_polysplat.start.on_gpu import fdk_on_gpu
 from tomo_polysplat.start.sirt import sirt
 from tomo_polysplat.start.source_planes import beyond_sources
 
-__all__ = ["fill_invalid", "initial_volume", "initial_volume_on"]
+__all__ = ["initial_volume", "initial_volume_on"]
 
 _log = logging.getLogger(__name__)
 
@@ -192,16 +193,3 @@ def _binned(projections: np.ndarray, row_factor: int, factor: int) -> np.ndarray
     count = finite.sum(axis=(2, 4))
     total = np.where(finite, blocks, 0).sum(axis=(2, 4))
     return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
-
-
-def fill_invalid(projections: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Invalid pixels interpolated linearly along their row; a row without any valid pixel becomes 0."""
-    if valid.all():
-        return projections
-    filled = np.where(valid, projections, 0).astype(np.float32)
-    column = np.arange(projections.shape[2])
-    for view, row in np.argwhere(~valid.all(axis=2)):
-        good = valid[view, row]
-        if good.any():
-            filled[view, row, ~good] = np.interp(column[~good], column[good], filled[view, row, good])
-    return filled

@@ -35,7 +35,7 @@ def fdk_on_gpu(
 
 
 def fill_rows(projections: torch.Tensor) -> torch.Tensor:
-    """Pixels that are not finite interpolated linearly along their row, as by `initial.fill_invalid`.
+    """Pixels that are not finite interpolated linearly along their row, as by `defects.fill_invalid`.
 
     Beyond the last good pixel the row goes on as it ends; a row without any becomes 0.
     """

@@ -1,0 +1,50 @@
+"""Rows with holes filled in place, compiled: a dead column of a large scan spoils millions of rows."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+__all__ = ["fill_rows_in_place"]
+
+
+@njit(nogil=True, cache=True)
+def fill_rows_in_place(rows: np.ndarray, valid: np.ndarray) -> None:
+    """Replace what is not valid, linearly between valid neighbours and constant beyond the outermost.
+
+    Parameters
+    ----------
+    rows : (n, columns) float array
+        Changed in place; a row without a valid value becomes 0.
+    valid : (n, columns) bool array
+    """
+    count, columns = rows.shape
+    for row in range(count):
+        before = -1
+        column = 0
+        while column < columns:
+            if valid[row, column]:
+                before = column
+                column += 1
+                continue
+            after = column
+            while after < columns and not valid[row, after]:
+                after += 1
+            _bridge(rows[row], before, after)
+            column = after
+
+
+@njit(nogil=True, cache=True)
+def _bridge(values, before, after):
+    """Fill what lies between two valid columns, the first -1 and the second the end where there is none."""
+    if before < 0 and after == len(values):
+        values[:] = 0
+    elif before < 0:
+        values[:after] = values[after]
+    elif after == len(values):
+        values[before + 1 :] = values[before]
+    else:
+        low = np.float64(values[before])
+        slope = (np.float64(values[after]) - low) / (after - before)
+        for column in range(before + 1, after):
+            values[column] = slope * (column - before) + low
