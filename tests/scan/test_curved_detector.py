@@ -6,6 +6,7 @@ from geometry_scans import ANGLES, VOLUME
 
 from tomo_polysplat.scan.curved_detector import flat_geometry, flatten_projections
 from tomo_polysplat.scan.geometry import from_astra, projections_from_astra
+from tomo_polysplat.scan.usable import usable_rays
 
 astra = pytest.importorskip("astra")
 pytest.importorskip("astra.experimental")  # not loaded by astra itself
@@ -37,6 +38,24 @@ def test_a_curved_detector_becomes_flat(radius, shift):
                 astra.experimental.projectPoint(proj_geom, *map(float, p), view)[index] for p in points
             ]
             np.testing.assert_allclose(flat[view][covered[view]], expected, atol=2e-5)
+
+
+@pytest.mark.parametrize(("radius", "column"), [(90.0, 8), (60.0, 3), (45.0, 33), (1e6, 12)])
+@pytest.mark.parametrize("kind", [bool, np.uint8, float])
+def test_what_is_not_valid_leaks_into_no_ray_that_is(radius, column, kind):
+    """A flat ray between a good and a bad pixel is bad, however little it takes of the bad one."""
+    proj_geom = curved_scan(radius, (1.3, 0.4))
+    projections = np.ones((9, 2, 41), np.float32)
+    valid = np.ones(projections.shape, kind) * (200 if kind is np.uint8 else 1)
+    covered = np.isfinite(usable_rays(projections, proj_geom, None)[0]).sum()
+    projections[:, :, column], valid[:, :, column] = 5000.0, 0
+    projections[4, 1, 20], valid[4, 1, 20] = -7.0, 0
+    values, counts = usable_rays(projections, proj_geom, valid)
+    usable = np.isfinite(values)
+    np.testing.assert_allclose(values[usable], 1.0, rtol=1e-6)
+    # Between neighbours of a column lie at most three of the flat detector, of a pixel nine.
+    assert covered - 3 * 18 - 9 <= usable.sum() < covered
+    assert counts["rays_out_of_range"] == 0
 
 
 def test_the_flat_detector_takes_in_the_whole_curved_one():
