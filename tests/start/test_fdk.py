@@ -180,6 +180,11 @@ def test_slices_that_no_view_sees_are_empty():
     assert volume[4:12].any(axis=(1, 2)).all()
 
 
+@pytest.mark.parametrize(("columns", "offset"), [(40, 0.0), (72, 4.0), (72, -4.0)])
+def test_half_a_turn_of_a_detector_that_is_short_on_both_sides_or_a_little_on_one_fits(columns, offset):
+    assert fits_fdk(*from_astra(parallel(columns=columns, offset=offset), VOLUME))[0]
+
+
 def tilted():
     vectors = astra.geom_2vec(cone())["Vectors"]
     vectors[:, 9] += 0.2
@@ -209,6 +214,13 @@ def laminography():
         ),
         pytest.param(parallel(np.linspace(0, 2.0, 60)), "115 degrees of arc where 180", id="limited angle"),
         pytest.param(cone(columns=20, offset=(15.0, 0.0)), "does not reach the shadow", id="axis not seen"),
+        pytest.param(parallel(columns=48, offset=16.0), "one side", id="half turn that sees one side"),
+        pytest.param(parallel(columns=48, offset=-16.0), "one side", id="half turn that sees the other side"),
+        pytest.param(
+            cone(np.linspace(0, np.deg2rad(230), 120), columns=60, offset=(22.0, 0.0)),
+            "one side",
+            id="short scan that sees one side",
+        ),
         pytest.param(cone(TURN[:2]), "fewer than three views", id="two views"),
     ],
 )

@@ -10,12 +10,16 @@ from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.backproject import accumulate, voxel_maps
 from tomo_polysplat.start.filters import FILTERS, filter_rows
 from tomo_polysplat.start.orbit import Orbit, find_orbit
-from tomo_polysplat.start.weights import object_fan, pixel_weights, ray_arcs, ray_offsets
+from tomo_polysplat.start.weights import object_fan, object_radius, pixel_weights, ray_arcs, ray_offsets
 
 __all__ = ["fdk", "fits_fdk"]
 
 # Views filtered and backprojected together: few enough to stay in cache, enough to share out over threads.
 _CHUNK = 32
+# Share of the object's radius, or of the detector's longer side, that its shorter side must reach in part of a
+# turn, where no other view has the lines beyond. Of discs that fill the window the error at 0.8 and 0.67 is 9 and
+# 15 %, that of SIRT 6 %; but most objects are smaller than their window, and a large SIRT is coarse.
+_SHORTER_SIDE = 0.75
 # Of an arc, radians.
 _ROUNDING = 1e-9
 
@@ -24,7 +28,7 @@ def fits_fdk(geometry: Geometry, grid: VolumeGrid) -> tuple[bool, str]:
     """Whether filtered backprojection suits a scan, and why (not).
 
     It wants a circular orbit about an axis parallel to z, an untilted detector, and every line through the
-    object measured at least once.
+    object measured at least once; in part of a turn that takes a detector that sees both sides of it.
     """
     orbit, reason = find_orbit(geometry)
     if orbit is None:
@@ -32,8 +36,9 @@ def fits_fdk(geometry: Geometry, grid: VolumeGrid) -> tuple[bool, str]:
     if np.hypot(*(grid.centre[:2] - orbit.axis)) > 0.5 * orbit.radius:
         return False, "the volume lies far off the axis of rotation"
     offsets = ray_offsets(geometry, orbit, (0, geometry.columns - 1))
+    shorter, longer = np.sort([-offsets.min(axis=1).max(), offsets.max(axis=1).min()])
     if orbit.full:
-        if not offsets.min(axis=1).max() < 0 < offsets.max(axis=1).min():
+        if shorter <= 0:
             return False, "the detector does not reach the shadow of the axis of rotation"
         return True, f"{reason}, full turn"
     arc, step = np.rad2deg(orbit.arc), orbit.steps.max()
@@ -45,6 +50,8 @@ def fits_fdk(geometry: Geometry, grid: VolumeGrid) -> tuple[bool, str]:
         needed += fan if fan > 0.5 * step else 0.0
     if orbit.arc + step < needed - _ROUNDING:
         return False, f"{arc:.0f} degrees of arc where {np.rad2deg(needed):.0f} are needed"
+    if shorter < _SHORTER_SIDE * min(longer, object_radius(grid, orbit)):
+        return False, f"in {arc:.0f} degrees of arc the detector sees little more than one side of the object"
     return True, f"{reason}, {arc:.0f} degrees of arc"
 
 
