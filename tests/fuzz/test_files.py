@@ -2,9 +2,11 @@
 
 import os
 import resource
+import struct
 import subprocess
 import sys
 import threading
+import time
 import zipfile
 from pathlib import Path
 
@@ -14,6 +16,7 @@ import pytest
 from hostile_files import ARCHIVE, EXCHANGE, OURS, RESULT, RESULT_ATTRIBUTES, image, npy
 
 from tomo_polysplat.result.result import Result
+from tomo_polysplat.scan.hdf5_heaps import require_sound_heaps
 from tomo_polysplat.scan.io import load_scan
 
 
@@ -129,6 +132,33 @@ def test_pickles_are_not_loaded(tmp_path):
     with pytest.raises(ValueError, match="never loaded"):
         load_scan(archive(tmp_path / "scan.npz", vectors=content))
     assert not (tmp_path / "sprung").exists()
+
+
+def nested_heaps(units):
+    """Sound heaps, each begun inside the one before and reaching to the same end; the walk of each is the longer."""
+    head = b"\x89HDF\r\n\x1a\n" + bytes([0, 0, 0, 0, 0, 8, 8, 0]) + bytes(16)
+    total = 16 + 48 * units
+    parts = [head, b"GCOL\x01\x00\x00\x00", struct.pack("<Q", total)]
+    for unit in range(units):
+        rest = total - 48 * unit - 32
+        parts += [struct.pack("<HHIQ", 1, 0, 0, 32), b"GCOL\x01\x00\x00\x00", struct.pack("<Q", rest)]
+        parts += [struct.pack("<HHIQ", 1, 0, 0, 0)]
+    return b"".join(parts)
+
+
+def test_heaps_within_heaps_take_no_time(tmp_path):
+    """Some are harmless, such as those of an HDF5 file kept in another; the time of thousands grows with their square."""
+    file = tmp_path / "scan.h5"
+    file.write_bytes(nested_heaps(3))
+    require_sound_heaps(file)
+    file.write_bytes(nested_heaps(3)[:-8] + bytes([8] * 8))
+    with pytest.raises(ValueError, match="damaged heap"):
+        require_sound_heaps(file)
+    file.write_bytes(nested_heaps(4000))
+    begun = time.process_time()
+    with pytest.raises(ValueError, match="heaps within heaps"):
+        require_sound_heaps(file)
+    assert time.process_time() - begun < 1.0
 
 
 HEADER = "{'descr': '<f4', 'fortran_order': False, 'shape': (10, 10000, 10000)}"

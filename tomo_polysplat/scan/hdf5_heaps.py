@@ -20,6 +20,8 @@ _COLLECTION = b"GCOL\x01\x00\x00\x00"
 # Of a collection and of an object, with lengths of 8 bytes.
 _HEADER = 16
 _BLOCK = 2**24
+# Times that all the heaps of a file may walk over all of it: one that lies inside another is walked by both.
+_MOST_WALKS = 4
 _REMEDY = "it is damaged: copy or write it again"
 
 
@@ -30,7 +32,7 @@ def require_sound_heaps(file: Path) -> None:
     ------
     ValueError
         If it is not HDF5 from its first byte on, has lengths of other than 8 bytes, or a heap whose objects do
-        not follow each other.
+        not follow each other, or so many heaps within heaps that to look through them would take long.
     """
     with open(file, "rb") as stream:
         start = stream.read(2 * _HEADER)
@@ -41,9 +43,15 @@ def require_sound_heaps(file: Path) -> None:
             raise fail(
                 "path", "a readable HDF5 file", f"{file} with lengths of {tuple(sizes)} bytes", _REMEDY
             )
+        file_size = file.stat().st_size
+        left = _MOST_WALKS * file_size // _HEADER
         for place in _places(stream):
-            if not _sound(stream, place, file.stat().st_size):
+            objects = _objects(stream, place, file_size)
+            if objects is None:
                 raise fail("path", "a readable HDF5 file", f"{file} with a damaged heap", _REMEDY)
+            left -= objects
+            if left < 0:
+                raise fail("path", "a readable HDF5 file", f"{file} with heaps within heaps", _REMEDY)
 
 
 def _places(stream: BinaryIO) -> list[int]:
@@ -61,14 +69,14 @@ def _places(stream: BinaryIO) -> list[int]:
     return places
 
 
-def _sound(stream: BinaryIO, place: int, file_size: int) -> bool:
-    """Whether every object of a collection leads to the next, up to its end."""
+def _objects(stream: BinaryIO, place: int, file_size: int) -> int | None:
+    """How many objects a collection has, or None unless each leads to the next, up to its end."""
     stream.seek(place + 8)
     size = int.from_bytes(stream.read(8), "little")
     if place + size > file_size:
         # HDF5 notices this by itself.
-        return True
-    at = _HEADER
+        return 0
+    at, count = _HEADER, 0
     while at + _HEADER <= size:
         stream.seek(place + at)
         header = stream.read(_HEADER)
@@ -76,6 +84,6 @@ def _sound(stream: BinaryIO, place: int, file_size: int) -> bool:
         # The length of free space, object 0, counts its header; other objects are padded to 8 bytes.
         step = length if index == 0 else _HEADER + -(-length // 8) * 8
         if step < _HEADER or at + step > size:
-            return False
-        at += step
-    return True
+            return None
+        at, count = at + step, count + 1
+    return count
