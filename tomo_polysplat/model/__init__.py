@@ -1,1 +1,1 @@
-"""What is unknown: the Gaussians, how they are seeded, added and removed."""
+"""What is unknown: the Gaussians, how they are seeded and, where of no use, moved elsewhere."""

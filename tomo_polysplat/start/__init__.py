@@ -1,1 +1,1 @@
-"""The volume a fit starts from: FDK, SIRT and the water pre-correction."""
+"""The volume a fit starts from: FDK or SIRT, bridged at metal."""
