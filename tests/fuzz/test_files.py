@@ -147,7 +147,7 @@ def nested_heaps(units):
 
 
 def test_heaps_within_heaps_take_no_time(tmp_path):
-    """Some are harmless, such as those of an HDF5 file kept in another; the time of thousands grows with their square."""
+    """Some are harmless, as those of an HDF5 file kept in another; the time of many grows with their square."""
     file = tmp_path / "scan.h5"
     file.write_bytes(nested_heaps(3))
     require_sound_heaps(file)

@@ -171,8 +171,8 @@ def _geometry(
         unit = options.settled_unit(_attribute(group, "unit"), "cm")
         return {"proj_geom": proj_geom, "vol_geom": dict(options.vol_geom or vol_geom), "unit": unit}
     rows, views, columns = projections.shape
-    theta = _angles(file, views, options.theta)
     centre = options.centre
+    theta = _angles(file, views, options.theta, centre)
     if centre is None:
         centre = estimate_centre(projections, theta, valid)
     notes |= {"centre": float(centre), "centre_estimated": options.centre is None}
@@ -188,7 +188,7 @@ def _attribute(group: h5py.Group, name: str) -> str:
     return value
 
 
-def _angles(file: h5py.File, views: int, given: Any) -> np.ndarray:
+def _angles(file: h5py.File, views: int, given: Any, centre: float | None) -> np.ndarray:
     """View angles in radians."""
     in_radians = False
     if given is None:
@@ -203,6 +203,13 @@ def _angles(file: h5py.File, views: int, given: Any) -> np.ndarray:
         raise fail("theta", "finite angles", "NaN or infinity")
     if not in_radians and views > 2 and np.ptp(theta) < 2 * np.pi + 0.1:
         logger.warning("theta spans %.3g degrees only: are these radians?", np.ptp(theta))
+        # Without half a turn the axis cannot be found either, and to give it would hide what is wrong.
+        if centre is None:
+            got = f"{np.ptp(theta):.3g} degrees from the first to the last, which look like radians"
+            remedy = (
+                "set the attribute units = 'rad' of /exchange/theta, or pass theta= in degrees; else centre="
+            )
+            raise fail("theta", "at least half a turn", got, remedy)
     return theta if in_radians else np.deg2rad(theta)
 
 

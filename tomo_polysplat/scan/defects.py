@@ -17,10 +17,22 @@ logger = logging.getLogger(__name__)
 def flat_and_dark(
     white: np.ndarray, dark: np.ndarray | None, shape: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean open-beam and dark images of a detector of `shape` (rows, columns); no dark image means zero."""
-    return _mean_frame("data_white", white, shape), (
-        np.zeros(shape) if dark is None else _mean_frame("data_dark", dark, shape)
-    )
+    """Mean open-beam and dark images of a detector of `shape` (rows, columns); no dark image means zero.
+
+    Raises
+    ------
+    ValueError
+        If a shape is not that of the detector, or the open-beam image has no more light than the dark one.
+    """
+    flat = _mean_frame("data_white", white, shape)
+    background = np.zeros(shape) if dark is None else _mean_frame("data_dark", dark, shape)
+    light, without = (np.where(np.isfinite(image), image, 0).mean() for image in (flat, background))
+    if not light > without:
+        remedy = "are the two swapped, or was there no light?"
+        raise fail(
+            "data_white", f"more light than data_dark has, {without:.6g} counts", f"{light:.6g}", remedy
+        )
+    return flat, background
 
 
 def _mean_frame(name: str, frames: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
