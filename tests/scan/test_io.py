@@ -16,29 +16,6 @@ from tomo_polysplat.scan.layout import vector_geometry, volume_geometry
 from tomo_polysplat.scan.scan import Scan
 
 
-@pytest.fixture
-def exchange(tmp_path):
-    """Write a Data Exchange file of the discs; keyword arguments replace or (None) remove datasets."""
-
-    def write(**changes):
-        theta = np.linspace(0, 180, 91)
-        lines = discs(np.deg2rad(theta)).transpose(1, 0, 2)
-        content = {
-            "data": (100 + 40000 * np.exp(-lines)).astype(np.float32),
-            "data_white": np.full((3, ROWS, COLUMNS), 40100, np.float32),
-            "data_dark": np.full((2, ROWS, COLUMNS), 100, np.float32),
-            "theta": theta,
-        }
-        path = tmp_path / "scan.h5"
-        with h5py.File(path, "w") as file:
-            for name, value in (content | changes).items():
-                if value is not None:
-                    file[f"exchange/{name}"] = value
-        return path, lines
-
-    return write
-
-
 def cone_scan(seed=3):
     """A scan with nothing left out: geometry, spectrum, truth, metal and bad rays."""
     random = np.random.default_rng(seed)
@@ -151,29 +128,6 @@ def test_missing_or_wrong_angles(exchange, caplog):
     path, _ = exchange(theta=np.linspace(0, np.pi, 91))
     load_scan(path, centre=30.0)
     assert "radians?" in caplog.text
-
-
-def test_angles_that_look_like_radians_are_said_to(exchange):
-    """Before the axis is looked for: to give one, as a search in vain advises, would not mend the angles."""
-    path, _ = exchange(theta=np.linspace(0, np.pi, 91))
-    with pytest.raises(ValueError, match=r"theta: expected at least half a turn.*radians.*units"):
-        load_scan(path)
-    with h5py.File(path, "a") as file:
-        file["exchange/theta"].attrs["units"] = "radians"
-    assert load_scan(path).notes["centre"] == pytest.approx(CENTRE, abs=0.15)
-
-
-@pytest.mark.parametrize("what", ["swapped", "dark", "nan"])
-def test_open_beam_images_without_light_are_named(exchange, what):
-    path, _ = exchange()
-    with h5py.File(path, "a") as file:
-        images = file["exchange/data_white"][()], file["exchange/data_dark"][()]
-        white, dark = images[::-1] if what == "swapped" else (0.0 * images[0], images[1])
-        for name, image in (("data_white", white * (np.nan if what == "nan" else 1)), ("data_dark", dark)):
-            del file[f"exchange/{name}"]
-            file[f"exchange/{name}"] = image
-    with pytest.raises(ValueError, match="data_white: expected more light than data_dark"):
-        load_scan(path)
 
 
 def test_pixel_size(exchange):

@@ -1,0 +1,29 @@
+"""A Data Exchange file to change."""
+
+import h5py
+import numpy as np
+import pytest
+from discs import COLUMNS, ROWS, discs
+
+
+@pytest.fixture
+def exchange(tmp_path):
+    """Write a Data Exchange file of the discs; keyword arguments replace or (None) remove datasets."""
+
+    def write(**changes):
+        theta = np.linspace(0, 180, 91)
+        lines = discs(np.deg2rad(theta)).transpose(1, 0, 2)
+        content = {
+            "data": (100 + 40000 * np.exp(-lines)).astype(np.float32),
+            "data_white": np.full((3, ROWS, COLUMNS), 40100, np.float32),
+            "data_dark": np.full((2, ROWS, COLUMNS), 100, np.float32),
+            "theta": theta,
+        }
+        path = tmp_path / "scan.h5"
+        with h5py.File(path, "w") as file:
+            for name, value in (content | changes).items():
+                if value is not None:
+                    file[f"exchange/{name}"] = value
+        return path, lines
+
+    return write

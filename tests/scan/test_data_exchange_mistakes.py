@@ -1,0 +1,31 @@
+"""What is wrong with a Data Exchange file is said, not what comes of it."""
+
+import h5py
+import numpy as np
+import pytest
+from discs import CENTRE
+
+from tomo_polysplat.scan.io import load_scan
+
+
+def test_angles_that_look_like_radians_are_said_to(exchange):
+    """Before the axis is looked for: to give one, as a search in vain advises, would not mend the angles."""
+    path, _ = exchange(theta=np.linspace(0, np.pi, 91))
+    with pytest.raises(ValueError, match=r"theta: expected at least half a turn.*radians.*units"):
+        load_scan(path)
+    with h5py.File(path, "a") as file:
+        file["exchange/theta"].attrs["units"] = "radians"
+    assert load_scan(path).notes["centre"] == pytest.approx(CENTRE, abs=0.15)
+
+
+@pytest.mark.parametrize("what", ["swapped", "dark", "nan"])
+def test_open_beam_images_without_light_are_named(exchange, what):
+    path, _ = exchange()
+    with h5py.File(path, "a") as file:
+        images = file["exchange/data_white"][()], file["exchange/data_dark"][()]
+        white, dark = images[::-1] if what == "swapped" else (0.0 * images[0], images[1])
+        for name, image in (("data_white", white * (np.nan if what == "nan" else 1)), ("data_dark", dark)):
+            del file[f"exchange/{name}"]
+            file[f"exchange/{name}"] = image
+    with pytest.raises(ValueError, match="data_white: expected more light than data_dark"):
+        load_scan(path)
