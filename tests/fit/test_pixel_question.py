@@ -1,0 +1,73 @@
+"""Whether pixels average their light: scans of one ray a pixel and of several, and when nobody needs to ask."""
+
+import numpy as np
+import pytest
+
+import tomo_polysplat as tps
+
+QUICK = {"passes": 10.0, "edges": "blurred", "tv_factor": 1.0}
+
+
+def pins(subrays=1, metal=True):
+    return tps.simulate_scan("pins", size=64, views=60, geometry="fan", subrays=subrays, metal=metal)
+
+
+def reconstruct(scan, settings=None, **options):
+    options = {"unit": scan.unit, "spectrum": scan.spectrum, "progress": False} | options
+    settings = QUICK | (settings or {})
+    return tps.reconstruct(scan.projections, scan.proj_geom, scan.vol_geom, settings=settings, **options)
+
+
+def error(result, scan):
+    return float(np.sqrt(np.mean((result.volume - scan.truth) ** 2)))
+
+
+@pytest.mark.parametrize(("subrays", "taken", "other"), [(1, 1, 2), (3, 2, 1)])
+def test_the_rays_at_metal_tell_it(subrays, taken, other):
+    scan = pins(subrays)
+    told = reconstruct(scan)
+    assert told.plan["pixel_rays"].startswith(f"{taken}: ") and "averaged light leaves" in told.plan["pixel_rays"]
+    wrong = reconstruct(scan, {"pixel_rays": other})
+    assert wrong.plan["pixel_rays"] == f"{other}: asked for"
+    assert error(told, scan) < 0.7 * error(wrong, scan)
+
+
+def test_the_loser_leaves_no_trace_of_itself():
+    """Infinitely thin rays that were asked about are those that were asked for."""
+    scan = pins()
+    told, wanted = reconstruct(scan), reconstruct(scan, {"pixel_rays": 1})
+    assert np.array_equal(told.volume, wanted.volume)
+
+
+@pytest.mark.parametrize(
+    ("metal", "changes", "options", "words"),
+    [
+        (False, {}, {}, "without metal"),
+        (True, {"passes": 9.0}, {}, "in so few passes"),
+        (True, {}, {"time_budget": 1.0}, "time budget"),
+        (True, {}, {"spectrum": None}, "without metal"),
+    ],
+)
+def test_nobody_asks_where_it_cannot_be_told(metal, changes, options, words):
+    told = reconstruct(pins(metal=metal), changes, **options).plan["pixel_rays"]
+    assert told.startswith("1, infinitely thin") and words in told
+
+
+def test_a_run_resumed_around_the_question_is_the_uninterrupted_one(tmp_path, monkeypatch):
+    class Killed(Exception):
+        """What no part of the package catches."""
+
+    def die(state):
+        if state.share >= at:
+            raise Killed
+
+    monkeypatch.setattr("tomo_polysplat.fit.checkpoint._LARGEST_SHARE", 1e9)
+    scan = pins(3)
+    whole = reconstruct(scan)
+    for at in (0.3, 0.4, 0.6):
+        path = tmp_path / f"{at}.npz"
+        with pytest.raises(Killed):
+            reconstruct(scan, checkpoint=path, callbacks=[die])
+        resumed = reconstruct(scan, checkpoint=path, resume=True)
+        assert np.array_equal(resumed.volume, whole.volume), at
+        assert resumed.plan == whole.plan
