@@ -26,7 +26,10 @@ def error(result, scan):
 def test_the_rays_at_metal_tell_it(subrays, taken, other):
     scan = pins(subrays)
     told = reconstruct(scan)
-    assert told.plan["pixel_rays"].startswith(f"{taken}: ") and "averaged light leaves" in told.plan["pixel_rays"]
+    assert (
+        told.plan["pixel_rays"].startswith(f"{taken}: ")
+        and "averaged light leaves" in told.plan["pixel_rays"]
+    )
     wrong = reconstruct(scan, {"pixel_rays": other})
     assert wrong.plan["pixel_rays"] == f"{other}: asked for"
     assert error(told, scan) < 0.7 * error(wrong, scan)

@@ -7,7 +7,12 @@ from splat_scenes import cone_views, gaussians, parallel_views, planar_views
 
 from tomo_polysplat.kernels.project.autograd import project
 
-VIEWS = {"cone": cone_views(), "parallel": parallel_views(), "fan": planar_views(True), "2d": planar_views(False)}
+VIEWS = {
+    "cone": cone_views(),
+    "parallel": parallel_views(),
+    "fan": planar_views(True),
+    "2d": planar_views(False),
+}
 
 
 @pytest.mark.parametrize("kind", VIEWS)
