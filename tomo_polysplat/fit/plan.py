@@ -190,7 +190,6 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
         "smoothed": _smoothed(every, settings),
         "texture": texture,
         "detector_blur": told,
-        "pixel_rays": f"{settings.pixel_rays}: asked for",
         "passes": f"{passes:g} over the views at most, fewer where {settings.held_out:.1%} of the rays, held"
         f" out of the fit, have not improved for {patience_of(settings, passes)}",
     }
