@@ -53,5 +53,5 @@ def make_step(
             logger.debug("no CUDA graph", exc_info=True)
             logger.warning("Steps one operation at a time: no CUDA graph could be recorded: %s", problem)
     else:
-        logger.info("Steps one operation at a time: %s.", reason)
+        logger.debug("Steps one operation at a time: %s.", reason)
     return EagerStep(gaussians, spacing, rays, scene, settings)

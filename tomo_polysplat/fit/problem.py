@@ -314,7 +314,7 @@ class Problem:
         found = float(basis.max(initial=0.0)) / plan.reference
         if found > dense:
             words = f"the fit found {found:.2g} soft references where the start had none above {dense:g}"
-            words += "; a lower bone_level would free material numbers"
+            words += f"; settings={{'bone_level': {0.7 * dense:.2g}}} would free material numbers there"
             plan.reasons["curves"] += f"; {words}"
             logger.warning("One curve may be too few: %s.", words)
         return np.concatenate([basis, np.zeros((2, *basis.shape[1:]), np.float32)])
