@@ -23,8 +23,6 @@ logger = logging.getLogger(__name__)
 _LARGEST_LOGARITHM = 745.0
 # A larger share of rays left out than this is said in the log: a mask may be of the other sense.
 _MOST_LEFT_OUT = 0.2
-# Of a mask of ones that is resampled.
-_ROUNDING = 1e-5
 
 
 def usable_rays(
@@ -50,7 +48,7 @@ def usable_rays(
         require_shape("valid", mask, np.shape(projections), "of the projections")
         # A curved detector is resampled: a ray that takes anything of a pixel that is not valid is not, either.
         whole = (mask > 0.5).astype(np.float32)
-        marked = ~(projections_from_astra(whole, proj_geom) > 1 - _ROUNDING)
+        marked = ~(projections_from_astra(whole, proj_geom) >= 1)
     require_line_integrals(values, marked)
     parts = [(values[a:b], None if marked is None else marked[a:b]) for a, b in split_range(len(values), 64)]
     found = run_tasks(_take_out, parts)
