@@ -59,7 +59,10 @@ def matter_is_inside(projections: torch.Tensor, geometry: Geometry, grid: Volume
                 "The object reaches beyond the volume: rays next to it see matter, which ends up in the volume, too"
                 " dense towards its border. Make the volume larger, or check its window and the geometry."
             )
-            return False, "not kept within the volume: rays beside it see matter, as the object reaches beyond it"
+            return (
+                False,
+                "not kept within the volume: rays beside it see matter, as the object reaches beyond it",
+            )
         return False, "not kept within the volume: rays beside it see matter"
     return True, "kept within the volume: rays beside it see nothing"
 
