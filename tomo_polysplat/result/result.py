@@ -128,7 +128,7 @@ class Result:
 
     @cached_property
     def material(self) -> np.ndarray:
-        """Material map u from 0 (soft) over 1/2 (mostly middle) to 1 (dense), shaped like :attr:`volume`.
+        """Material map u from 0 (soft) over 1/2 (half of it middle) to 1 (dense), shaped like :attr:`volume`.
 
         ``u = (basis_middle / 2 + basis_dense) / density``, the mass-weighted mean u of the Gaussians
         at a voxel, exact for one material because ``2u(1-u) / 2 + u^2 = u``. 0 where there is next to
