@@ -19,7 +19,7 @@ import torch
 from scipy import ndimage
 
 from tomo_polysplat.fit.problem import Problem
-from tomo_polysplat.fit.short_fit import short_fit
+from tomo_polysplat.fit.short_fit import TOO_SHORT, short_fit
 from tomo_polysplat.physics.edges import edge_inside
 from tomo_polysplat.physics.materials import Materials, composition
 from tomo_polysplat.settings import Settings
@@ -80,7 +80,7 @@ def settings_for_agent(
     for choice in choices:
         one = short_fit(problem, start, {}, replace(choice, **alike), device, seed, seconds, _STEPS)
         if one.cut:
-            return settings, {"agent": "as without an edge: the time budget is too short to tell"}
+            return settings, {"agent": f"as without an edge: {TOO_SHORT}"}
         misfits.append(one.held_out)
     best = choices[int(np.argmin(misfits))]
     words = ["as without an edge", *(f"the agent above {level:.3g} soft references" for level in levels)]

@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ import torch
 from tomo_polysplat.checks import fail, require_choice, require_number
 from tomo_polysplat.fit.first_volume import first_volume
 from tomo_polysplat.fit.problem import Problem
-from tomo_polysplat.fit.short_fit import ShortFit, short_fit
+from tomo_polysplat.fit.short_fit import TOO_SHORT, ShortFit, Untold, short_fit
 from tomo_polysplat.physics.ray_estimates import estimate_scatter, matching_factor
 from tomo_polysplat.physics.spectral_change import tube_voltage, with_filtration, with_voltage
 from tomo_polysplat.physics.spectrum import Spectrum
@@ -34,7 +34,6 @@ logger = logging.getLogger(__name__)
 _ROUNDS = 2
 # Of the seconds that a reconstruction may take, the share for all short fits with their start volumes.
 _SHARE_OF_BUDGET = 0.6
-_TOO_SHORT = "the time budget is too short to tell"
 # Steps of a short fit that tells a density: it is 0.7 to 1.5 % low after 120 (teeth, pins, lung), 0.3 to 0.5 after 240.
 _STEPS_FOR_DENSITY = 240
 # Scatter below this share of the open beam, and densities closer than this, are left as they are.
@@ -154,7 +153,7 @@ def calibrated(
             trials.require_time()
             stage = _stage(name, best, wanted, problem, trials.another)
             accepted[name], reason = _judge(name, best, stage, problem)
-        except _Untold as untold:
+        except Untold as untold:
             accepted[name], reason = False, f"not accepted: {untold}"
         why.append(f"{name}: {reason}")
         if accepted[name]:
@@ -170,32 +169,25 @@ def calibrated(
     }
 
 
-class _Untold(Exception):
-    """Short fits that tell nothing, and why."""
-
-
+@dataclass
 class _Trials:
     """Short fits under one physics after another, for as long as the time budget has room for them."""
 
-    def __init__(
-        self,
-        problem: Problem,
-        wanted: Calibration,
-        settings: Settings,
-        device: torch.device,
-        seed: int,
-        time_budget: float | None,
-    ) -> None:
-        self._problem, self._settings, self._device, self._seed = problem, settings, device, seed
-        self._steps = () if wanted.soft_density is None else (_STEPS_FOR_DENSITY,)
-        self._budget, self._begun = time_budget, time.perf_counter()
-        self.made: list[ShortFit] = []
+    problem: Problem
+    wanted: Calibration
+    settings: Settings
+    device: torch.device
+    seed: int
+    budget: float | None
+    begun: float = field(default_factory=time.perf_counter)
+    made: list[ShortFit] = field(default_factory=list)
 
     def made_under(self, fitted: Mapping[str, float]) -> ShortFit:
         """A short fit, cut or not."""
-        physics, settings, device = with_fitted(self._problem, fitted), self._settings, self._device
+        physics, settings, device = with_fitted(self.problem, fitted), self.settings, self.device
         start, _ = first_volume(physics, device, settings)
-        rest = (self._seed, self._budget, *self._steps)
+        steps = () if self.wanted.soft_density is None else (_STEPS_FOR_DENSITY,)
+        rest = (self.seed, self.budget, *steps)
         self.made.append(short_fit(physics, start, dict(fitted), settings, device, *rest))
         return self.made[-1]
 
@@ -204,22 +196,22 @@ class _Trials:
 
         Raises
         ------
-        _Untold
+        Untold
             If there is none.
         """
         self.require_time()
         one = self.made_under(fitted)
         if one.cut:
-            raise _Untold(_TOO_SHORT)
+            raise Untold(TOO_SHORT)
         return one
 
     def require_time(self) -> None:
         """See to it that no short fit so far was cut, and that one more, as long as they were, can be made."""
-        if self._budget is None:
+        if self.budget is None:
             return
-        spent, number = time.perf_counter() - self._begun, len(self.made)
-        if self.made[-1].cut or spent * (number + 1) / number > _SHARE_OF_BUDGET * self._budget:
-            raise _Untold(_TOO_SHORT)
+        spent, number = time.perf_counter() - self.begun, len(self.made)
+        if self.made[-1].cut or spent * (number + 1) / number > _SHARE_OF_BUDGET * self.budget:
+            raise Untold(TOO_SHORT)
 
 
 def _stage(

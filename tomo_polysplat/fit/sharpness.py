@@ -20,7 +20,7 @@ from tomo_polysplat.fit.plan import Plan, finest_spacing
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays, batches_around
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.fit.short_fit import cut_short, fitted_shortly
+from tomo_polysplat.fit.short_fit import TOO_SHORT, cut_short, fitted_shortly
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.initial import FEW_VIEWS
@@ -99,7 +99,7 @@ def seeds_for_edges(
             seeds.copy(), own, problem, scene, rays, short, options["seed"], options["time_budget"]
         )
         if cut_short(outcome):
-            return _because(*plain, "round seeds: the time budget is too short to tell how sharp edges are")
+            return _because(*plain, f"round seeds: {TOO_SHORT} how sharp edges are")
         misfits.append(_misfit(outcome.gaussians, scene, rays, short))
     sharp, reason = _judged(*misfits)
     return _because(*kinds[sharp], reason)

@@ -21,8 +21,10 @@ from tomo_polysplat.render.renderer import project_gaussians
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.levels import mass_level
 
-__all__ = ["ShortFit", "cut_short", "fitted_shortly", "main_density", "short_fit"]
+__all__ = ["TOO_SHORT", "ShortFit", "Untold", "cut_short", "fitted_shortly", "main_density", "short_fit"]
 
+# Why a short fit that the time budget ended tells nothing.
+TOO_SHORT = "the time budget is too short to tell"
 _PASSES = 2.0
 # A scan of few views is not seen in fewer steps.
 _FEWEST_STEPS = 120
@@ -151,6 +153,10 @@ def fitted_shortly(
     if outcome.reason == "interrupted":
         raise KeyboardInterrupt("interrupted during a short fit: there is no result yet")
     return outcome
+
+
+class Untold(Exception):
+    """Short fits that tell nothing, and why."""
 
 
 def cut_short(outcome: FitOutcome) -> bool:

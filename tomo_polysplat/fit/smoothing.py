@@ -27,7 +27,7 @@ from tomo_polysplat.fit.plan import Plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays, batches_around
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.fit.short_fit import cut_short, fitted_shortly
+from tomo_polysplat.fit.short_fit import TOO_SHORT, Untold, cut_short, fitted_shortly
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.initial import FEW_VIEWS
@@ -110,14 +110,14 @@ def choose_smoothing(
             seeds.copy(), own, problem, scene, asking, short, options["seed"], options["time_budget"]
         )
         if cut_short(outcome):
-            raise _Untold("the time budget is too short to tell")
+            raise Untold(TOO_SHORT)
         return _misfit_aside(
             outcome.gaussians, scene, asking, short, _VIEWS_PLANAR if problem.planar else _VIEWS
         )
 
     try:
         plan.tv_factor, told = _asked(left_by, [by_depth, by_noise] if thin else [], not no_more)
-    except _Untold as reason:
+    except Untold as reason:
         plan.reasons["smoothing"] = f"{usual}: {reason}"
         return
     weight = "the usual weight" if plan.tv_factor == 1 else f"{plan.tv_factor:.2g} times the usual weight"
@@ -125,15 +125,11 @@ def choose_smoothing(
     logger.info("The volume is smoothed with %s", plan.reasons["smoothing"])
 
 
-class _Untold(Exception):
-    """Short fits that tell nothing, and why."""
-
-
 def _asked(left_by: Callable[[float], float], less: list[float], more: bool) -> tuple[float, str]:
     """The factor to take, of 1, those ever ``less``, and with ``more`` three, and what each leaves of the misfit."""
     usual = best = left_by(1.0)
     if not usual:
-        raise _Untold("no ray of those held out is usable")
+        raise Untold("no ray of those held out is usable")
     chosen, told = 1.0, []
 
     def ask(factor: float) -> float:
