@@ -206,7 +206,7 @@ def _fitted(
         left = max(started + budget - time.perf_counter(), 0.0)
         deadline = started + budget - min(scene.seconds_of_basis(begun.gaussians), 0.5 * left)
     settings = plan.adapted(wishes.settings)
-    question = pixel_question(plan, begun.gaussians, scene, settings, problem.geometry.views, budget)
+    question = pixel_question(plan, begun.gaussians, settings, problem.geometry.views)
     return fit(
         begun.gaussians,
         plan.spacing * problem.voxel,

@@ -1,9 +1,14 @@
 """Whether pixels average their light: scans of one ray a pixel and of several, and when nobody needs to ask."""
 
+import time
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 import tomo_polysplat as tps
+from tomo_polysplat.fit.pixel_question import PixelQuestion
+from tomo_polysplat.fit.stopping import Clock
 
 QUICK = {"passes": 10.0, "edges": "blurred", "tv_factor": 1.0}
 
@@ -47,13 +52,35 @@ def test_the_loser_leaves_no_trace_of_itself():
     [
         (False, {}, {}, "without metal"),
         (True, {"passes": 9.0}, {}, "in so few passes"),
-        (True, {}, {"time_budget": 1.0}, "time budget"),
+        (True, {}, {"time_budget": 0.5}, "time budget"),
         (True, {}, {"spectrum": None}, "without metal"),
     ],
 )
 def test_nobody_asks_where_it_cannot_be_told(metal, changes, options, words):
     told = reconstruct(pins(metal=metal), changes, **options).plan["pixel_rays"]
     assert told.startswith("1, infinitely thin") and words in told
+
+
+def test_a_budget_with_time_to_spare_does_not_hinder_it():
+    told, hurried = reconstruct(pins(3)), reconstruct(pins(3), time_budget=3600.0)
+    assert told.plan["pixel_rays"] == hurried.plan["pixel_rays"]
+    assert np.array_equal(told.volume, hurried.volume)
+
+
+@pytest.mark.parametrize("passes", [0, 1])
+def test_a_budget_that_ends_amid_the_question_leaves_the_run_as_it_was(passes):
+    """However few passes it was able to make."""
+    clock, plan = Clock(10, time.perf_counter() + 3600), SimpleNamespace(pixel_rays=0, reasons={})
+    made = [(0.2, 0.3, 1)] * passes
+
+    def slowly(clock, passes):
+        clock.deadline = time.perf_counter() - 1
+        return made
+
+    fitter = SimpleNamespace(ahead=slowly, branch=lambda rays: SimpleNamespace(ahead=slowly))
+    chosen, last = PixelQuestion(plan).answered(fitter, clock)
+    assert chosen is fitter and last == (made[0] if made else None)
+    assert plan.pixel_rays == 1 and "time budget" in plan.reasons["pixel_rays"]
 
 
 def test_a_run_resumed_around_the_question_is_the_uninterrupted_one(tmp_path, monkeypatch):

@@ -102,6 +102,7 @@ def test_gaussians_turn_from_the_second_step_on():
         ("fan", True, {}),
         ("cone", True, {"tv_weight": 0.0, "held_out": 0.0}),
         ("cone", True, {"every": 2}),
+        ("cone", True, {"pixel_rays": 2}),
     ],
 )
 def test_a_graph_steps_like_autograd(kind, polychromatic, changes):
@@ -142,7 +143,7 @@ def test_another_number_of_views_or_gaussians_compiles_nothing(monkeypatch):
     """Which would take longer than many a pass over the views."""
     import triton
 
-    from tomo_polysplat.kernels.step.triton_blur import _blurred_kernel
+    from tomo_polysplat.kernels.step.triton_detector import _blurred_kernel
 
     compiled = []
     monkeypatch.setattr(

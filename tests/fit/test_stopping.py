@@ -143,3 +143,13 @@ def test_a_deadline_can_only_shorten_a_run():
     assert 0 <= clock.share() < 0.01 and not clock.late
     clock.done = 4
     assert clock.share() == 0.5
+
+
+def test_slower_steps_fit_in_where_the_time_left_is_enough_for_them():
+    """Four steps took four seconds; four more, four times slower, take sixteen."""
+    now = time.perf_counter()
+    for left, fits in ((17, True), (15, False)):
+        clock = Clock(8, now + left)
+        clock.begun, clock.done = now - 4, 4
+        assert clock.allows(4.0) == fits
+    assert Clock(8, None).allows(1e9)

@@ -31,6 +31,7 @@ def fit_problem(kind, polychromatic, device, kernel, count=17, **changes):
     values[:, -1, 7] = 400.0
     blurring, one_curve = changes.pop("blurring", True), changes.pop("one_curve", False)
     corners, every = changes.pop("corners", (0.1, 0.03)), changes.pop("every", 1)
+    pixel_rays = changes.pop("pixel_rays", 1)
     settings = Settings(**({"held_out": 0.2, "tv_weight": 0.3, "material_from": 0.5} | changes))
     rays = Rays(values.to(device), views, 1e3, settings.model_error, settings.held_out)
     quadrature, curves = None, (None, None)
@@ -42,7 +43,20 @@ def fit_problem(kind, polychromatic, device, kernel, count=17, **changes):
     shape = (1, 7, 9) if planar else (4, 5, 6)
     box = VoxelBox(np.array([-0.6, -0.5, 0.0 if planar else -0.4]), np.array([0.2, 0.21, 0.23]), shape)
     scene = FitScene(
-        box, quadrature, 0.7, *curves, -0.1, kernel, 3.0, 0.0, blurring, corners, False, every, 0.2
+        box,
+        quadrature,
+        0.7,
+        *curves,
+        -0.1,
+        kernel,
+        3.0,
+        0.0,
+        blurring,
+        corners,
+        False,
+        every,
+        0.2,
+        pixel_rays,
     )
     return _gaussians(count, planar, device), 0.2, rays, scene, settings
 

@@ -53,6 +53,19 @@ def every_other_step_smooths_twice_as_much(device):
 
 
 @case
+def pixels_that_average_the_light_of_several_rays(device):
+    """With metal's edges in them, under a spectrum and without, blurred and not, along both axes and along one."""
+    for kind, polychromatic, changes in (
+        ("cone", True, {}),
+        ("cone", True, {"one_curve": True, "blurring": False}),
+        ("parallel", False, {"blurring": False}),
+        ("fan", True, {"pixel_rays": 3}),
+    ):
+        changes = {"pixel_rays": 2} | changes
+        compare_steps(_fused, device, ("cpu", "numba"), kind, polychromatic, **changes)
+
+
+@case
 def the_slope_by_the_blur_behind_much_matter(device):
     """As large as the projections, and yet a sum of whole numbers."""
     slopes = []

@@ -19,8 +19,6 @@ def why_eager(scene: FitScene, settings: Settings) -> str:
     """Why a step cannot be one graph of our own kernels; nothing if it can."""
     if scene.kernel != "triton":
         return f"the {scene.kernel} kernel runs"
-    if scene.pixel_rays > 1:
-        return "pixels average their light"
     if settings.ssim_weight:
         return "structural similarity is asked for"
     return ""

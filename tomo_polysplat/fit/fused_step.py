@@ -28,7 +28,7 @@ from tomo_polysplat.kernels.project import triton_forward as rays_forward
 from tomo_polysplat.kernels.project.triton_pull_back import pull_back as rays_pull_back
 from tomo_polysplat.kernels.project.triton_setup import footprints
 from tomo_polysplat.kernels.step.triton_activate import activate
-from tomo_polysplat.kernels.step.triton_blur import blurred_misfit_gradient
+from tomo_polysplat.kernels.step.triton_detector import detected_misfit_gradient
 from tomo_polysplat.kernels.step.triton_misfit import Measurement, Splat, misfit_gradient
 from tomo_polysplat.kernels.step.triton_update import FIRST_DECAY, SECOND_DECAY, Bounds, update
 from tomo_polysplat.kernels.step.triton_variation import variation_gradient
@@ -82,7 +82,9 @@ class FusedStep:
         self._rates = torch.tensor([rates[k] for k in parameters], dtype=torch.float32, device=device)
         bounds = log_scale_bounds(scene, spacing, gaussians.planar, settings)
         self._bounds = Bounds(bounds, (scene.least_u, 1.0), LARGEST_BLUR, EPSILON)
-        self._views, self._table = rays.views.select(np.arange(batch)), rays.views.host_table()
+        fine = scene.fine(rays.views)
+        self._views, self._table = fine.select(np.arange(batch)), fine.host_table()
+        self._parts = (fine.rows // rays.views.rows, fine.columns // rays.views.columns)
         self._sums = torch.zeros(3, dtype=torch.float64, device=device)
         self._skipped = torch.zeros((), dtype=torch.int64, device=device)
         # The largest values so far of an image and of a volume, for sums that do not depend on their order.
@@ -90,6 +92,7 @@ class FusedStep:
         self._grad_shared = torch.zeros(len(gaussians.shared_material), dtype=torch.int64, device=device)
         self._grad_blur = torch.zeros(1, dtype=torch.int64, device=device)
         self._control = torch.zeros(_HEAD + batch * (_CHOSEN + _VIEW), dtype=torch.float64, device=device)
+        self._no_blur = torch.zeros(1, dtype=torch.float32, device=device)
         self._curves = None
         if scene.reference_curve is not None and scene.output_curve is not None:
             self._curves = torch.cat([scene.reference_curve, scene.output_curve])
@@ -189,9 +192,10 @@ class FusedStep:
         record = footprints(*drawn, views, table, cutoff, self._skipped)
         largest = self._largest[0]
         image = rays_forward.splat(record, channels, views, cutoff, largest)
-        seen = Splat(image, table, chosen, views, self._measurement, self._sums, largest)
-        if self.scene.blurring:
-            pixels = blurred_misfit_gradient(seen, self.gaussians.blur, self._grad_blur)
+        seen = Splat(image, table, chosen, views, self._parts, self._measurement, self._sums, largest)
+        if self.scene.blurring or max(self._parts) > 1:
+            blur = self.gaussians.blur if self.scene.blurring else self._no_blur
+            pixels = detected_misfit_gradient(seen, blur, self._grad_blur)
         else:
             pixels = misfit_gradient(seen)
         moments = rays_backward.sum_moments(record, pixels, channels, views)

@@ -233,10 +233,11 @@ class _Run:
         """What each pass gave; where the question is asked, two at once, so that no checkpoint lies between them."""
         passes = self.fitter.passes(self.clock)
         while True:
-            if self.question is not None and self.question.due(self.clock.share()):
+            if self.question is not None and self.question.due(self.clock):
                 self.fitter, made = self.question.answered(self.fitter, self.clock)
                 passes = self.fitter.passes(self.clock)
-                yield made
+                if made is not None:
+                    yield made
             elif (one := next(passes, None)) is not None:
                 yield one
             else:

@@ -26,7 +26,7 @@ from tomo_polysplat.render.renderer import project_gaussians
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.initial import FEW_VIEWS
 
-__all__ = ["PixelQuestion", "pixel_question"]
+__all__ = ["WHILE_ASKED", "PixelQuestion", "pixel_question"]
 
 logger = logging.getLogger(__name__)
 
@@ -36,6 +36,10 @@ _FROM, _PASSES = 0.4, 2
 _FEWEST_PASSES = 10.0
 # Rays a pixel and axis: with three pins of 36^3 are no better than with two (45.4 and 48.4 dB everywhere).
 _RAYS = 2
+# Runs, and rays a pixel, that there are while it is asked.
+WHILE_ASKED = (2, 1 + _RAYS**2)
+# So many times as long a step of averaged light may take, with two rays a pixel and axis.
+_SLOWER = 4.0
 # Light is averaged where that leaves as much of the misfit of the rays at metal: a fit makes up for most of what it
 # does not model. 20 scans of several rays a pixel came to 0.75 to 1.13, three of thin or opaque metal to 1.16 to 1.27;
 # 14 of one ray to 1.32 and more, but for grains smaller than a voxel, 1.06, and for rods in the middle of a disc, which
@@ -71,14 +75,22 @@ class PixelQuestion:
 
     plan: Plan
 
-    def due(self, share: float) -> bool:
-        """Whether it is to be asked when ``share`` of the run is done."""
-        return not self.plan.pixel_rays and share >= _FROM
+    def due(self, clock: Clock) -> bool:
+        """Whether it is to be asked now; where time is too short for it, it is answered without."""
+        if self.plan.pixel_rays or clock.share() < _FROM:
+            return False
+        if clock.allows(_SLOWER):
+            return True
+        _not_asked(self.plan, "the time budget is kept for the fit")
+        return False
 
-    def answered(self, fitter: _Branching, clock: Clock) -> tuple[_Branching, Made]:
-        """The fitter to go on with, two passes later, and what the last of them gave."""
+    def answered(self, fitter: _Branching, clock: Clock) -> tuple[_Branching, Made | None]:
+        """The fitter to go on with, two passes later, and what the last of them gave, if time was left for any."""
         other, its_clock = fitter.branch(_RAYS), copy.copy(clock)
         made = [fitter.ahead(clock, _PASSES), other.ahead(its_clock, _PASSES)]
+        if its_clock.late:
+            _not_asked(self.plan, "the time budget was used before the rays could tell")
+            return fitter, _last(made[0])
         left = _misfits_at_metal([fitter, other])
         share = left[1] / left[0] if left[0] else float("inf")
         averaged = _AS_WELL[0] <= share <= _AS_WELL[1]
@@ -88,14 +100,10 @@ class PixelQuestion:
         least, most = _AS_WELL
         self.plan.reasons["pixel_rays"] = f"{self.plan.pixel_rays}: {kind}; {words} {least:g} to {most:g}"
         logger.info("Pixels: %s.", self.plan.reasons["pixel_rays"])
-        chosen = made[averaged]
-        last = (*chosen[-1][:2], sum(skipped for _, _, skipped in chosen))
-        return (other if averaged else fitter), last
+        return (other if averaged else fitter), _last(made[averaged])
 
 
-def pixel_question(
-    plan: Plan, gaussians: Gaussians, scene: FitScene, settings: Settings, views: int, budget: float | None
-) -> PixelQuestion | None:
+def pixel_question(plan: Plan, gaussians: Gaussians, settings: Settings, views: int) -> PixelQuestion | None:
     """The question where it can be answered; else the plan gets the answer now.
 
     Parameters
@@ -104,34 +112,34 @@ def pixel_question(
         Of a run that begins, or goes on from a checkpoint.
     gaussians : Gaussians
         That it begins with.
-    scene : FitScene
     settings : Settings
     views : int
-    budget : float or None
-        Seconds of the reconstruction.
     """
     if settings.pixel_rays:
         plan.reasons["pixel_rays"] = f"{settings.pixel_rays}: asked for"
     if plan.pixel_rays:
         return None
-    why_not = _why_not(plan, gaussians, scene, settings, views, budget)
+    why_not = _why_not(plan, gaussians, views)
     if not why_not:
         return PixelQuestion(plan)
-    plan.pixel_rays = 1
-    plan.reasons["pixel_rays"] = f"1, infinitely thin: {why_not}"
+    _not_asked(plan, why_not)
     return None
 
 
-def _why_not(
-    plan: Plan, gaussians: Gaussians, scene: FitScene, settings: Settings, views: int, budget: float | None
-) -> str:
+def _last(made: list[Made]) -> Made | None:
+    """The errors of the last pass, and the pairs skipped in all."""
+    return (*made[-1][:2], sum(skipped for _, _, skipped in made)) if made else None
+
+
+def _not_asked(plan: Plan, why: str) -> None:
+    plan.pixel_rays = 1
+    plan.reasons["pixel_rays"] = f"1, infinitely thin: {why}"
+
+
+def _why_not(plan: Plan, gaussians: Gaussians, views: int) -> str:
     """Why it is not asked, if so."""
     if not bool((gaussians.group > 0).any()):
         return "without metal it matters little"
-    if scene.kernel == "triton":
-        return "asked on a CPU only, as each step would take longer; the setting pixel_rays asks for more"
-    if budget is not None:
-        return "the time budget is kept for the fit"
     if plan.passes < _FEWEST_PASSES:
         return "in so few passes two more would take too long a part"
     if views < FEW_VIEWS:

@@ -19,6 +19,7 @@ from tomo_polysplat.checks import require_choice
 from tomo_polysplat.fit.inside import matter_is_inside
 from tomo_polysplat.fit.memory import projections_stay, require_room
 from tomo_polysplat.fit.noise import photons_per_ray
+from tomo_polysplat.fit.pixel_question import WHILE_ASKED
 from tomo_polysplat.fit.plan import Plan, finest_spacing
 from tomo_polysplat.fit.plan_costs import alternatives, work
 from tomo_polysplat.fit.rays import Rays
@@ -294,11 +295,12 @@ class Problem:
         plan.reasons["work"] = work(plan, self, settings, len(gaussians))
         plan.reasons["alternatives"] = alternatives(plan, self, settings, len(gaussians))
         values = self.measured(device)
+        runs, rays = (1, plan.pixel_rays**2) if plan.pixel_rays else WHILE_ASKED
         plan.reasons["memory"] = require_room(
             device,
-            gaussians=len(gaussians),
+            gaussians=runs * len(gaussians),
             views=plan.views_per_step,
-            pixels=self.geometry.rows * self.geometry.columns * max(plan.pixel_rays, 1) ** 2,
+            pixels=rays * self.geometry.rows * self.geometry.columns,
             voxels=math.prod(self.grid.shape),
             projections=values.nbytes if values.device.type == device.type else 0,
         )

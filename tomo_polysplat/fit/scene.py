@@ -82,11 +82,14 @@ class FitScene:
     pixel_rays: int = 1
     solid_number: Callable[[np.ndarray], np.ndarray] | None = None
 
+    def fine(self, views: DetectorViews) -> DetectorViews:
+        """The rays whose light the pixels of these views average."""
+        return views if self.pixel_rays == 1 else views.finer(self.pixel_rays)
+
     def projections(self, gaussians: Gaussians, views: DetectorViews) -> tuple[torch.Tensor, int]:
         """(views, rows, columns) predicted -log(I/I0), and the pairs skipped at the source plane."""
         weights = gaussians.weights(self.reference_curve)
-        rays = views if self.pixel_rays == 1 else views.finer(self.pixel_rays)
-        areal, skipped = project_gaussians(gaussians, weights, rays, self.kernel, self.cutoff)
+        areal, skipped = project_gaussians(gaussians, weights, self.fine(views), self.kernel, self.cutoff)
         areal = areal * self.areal_scale
         sharp = areal[0] if self.quadrature is None else polychromatic_projection(areal, self.quadrature)
         if self.pixel_rays > 1:

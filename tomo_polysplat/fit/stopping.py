@@ -83,6 +83,13 @@ class Clock:
             return 1.0
         return max(self.done / self.steps, (time.perf_counter() - self.begun) / (self.deadline - self.begun))
 
+    def allows(self, slower: float) -> bool:
+        """Whether the steps left, so many times slower than those so far, would end before the deadline."""
+        if self.deadline is None:
+            return True
+        now, left = time.perf_counter(), self.steps - self.done
+        return now + slower * left * (now - self.begun) / max(self.done, 1) <= self.deadline
+
 
 def patience_of(settings: Settings, passes: float) -> int:
     """Passes without improvement that end a run of so many."""

@@ -7,6 +7,7 @@ back to the base materials' line integrals.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -76,10 +77,13 @@ class Splat:
     raw : (views, rows, columns, ...) tensor
         Image of the splat.
     table : (views, 21) float64 tensor
+        Of the rays.
     chosen : (2, views) float64 tensor
         Number of each view in the scan, and its slot among the measured projections.
     views : DetectorViews
-        As many views of the same detector; only its shape is read.
+        As many views of the rays; only their shape is read.
+    parts : pair of int
+        Rays of a pixel along rows' and columns' axis.
     measurement : Measurement
     sums : (3,) float64 tensor
         To which the mean misfit of the fitted rays, the sum of that of the held-out rays, and their weight are
@@ -92,6 +96,7 @@ class Splat:
     table: torch.Tensor
     chosen: torch.Tensor
     views: DetectorViews
+    parts: tuple[int, int]
     measurement: Measurement
     sums: torch.Tensor
     largest: torch.Tensor
@@ -99,7 +104,7 @@ class Splat:
     @property
     def area(self) -> int:
         """Pixels of a view."""
-        return self.views.rows * self.views.columns
+        return self.views.rows * self.views.columns // math.prod(self.parts)
 
     def gradient(self) -> torch.Tensor:
         """Room for the gradient, laid out for the projection's adjoint."""
@@ -116,7 +121,7 @@ class Splat:
         return triton.cdiv(self.area, PIXELS_A_PROGRAM), len(self.views)
 
     def gradient_blocks(self) -> tuple[int, int]:
-        """The grid of a kernel over the room for the gradient."""
+        """The grid of a kernel over the room for the gradient, which has a place for each ray."""
         return triton.cdiv(sum(gradient_room(self.views)), PIXELS_A_PROGRAM), len(self.views)
 
 
@@ -253,7 +258,7 @@ def _misfit_kernel(
 
 
 def misfit_gradient(splat: Splat) -> torch.Tensor:
-    """The gradient of the misfit, as `Splat.gradient` lays it out."""
+    """The gradient of the misfit of one ray a pixel, as `Splat.gradient` lays it out."""
     measurement, pixels = splat.measurement, splat.gradient()
     log_weights, attenuation, nodes = splat.spectrum()
     with on_device(splat.raw):

@@ -1,10 +1,14 @@
-"""The misfit of projections seen through the detector's blur, and its gradient, in three CUDA kernels.
+"""The misfit of projections as the detector sees them, and its gradient, in three CUDA kernels.
 
-What triton_misfit.py does where rays are sharp. P is made first, for a pixel needs its neighbours'; then the
-blurred P' is compared with what was measured; last, each pixel gathers from those that its light reaches. The
-blur's matrix A (physics/detector_blur.py) is symmetric, so that both ways take the same weights:
+What triton_misfit.py does where rays are sharp and one goes through each pixel. P is made first, for a pixel needs
+its neighbours'; then the blurred P' is compared with what was measured; last, each ray gathers from the pixels that
+its light reaches. The blur's matrix A (physics/detector_blur.py) is symmetric, so that both ways take the same weights:
 
     P'_k = sum_j A_kj P_j,   dP'_k / dP_j = A_kj,   dP'_k / dv = sum_j dA_kj/dv P_j
+
+Where a pixel averages the light of n rays (physics/pixel_light.py), with p_i of each:
+
+    P_j = log n - log sum_i exp(-p_i),   dP_j / dp_i = exp(P_j - p_i) / n
 """
 
 from __future__ import annotations
@@ -24,7 +28,7 @@ from tomo_polysplat.kernels.step.triton_misfit import (
 from tomo_polysplat.kernels.step.triton_update import WHOLE_OF_BLUR
 from tomo_polysplat.kernels.triton_maths import SIZES, on_device
 
-__all__ = ["blurred_misfit_gradient"]
+__all__ = ["detected_misfit_gradient"]
 
 
 @triton.jit
@@ -45,15 +49,27 @@ def _taps(index, count, STEP: tl.constexpr, variance):
 @triton.jit(do_not_specialize=SIZES)
 def _sharp_kernel(
     raw, sharp, table, log_weights, attenuation, largest, area, columns, nodes, areal_scale,
-    CURVES: tl.constexpr, CONE: tl.constexpr, BLOCK: tl.constexpr,
+    CURVES: tl.constexpr, CONE: tl.constexpr, DOWN: tl.constexpr, ACROSS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     k = tl.program_id(1).to(tl.int64)
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    factor = pixel_factor(table, k, pixel, columns, CONE) * areal_scale
-    at = k * area + tl.minimum(pixel, area - 1)
-    most, predicted, _, _, _ = sharp_projection(raw, at, factor, log_weights, attenuation, nodes, CURVES)
-    tl.atomic_max(largest, tl.max(most, 0), sem="relaxed")
-    tl.store(sharp + at, predicted, mask=pixel < area)
+    within = tl.minimum(pixel, area - 1)
+    row, column = within // columns, within % columns
+    largest_term, light = tl.full([BLOCK], float("-inf"), tl.float32), tl.zeros([BLOCK], tl.float32)
+    for i in tl.static_range(DOWN):
+        for j in tl.static_range(ACROSS):
+            ray = (row * DOWN + i) * (columns * ACROSS) + column * ACROSS + j
+            factor = pixel_factor(table, k, ray, columns * ACROSS, CONE) * areal_scale
+            most, predicted, _, _, _ = sharp_projection(
+                raw, k * area * (DOWN * ACROSS) + ray, factor, log_weights, attenuation, nodes, CURVES
+            )
+            tl.atomic_max(largest, tl.max(most, 0), sem="relaxed")
+            if DOWN * ACROSS > 1:
+                before, largest_term = largest_term, tl.maximum(largest_term, -predicted)
+                light = light * tl.exp(before - largest_term) + tl.exp(-predicted - largest_term)
+    if DOWN * ACROSS > 1:
+        predicted = tl.log(DOWN * ACROSS / light) - largest_term
+    tl.store(sharp + k * area + within, predicted, mask=pixel < area)
 
 
 @triton.jit(do_not_specialize=SIZES)
@@ -88,18 +104,21 @@ def _blurred_kernel(
 
 @triton.jit(do_not_specialize=SIZES)
 def _gather_kernel(
-    raw, pixels, table, slopes, blur, log_weights, attenuation,
+    raw, sharp, pixels, table, slopes, blur, log_weights, attenuation,
     area, rows, columns, room, beyond, many, nodes, areal_scale,
-    CURVES: tl.constexpr, CONE: tl.constexpr, FOLD: tl.constexpr, BLOCK: tl.constexpr,
+    CURVES: tl.constexpr, CONE: tl.constexpr, FOLD: tl.constexpr, DOWN: tl.constexpr, ACROSS: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
     k = tl.program_id(1).to(tl.int64)
-    pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    inside = pixel < area
-    live = pixel < room + tl.where(k == many - 1, beyond, 0)
-    row, column, variance = pixel // columns, pixel % columns, tl.load(blur)
-    factor = pixel_factor(table, k, pixel, columns, CONE) * areal_scale
-    at = k * area + tl.minimum(pixel, area - 1)
-    _, _, d0, d1, d2 = sharp_projection(raw, at, factor, log_weights, attenuation, nodes, CURVES)
+    ray = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    rays, rays_across = area * (DOWN * ACROSS), columns * ACROSS
+    inside = ray < rays
+    live = ray < room + tl.where(k == many - 1, beyond, 0)
+    row, column, variance = ray // (rays_across * DOWN), (ray % rays_across) // ACROSS, tl.load(blur)
+    pixel = row * columns + column
+    factor = pixel_factor(table, k, ray, rays_across, CONE) * areal_scale
+    at = k * rays + tl.minimum(ray, rays - 1)
+    _, predicted, d0, d1, d2 = sharp_projection(raw, at, factor, log_weights, attenuation, nodes, CURVES)
     gathered = tl.zeros([BLOCK], tl.float32)
     for i in tl.static_range(-1, 2):
         along_v, _, there_v = _taps(row, rows, i, variance)
@@ -108,11 +127,14 @@ def _gather_kernel(
             there = inside & there_v & there_u
             slope = tl.load(slopes + k * area + pixel + i * columns + j, mask=there, other=0.0)
             gathered += along_v * along_u * slope
-    to = k * room + place(pixel, columns, FOLD)
+    if DOWN * ACROSS > 1:
+        averaged = tl.load(sharp + k * area + pixel, mask=inside, other=0.0)
+        gathered *= tl.where(inside, tl.exp(averaged - predicted) / (DOWN * ACROSS), 0.0)
+    to = k * room + place(ray, rays_across, FOLD)
     store_gradients(pixels, to, gathered * factor, d0, d1, d2, live, CURVES)
 
 
-def blurred_misfit_gradient(splat: Splat, blur: torch.Tensor, grad_blur: torch.Tensor) -> torch.Tensor:
+def detected_misfit_gradient(splat: Splat, blur: torch.Tensor, grad_blur: torch.Tensor) -> torch.Tensor:
     """The gradient of the misfit, as `Splat.gradient` lays it out.
 
     Parameters
@@ -125,24 +147,27 @@ def blurred_misfit_gradient(splat: Splat, blur: torch.Tensor, grad_blur: torch.T
     """
     views, measurement, pixels = splat.views, splat.measurement, splat.gradient()
     log_weights, attenuation, nodes = splat.spectrum()
+    down, across = splat.parts
+    rows, columns = views.rows // down, views.columns // across
     size = (2, len(views) * splat.area)
     sharp, slopes = torch.empty(size, dtype=torch.float32, device=splat.raw.device)
     with on_device(splat.raw):
         _sharp_kernel[splat.blocks()](
             splat.raw, sharp, splat.table, log_weights, attenuation, splat.largest,
-            splat.area, views.columns, nodes, measurement.areal_scale,
-            CURVES=measurement.curves, CONE=views.cone, BLOCK=PIXELS_A_PROGRAM, num_warps=4,
+            splat.area, columns, nodes, measurement.areal_scale,
+            CURVES=measurement.curves, CONE=views.cone, DOWN=down, ACROSS=across, BLOCK=PIXELS_A_PROGRAM,
+            num_warps=4,
         )  # fmt: skip
         _blurred_kernel[splat.blocks()](
             sharp, slopes, blur, grad_blur, splat.chosen, measurement.projections, measurement.totals,
-            splat.sums, splat.area, views.rows, views.columns, len(views),
+            splat.sums, splat.area, rows, columns, len(views),
             measurement.noise, measurement.held_out, measurement.corner,
             HUBER=measurement.corner > 0, BLOCK=PIXELS_A_PROGRAM, num_warps=4,
         )  # fmt: skip
         _gather_kernel[splat.gradient_blocks()](
-            splat.raw, pixels, splat.table, slopes, blur, log_weights, attenuation,
-            splat.area, views.rows, views.columns, *gradient_room(views), len(views), nodes,
+            splat.raw, sharp, pixels, splat.table, slopes, blur, log_weights, attenuation,
+            splat.area, rows, columns, *gradient_room(views), len(views), nodes,
             measurement.areal_scale, CURVES=measurement.curves, CONE=views.cone, FOLD=folded(views),
-            BLOCK=PIXELS_A_PROGRAM, num_warps=4,
+            DOWN=down, ACROSS=across, BLOCK=PIXELS_A_PROGRAM, num_warps=4,
         )  # fmt: skip
     return pixels
