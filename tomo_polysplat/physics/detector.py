@@ -54,16 +54,55 @@ class Detector:
     def photon_counting(
         cls, sensor: str | None = None, thickness_cm: float = 0.0, threshold_kev: float = 0.0
     ) -> Detector:
-        """One count for every photon absorbed above a threshold; ideal without a sensor."""
+        """One count for every photon absorbed above a threshold.
+
+        Parameters
+        ----------
+        sensor : str, optional
+            Material that absorbs the photons, such as ``"CdTe"``; None absorbs all.
+        thickness_cm : float
+            Its thickness in cm.
+        threshold_kev : float
+            Photons of less energy are not counted.
+
+        Raises
+        ------
+        ValueError
+            For an unknown material, one without a thickness, a thickness without one, or negative numbers.
+        """
         return cls(False, sensor, thickness_cm, threshold_kev)
 
     @classmethod
     def energy_integrating(cls, scintillator: str | None = "CsI", thickness_cm: float = 0.06) -> Detector:
-        """Signal proportional to the absorbed energy, such as a flat panel's; None: an ideal absorber."""
+        """Signal proportional to the absorbed energy, such as a flat panel's.
+
+        Parameters
+        ----------
+        scintillator : str, optional
+            Material that absorbs the photons; None absorbs all.
+        thickness_cm : float
+            Its thickness in cm; not read without a scintillator.
+
+        Raises
+        ------
+        ValueError
+            For an unknown material or a thickness that is not above 0.
+        """
         return cls(True, scintillator, thickness_cm if scintillator is not None else 0.0)
 
     def response(self, energies_kev: Any) -> np.ndarray:
-        """Relative signal per photon, ``(n,)`` float64, at energies in keV; in keV if integrating."""
+        """Relative signal per photon, ``(n,)`` float64: a probability, or keV if integrating.
+
+        Parameters
+        ----------
+        energies_kev : (n,) array_like
+            Energies in keV.
+
+        Raises
+        ------
+        ValueError
+            For energies outside the tables, 0.1-800 keV.
+        """
         energies = require_energies("energies_kev", energies_kev)
         signal = energies.copy() if self.integrating else np.ones_like(energies)
         if self.sensor is not None:

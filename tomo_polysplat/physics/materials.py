@@ -241,7 +241,18 @@ class Materials:
 
     @classmethod
     def of(cls, value: Materials | Sequence[MaterialLike] | None) -> Materials:
-        """From what a caller may hand over: None (the defaults), three materials, or ``Materials``."""
+        """From what a caller may hand over.
+
+        Parameters
+        ----------
+        value : Materials, sequence of three materials, or None
+            None: the defaults.
+
+        Raises
+        ------
+        ValueError
+            For anything else, or an unknown material.
+        """
         if value is None:
             return cls()
         if isinstance(value, Materials):
@@ -270,7 +281,18 @@ class Materials:
         return materials
 
     def mass_attenuation(self, energies_kev: Any) -> np.ndarray:
-        """Curves ``(3, n)`` in cm2/g, float64, of soft, middle and dense at ``n`` energies in keV."""
+        """Curves ``(3, n)`` in cm2/g, float64, of soft, middle and dense.
+
+        Parameters
+        ----------
+        energies_kev : (n,) array_like
+            Energies in keV.
+
+        Raises
+        ------
+        ValueError
+            For energies outside the tables, 0.1-800 keV.
+        """
         energies = np.atleast_1d(require_energies("energies_kev", energies_kev))
         return np.stack([mass_attenuation(material, energies) for material in self])
 

@@ -69,8 +69,19 @@ class Spectrum:
 
     @classmethod
     def monochromatic(cls, kev: float) -> Spectrum:
-        """A single energy in keV."""
-        return cls([require_number("kev", kev, above=0.0)], [1.0], "monochromatic")
+        """A single energy.
+
+        Parameters
+        ----------
+        kev : float
+            In keV.
+
+        Raises
+        ------
+        ValueError
+            For an energy outside the tables, 0.1-800 keV.
+        """
+        return cls(require_energies("kev", [require_number("kev", kev, above=0.0)]), [1.0], "monochromatic")
 
     @classmethod
     def from_tube(
@@ -110,7 +121,18 @@ class Spectrum:
         return spectrum.detected(Detector.photon_counting() if detector is None else detector)
 
     def filtered(self, filters: Filters) -> Spectrum:
-        """This spectrum behind more filters, ``{material: cm}`` or ``{material: (cm, g/cm3)}``."""
+        """This spectrum behind more filters, each of which takes away ``exp(-mu t)``.
+
+        Parameters
+        ----------
+        filters : mapping
+            ``{material: cm}``, or ``{material: (cm, g/cm3)}`` for one without a known density.
+
+        Raises
+        ------
+        ValueError, TypeError
+            For an unknown material, a negative thickness, or what is no mapping.
+        """
         if not isinstance(filters, Mapping):
             raise fail("filters", "a dict of material and cm", repr(filters), error=TypeError)
         exponent = np.zeros_like(self._energies)
@@ -131,7 +153,17 @@ class Spectrum:
         return Spectrum(self._energies, weights, " + ".join([self._label, *amounts]))
 
     def detected(self, detector: Detector) -> Spectrum:
-        """This spectrum of photons as seen by a detector."""
+        """This spectrum of photons as seen by a detector.
+
+        Parameters
+        ----------
+        detector : Detector
+
+        Raises
+        ------
+        ValueError, TypeError
+            For a detector that sees none of it, or what is no `Detector`.
+        """
         if not isinstance(detector, Detector):
             raise fail("detector", "a Detector", repr(detector), error=TypeError)
         weights = self._weights * detector.response(self._energies)
@@ -171,6 +203,16 @@ class Spectrum:
 
         The usual way to cut the number of energies, kept for comparisons: ``fit_quadrature`` needs far fewer.
         The support is where the weight per keV exceeds 1e-4 of its maximum.
+
+        Parameters
+        ----------
+        n : int
+            Points, 1 at least.
+
+        Raises
+        ------
+        ValueError
+            For fewer.
         """
         n = int(require_number("n", n, at_least=1))
         if self.is_monochromatic:
@@ -198,7 +240,13 @@ class Spectrum:
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> Spectrum:
-        """The inverse of ``to_dict``."""
+        """The inverse of ``to_dict``.
+
+        Raises
+        ------
+        ValueError
+            For a dict without energies or weights, and as the class itself does.
+        """
         missing = {"energies_kev", "weights"} - set(content)
         if missing:
             raise fail("spectrum", "energies_kev and weights", f"no {' or '.join(sorted(missing))}")

@@ -99,12 +99,17 @@ class Result:
         return self._public(self.basis[0] if self.materials is None else self._attenuation(self.energy_kev))
 
     def attenuation(self, kev: float) -> np.ndarray:
-        """Virtual monoenergetic volume: attenuation at `kev` in 1/`unit`, shaped like :attr:`volume`.
+        """Virtual monoenergetic volume: attenuation in 1/`unit`, float32, shaped like :attr:`volume`.
+
+        Parameters
+        ----------
+        kev : float
+            Photon energy in keV.
 
         Raises
         ------
         ValueError
-            If the result is monochromatic and `kev` is not its energy.
+            For an energy outside the tables, 0.1-800 keV, or another than a monochromatic result's.
         """
         kev = require_number("kev", kev, above=0)
         if self.materials is None:
@@ -118,6 +123,7 @@ class Result:
                     "kev", "the energy of a monochromatic result", f"{kev:g}", f"{known}; pass a spectrum"
                 )
             return self.volume
+        require_energies("kev", [kev])
         return self._public(self._attenuation(kev))
 
     @cached_property
@@ -159,6 +165,12 @@ class Result:
 
         An interrupted write leaves an existing file as it was.
 
+        Parameters
+        ----------
+        path : str or path
+        overwrite : bool
+            Whether an existing file is replaced.
+
         Raises
         ------
         FileExistsError
@@ -172,19 +184,58 @@ class Result:
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> Result:
-        """Read what :meth:`save` wrote. Nothing is unpickled, and declared sizes are checked first."""
+        """Read what :meth:`save` wrote. Nothing is unpickled, and declared sizes are checked first.
+
+        Parameters
+        ----------
+        path : str or path
+
+        Raises
+        ------
+        FileNotFoundError
+        ValueError
+            If the file is truncated, of another layout, or declares more than it holds.
+        """
         from tomo_polysplat.result.files import load_hdf5
 
         return load_hdf5(path)
 
     def save_tiff(self, folder: str | os.PathLike, *, overwrite: bool = False) -> None:
-        """Write :attr:`volume` as 32-bit TIFF slices ``slice_0000.tif``, ... to a folder, made if need be."""
+        """Write :attr:`volume` as 32-bit TIFF slices ``slice_0000.tif``, ... to a folder, made if need be.
+
+        Parameters
+        ----------
+        folder : str or path
+        overwrite : bool
+            Whether slices that are there are replaced.
+
+        Raises
+        ------
+        FileExistsError
+            If there are slices and `overwrite` is false.
+        OSError
+            If the disk has too little free space.
+        """
         from tomo_polysplat.result.files import save_tiff
 
         save_tiff(self, folder, overwrite=overwrite)
 
     def save_npy(self, path: str | os.PathLike, *, overwrite: bool = False) -> None:
-        """Write :attr:`volume` as a NumPy array file."""
+        """Write :attr:`volume` as a NumPy array file.
+
+        Parameters
+        ----------
+        path : str or path
+        overwrite : bool
+            Whether an existing file is replaced.
+
+        Raises
+        ------
+        FileExistsError
+            If the file exists and `overwrite` is false.
+        OSError
+            If the disk has too little free space.
+        """
         from tomo_polysplat.result.files import save_npy
 
         save_npy(self, path, overwrite=overwrite)
@@ -201,9 +252,19 @@ class Result:
 
         Parameters
         ----------
+        path : str or path
         truth, metal_mask : array shaped like :attr:`volume`, or None
             True attenuation in 1/`unit` at :attr:`energy_kev`, and voxels of metal, for an error map and
             figures of merit.
+        overwrite : bool
+            Whether an existing file is replaced.
+
+        Raises
+        ------
+        FileExistsError
+            If the file exists and `overwrite` is false.
+        ValueError
+            If truth or mask have another shape than the volume.
         """
         from tomo_polysplat.report.html import write_report
 
