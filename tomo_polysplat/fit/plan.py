@@ -10,22 +10,19 @@ import numpy as np
 import torch
 
 from tomo_polysplat.fit.depth import optical_depth
+from tomo_polysplat.fit.plan_seeds import cells, seed_spacing, smallest_scale
 from tomo_polysplat.fit.reference import SoftReference, lightness, soft_reference
 from tomo_polysplat.fit.stopping import patience_of
 from tomo_polysplat.fit.texture import tv_corners
 from tomo_polysplat.fit.unit_check import doubt_lengths
-from tomo_polysplat.model.seed_samples import box_mean, widened
 from tomo_polysplat.physics.detector_blur import describe_blur
 from tomo_polysplat.settings import Settings
 
 if TYPE_CHECKING:
     from tomo_polysplat.fit.problem import Problem
 
-__all__ = ["PASSES", "Plan", "finest_spacing", "make_plan"]
+__all__ = ["PASSES", "Plan", "make_plan"]
 
-# Seeds along the longest edge: a ray through few large voxels tells what is inside them, and an object's outline
-# in a handful of Gaussians would leave its mass wrong.
-_FEWEST_SEEDS = 12
 # Fewer steps than this leave edges blurred; more of one view each are noisier than fewer of several. A GPU, whose
 # steps cost little, makes more of them (256^3: 40.1 dB with 4 views a step, 39.0 with 8, for 1.6 times the time).
 # The few rays of a planar view do with fewer steps (five fan-beam slices: 38.0 dB with 4 views a step, 38.3 with 8).
@@ -49,16 +46,6 @@ _LONGER, _LONGER_PLANAR = (1.5, 9000), (2.0, 36_000)
 _TV_EVERY, _TV_RARELY = 2, {"cpu": 4, "cuda": 8}
 # Voxels that a step can smooth while it does the rest.
 _TV_VOXELS, _TV_VOXELS_PLANAR = {"cpu": 140_000, "cuda": 4_200_000}, 65_536
-# Smallest deviation of a Gaussian in voxels. Where a volume has fewer Gaussians than the detector could tell apart,
-# each shows more of an edge: half as thick (H200, six scenes of 128^3 to 256^3) 0.8 dB more everywhere in the mean,
-# 0.05 without metal. Where they are many (40^3), and in slices, that changed nothing or lost 0.1 dB.
-_SMALLEST, _SMALLEST_OF_FEW = 0.2, 0.1
-# Gaussians that a laptop and a GPU fit in a time people wait for.
-_MOST_GAUSSIANS = {"cpu": 60_000, "cuda": 400_000}
-# What a cloud has to show is mostly surfaces. Where they have more than so many Gaussians a voxel, fewer but thin ones
-# are better and quicker (128^3, teeth, pins, pancreas: 43.6, 36.6, 40.0 dB in 2.1 s with 450 000 of them, 44.6, 37.6,
-# 40.4 in 1.3 s with 150 000), unless they are few anyway (64^3: 40.9 for 41.8 dB).
-_MOST_PER_SURFACE, _NOT_TOO_MANY = 1.7, 60_000
 
 
 @dataclass
@@ -147,10 +134,10 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     level = settings.support_level * min(1.0, light / _LIGHT)
     least = level * reference * problem.depth
     support = int((start > least).sum())
-    spacing, finer, because = _seed_spacing(start, least, support, problem, settings, device)
-    smallest, thin = _smallest_scale(spacing, problem, settings)
+    spacing, finer, because = seed_spacing(start, least, support, problem, settings, device)
+    smallest, thin = smallest_scale(spacing, problem, settings)
     most = _MOST_VIEWS_PLANAR if problem.planar else _MOST_VIEWS[device]
-    longer = _longer(_cells(support, problem) / spacing**problem.dimensions, problem.planar)
+    longer = _longer(cells(support, problem) / spacing**problem.dimensions, problem.planar)
     passes, views, reason = _length(problem.geometry.views, settings, most, longer)
     every = settings.tv_every or _tv_every(math.prod(start.shape), problem.planar, device)
     curves, needed = _curves(start, first * problem.depth, problem.polychromatic, settings)
@@ -227,75 +214,6 @@ def _blurred(start: np.ndarray | torch.Tensor, soft: float, settings: Settings) 
             f"fitted, from a variance of {settings.blur:g} squared pixels on: metal has edges that hold it",
         )
     return False, "none: without metal, a smooth object and a detector that blurs look alike"
-
-
-def _seed_spacing(
-    start: np.ndarray | torch.Tensor,
-    least: float,
-    support: int,
-    problem: Problem,
-    settings: Settings,
-    device: str,
-) -> tuple[float, float, str]:
-    """Distance of the seeds in voxels (the shortest edge), the finer share, and why.
-
-    Matter is what is above ``least``; ``support`` voxels have some.
-    """
-    if settings.seed_spacing:
-        return settings.seed_spacing, 0.0, "asked for"
-    most, limit = _most_gaussians(start, least, problem, settings, device)
-    finest, because = finest_spacing(problem)
-    crowded = (_cells(support, problem) / most) ** (1 / problem.dimensions)
-    if crowded <= finest:
-        return finest, 0.0, because
-    because = f"at most {most} Gaussians{limit} over {support} voxels of support"
-    finer = settings.finer_seeds
-    because += f", {finer:.0%} of them closer where the start varies"
-    return crowded, finer, because + (", thin across its edges" if settings.seed_edge else "")
-
-
-def _smallest_scale(spacing: float, problem: Problem, settings: Settings) -> tuple[float, str]:
-    """Smallest deviation in voxels of Gaussians whose seeds lie so far apart, and why."""
-    if settings.smallest_scale:
-        return settings.smallest_scale, "asked for"
-    if problem.planar or spacing <= finest_spacing(problem)[0]:
-        return _SMALLEST, "Gaussians are many enough to show edges together"
-    return _SMALLEST_OF_FEW, "as Gaussians are few, each shows more of an edge"
-
-
-def _cells(voxels: int, problem: Problem) -> float:
-    """So many voxels in cubes, or squares, of their shortest edge."""
-    return voxels * float(np.prod(problem.grid.voxel_size[: problem.dimensions] / problem.voxel))
-
-
-def _most_gaussians(
-    start: np.ndarray | torch.Tensor, least: float, problem: Problem, settings: Settings, device: str
-) -> tuple[int, str]:
-    """How many Gaussians at most, and why not more; matter is what is above ``least``."""
-    most = settings.max_gaussians or _MOST_GAUSSIANS[device]
-    if settings.max_gaussians or problem.planar or most <= _NOT_TOO_MANY:
-        return most, ""
-    # Averaged, as noise would make holes with surfaces of their own.
-    matter = box_mean(torch.as_tensor(start), np.minimum(3, start.shape)) > least
-    surface = int((matter & widened(~matter, 1)).sum())
-    enough = max(_NOT_TOO_MANY, round(_MOST_PER_SURFACE * surface * _cells(1, problem) ** (2 / 3)))
-    return (most, "") if most <= enough else (enough, f", for {surface} voxels at its surfaces,")
-
-
-def finest_spacing(problem: Problem) -> tuple[float, str]:
-    """Distance of seeds in voxels, and why.
-
-    No closer than the detector can tell apart and the voxels can show, unless these are few.
-    """
-    width, height = problem.geometry.pixel_size_at(problem.grid.centre)
-    pixel = (width if problem.planar else math.sqrt(width * height)) / problem.voxel
-    edge = float((problem.grid.extent / problem.voxel)[: problem.dimensions].max())
-    if pixel > 1.0:
-        return 1.3 * pixel, "1.3 detector pixels at the object"
-    few = max(1.3 * pixel, edge / _FEWEST_SEEDS)
-    if few < 1.3 - 1e-6:
-        return few, f"a volume of few voxels: {_FEWEST_SEEDS} seeds along it, or 1.3 detector pixels"
-    return 1.3, "1.3 voxels"
 
 
 def _tv_every(voxels: int, planar: bool, device: str) -> int:

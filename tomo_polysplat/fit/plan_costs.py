@@ -51,8 +51,12 @@ def alternatives(plan: Plan, problem: Problem, settings: Settings, gaussians: in
         "passes": f"{2 * plan.passes:g} for {plan.passes:g}: twice the time",
         "patience": f"{patience_of(settings, plan.passes)} passes without improvement end it sooner",
         "edges": "sharp or blurred: without two short fits, of about a pass over the views each, that tell which",
+        "tv_factor": "1: without the short fits that tell how strongly thin objects and slices are smoothed",
         "tv_weight": "0: nothing is smoothed, which on a CPU takes about half of the time",
     }
+    if plan.blurred:
+        rays = "twice" if problem.planar else "four times"
+        told["pixel_rays"] = f"1 or 2: not asked in the middle of the run; with 2 {rays} the pairs"
     if plan.views_per_step > 1:
         fewer = plan.views_per_step // 2
         told["views_per_step"] = (

@@ -20,8 +20,9 @@ from tomo_polysplat.fit.inside import matter_is_inside
 from tomo_polysplat.fit.memory import projections_stay, require_room
 from tomo_polysplat.fit.noise import photons_per_ray
 from tomo_polysplat.fit.pixel_question import WHILE_ASKED
-from tomo_polysplat.fit.plan import Plan, finest_spacing
+from tomo_polysplat.fit.plan import Plan
 from tomo_polysplat.fit.plan_costs import alternatives, work
+from tomo_polysplat.fit.plan_seeds import finest_spacing
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.kernels import select

@@ -16,7 +16,8 @@ import numpy as np
 import torch
 
 from tomo_polysplat.fit.loss import misfit
-from tomo_polysplat.fit.plan import Plan, finest_spacing
+from tomo_polysplat.fit.plan import Plan
+from tomo_polysplat.fit.plan_seeds import finest_spacing
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays, batches_around
 from tomo_polysplat.fit.scene import FitScene
