@@ -18,6 +18,7 @@ from tomo_polysplat.fit.loss import misfit, total_variation
 from tomo_polysplat.fit.noise import photons_per_ray
 from tomo_polysplat.fit.plan import PASSES
 from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.spectral_model import OPAQUE
 from tomo_polysplat.fit.step import held_out_mean
 from tomo_polysplat.fit.stopping import FitState, Watch, patience_of
 from tomo_polysplat.fit.texture import tv_corners
@@ -38,7 +39,6 @@ __all__ = ["voxel_poly"]
 
 VIEWS_PER_STEP = 4
 RATE_ATTENUATION, RATE_MATERIAL = 3e-2, 3e-3  # per step of Adam, falling like those of the Gaussians
-_LARGEST_PROJECTION = 15.0  # up to which the spectral nodes serve, as in the fit of Gaussians
 
 
 def voxel_poly(
@@ -120,7 +120,7 @@ class _Fit:
     ) -> None:
         self.model, self.pair, self.settings, self.cm = model, pair, settings, cm_per(unit)
         values = np.where(np.isfinite(projections), projections, np.float32(np.nan))
-        largest = float(np.clip(np.nanmax(values), 1.0, _LARGEST_PROJECTION))
+        largest = float(np.clip(np.nanmax(values), 1.0, OPAQUE))
         self.quadrature = fit_quadrature(spectrum, materials, largest, settings.spectral_nodes or None)
         target = model.relative.device
         energies = [transmitted_energy(values, spectrum), spectrum.effective_energy]

@@ -25,16 +25,14 @@ from tomo_polysplat.fit.plan_costs import alternatives, work
 from tomo_polysplat.fit.plan_seeds import finest_spacing
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.spectral_model import OPAQUE, spectral_model
 from tomo_polysplat.kernels import select
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.model.seed import seed_gaussians
-from tomo_polysplat.physics.material_range import LEAST_U, least_material_number
 from tomo_polysplat.physics.materials import Materials
-from tomo_polysplat.physics.quadrature import Quadrature, fit_quadrature
-from tomo_polysplat.physics.scatter import add_scatter, without_scatter
+from tomo_polysplat.physics.scatter import without_scatter
 from tomo_polysplat.physics.solids import number_of_solid
 from tomo_polysplat.physics.spectrum import Spectrum
-from tomo_polysplat.physics.water import transmitted_energy
 from tomo_polysplat.render.renderer import detector_views, voxel_box
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.scan.snapped import snapped_geometry, snapped_grid
@@ -47,11 +45,6 @@ from tomo_polysplat.units import LENGTH_UNITS, cm_per
 __all__ = ["Problem"]
 
 logger = logging.getLogger(__name__)
-
-# Beyond this a ray says "opaque", not how opaque: the spectral nodes are fitted up to it at most.
-_LARGEST_PROJECTION = 15.0
-# And to this at least: a scan of nothing has no range.
-_LEAST_PROJECTION = 1e-3
 
 
 @dataclass
@@ -204,7 +197,7 @@ class Problem:
         """The forward model."""
         kernel, why = select.choose(device, settings.kernel)
         plan.reasons["kernel"] = f"{kernel}: {why}"
-        quadrature, reference_curve, output_curve, least_u = self._physics(plan, settings, device)
+        quadrature, reference_curve, output_curve, least_u = spectral_model(self, plan, settings, device)
         # One node of one curve: -log(I/I0) is in proportion to the areal density.
         straight = quadrature is not None and quadrature.attenuation.size == 1
         slope = float(quadrature.attenuation[0, 0]) if quadrature is not None and straight else 1.0
@@ -232,32 +225,8 @@ class Problem:
         """The projections as they would be without scatter, on a device."""
         if not self.scatter:
             return self.measured(device)
-        primary = without_scatter(self.projections, self.scatter, _LARGEST_PROJECTION)
+        primary = without_scatter(self.projections, self.scatter, OPAQUE)
         return torch.from_numpy(primary).to(self.measured(device).device, torch.float32)
-
-    def _physics(
-        self, plan: Plan, settings: Settings, device: torch.device
-    ) -> tuple[Quadrature | None, torch.Tensor | None, torch.Tensor | None, float]:
-        """Nodes of the spectrum, the curves at the Gaussians' energy and at the volume's, and the least u."""
-        spectrum, materials = self.spectrum, self.materials
-        if spectrum is None or materials is None:
-            return None, None, None, LEAST_U
-        primary = self.primary(device)
-        most = float(primary.nan_to_num(nan=-math.inf).max())
-        # Mixtures of three curves are told apart by more than what thin rays use of them.
-        largest = min(max(most, 1.0 if plan.curves > 1 else _LEAST_PROJECTION), _LARGEST_PROJECTION)
-        nodes = settings.spectral_nodes or None
-        quadrature = fit_quadrature(spectrum, materials, largest, nodes, curves=plan.curves)
-        plan.reasons["spectrum"] = quadrature.describe()
-        plan.reasons["hardening"] = quadrature.describe_hardening(most)
-        lit_by_scatter = add_scatter(quadrature, self.scatter)
-        if plan.curves == 1:
-            return lit_by_scatter, None, None, LEAST_U
-        least_u = least_material_number(materials, spectrum, quadrature.attenuation)
-        energy = transmitted_energy(primary, spectrum)
-        plan.reasons["reference_energy"] = f"{energy:.1f} keV: the mean of what a typical ray transmits"
-        output = _relative(materials, spectrum.effective_energy, device)
-        return lit_by_scatter, _relative(materials, energy, device), output, least_u
 
     def _solid_number(self, plan: Plan, settings: Settings) -> Callable[[np.ndarray], np.ndarray] | None:
         """Numbers of solids by attenuation at the volume's energy, for curves that they are known for."""
@@ -330,9 +299,3 @@ class Problem:
         values = self.measured(device)
         target = None if values.device.type == device.type else device
         return Rays(values, views, photons, settings.model_error, settings.held_out, target)
-
-
-def _relative(materials: Materials, energy: float, device: torch.device) -> torch.Tensor:
-    """(3,) mass attenuation of the curves over that of the first."""
-    attenuation = materials.mass_attenuation([energy])[:, 0]
-    return torch.as_tensor(attenuation / attenuation[0], dtype=torch.float32, device=device)

@@ -1,0 +1,69 @@
+"""The spectrum as the model of a scan sees it: its nodes, and the material curves at the energies that matter."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+
+from tomo_polysplat.physics.material_range import LEAST_U, least_material_number
+from tomo_polysplat.physics.materials import Materials
+from tomo_polysplat.physics.quadrature import Quadrature, fit_quadrature
+from tomo_polysplat.physics.scatter import add_scatter
+from tomo_polysplat.physics.water import transmitted_energy
+from tomo_polysplat.settings import Settings
+
+if TYPE_CHECKING:
+    from tomo_polysplat.fit.plan import Plan
+    from tomo_polysplat.fit.problem import Problem
+
+__all__ = ["OPAQUE", "spectral_model"]
+
+# Beyond this a ray says "opaque", not how opaque: the spectral nodes are fitted up to it at most.
+OPAQUE = 15.0
+# And to this at least: a scan of nothing has no range.
+_LEAST_PROJECTION = 1e-3
+
+
+def spectral_model(
+    problem: Problem, plan: Plan, settings: Settings, device: torch.device
+) -> tuple[Quadrature | None, torch.Tensor | None, torch.Tensor | None, float]:
+    """Nodes of the spectrum, the curves at the Gaussians' energy and at the volume's, and the least u.
+
+    Of one energy there are neither nodes nor curves, and of one curve no curves. What was chosen is told in the plan.
+
+    Parameters
+    ----------
+    problem : Problem
+    plan : Plan
+        Its ``reasons`` are added to.
+    settings : Settings
+    device : torch.device
+        Of the curves, ``(3,)`` each, relative to the first.
+    """
+    spectrum, materials = problem.spectrum, problem.materials
+    if spectrum is None or materials is None:
+        return None, None, None, LEAST_U
+    primary = problem.primary(device)
+    most = float(primary.nan_to_num(nan=-math.inf).max())
+    # Mixtures of three curves are told apart by more than what thin rays use of them.
+    largest = min(max(most, 1.0 if plan.curves > 1 else _LEAST_PROJECTION), OPAQUE)
+    nodes = settings.spectral_nodes or None
+    quadrature = fit_quadrature(spectrum, materials, largest, nodes, curves=plan.curves)
+    plan.reasons["spectrum"] = quadrature.describe()
+    plan.reasons["hardening"] = quadrature.describe_hardening(most)
+    lit_by_scatter = add_scatter(quadrature, problem.scatter)
+    if plan.curves == 1:
+        return lit_by_scatter, None, None, LEAST_U
+    least_u = least_material_number(materials, spectrum, quadrature.attenuation)
+    energy = transmitted_energy(primary, spectrum)
+    plan.reasons["reference_energy"] = f"{energy:.1f} keV: the mean of what a typical ray transmits"
+    output = _relative(materials, spectrum.effective_energy, device)
+    return lit_by_scatter, _relative(materials, energy, device), output, least_u
+
+
+def _relative(materials: Materials, energy: float, device: torch.device) -> torch.Tensor:
+    """(3,) mass attenuation of the curves over that of the first."""
+    attenuation = materials.mass_attenuation([energy])[:, 0]
+    return torch.as_tensor(attenuation / attenuation[0], dtype=torch.float32, device=device)
