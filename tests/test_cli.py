@@ -11,7 +11,8 @@ import pytest
 
 import tomo_polysplat
 from tomo_polysplat.cli import main
-from tomo_polysplat.physics.materials import Materials, mass_attenuation
+from tomo_polysplat.physics.base_materials import Materials
+from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import VolumeGrid, from_astra, to_astra
 from tomo_polysplat.scan.io import load_scan, save_scan

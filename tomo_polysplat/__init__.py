@@ -13,7 +13,7 @@ __version__ = "0.1.0"
 
 _PUBLIC = {
     "Detector": "tomo_polysplat.physics.detector",
-    "Materials": "tomo_polysplat.physics.materials",
+    "Materials": "tomo_polysplat.physics.base_materials",
     "Result": "tomo_polysplat.result.result",
     "Scan": "tomo_polysplat.scan.scan",
     "Spectrum": "tomo_polysplat.physics.spectrum",

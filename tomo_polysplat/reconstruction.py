@@ -27,8 +27,8 @@ from tomo_polysplat.interrupts import postponed_interrupts
 from tomo_polysplat.kernels.device import one_torch_thread, usual_modes
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.parallel import kept_threads
+from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.detector_blur import describe_blur
-from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.spectrum import Spectrum, require_spectrum
 from tomo_polysplat.physics.water_correction import describe_polynomial
 from tomo_polysplat.progress import progress_reports

@@ -15,7 +15,7 @@ from tomo_polysplat.bench.scenes import cached_scan
 from tomo_polysplat.cli import main
 from tomo_polysplat.kernels.project.reference import project
 from tomo_polysplat.kernels.views import DetectorViews
-from tomo_polysplat.physics.materials import Materials
+from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.settings import make_settings
 
 ALL = [variant for variants in GROUPS.values() for variant in variants]

@@ -10,7 +10,7 @@ import torch
 from tomo_polysplat.fit.first_volume import first_volume
 from tomo_polysplat.fit.plan import make_plan
 from tomo_polysplat.fit.problem import Problem
-from tomo_polysplat.physics.materials import Materials
+from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.render.renderer import project_gaussians
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, from_astra

@@ -10,7 +10,8 @@ from small_scans import disc, reconstruct
 
 import tomo_polysplat as tps
 from tomo_polysplat.fit.reference import lightness, soft_reference
-from tomo_polysplat.physics.materials import Materials, density, mass_attenuation
+from tomo_polysplat.physics.base_materials import Materials
+from tomo_polysplat.physics.materials import density, mass_attenuation
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.simulate.orbit import circular_orbit

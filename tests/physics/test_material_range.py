@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.material_range import LEAST_U, least_material_number
-from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.quadrature import fit_quadrature
 from tomo_polysplat.physics.spectrum import Spectrum
 

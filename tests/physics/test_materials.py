@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.detector import Detector
-from tomo_polysplat.physics.materials import Materials, composition, density, mass_attenuation
+from tomo_polysplat.physics.materials import composition, density, mass_attenuation
 
 # Total mass attenuation with coherent scattering, cm2/g, at 20, 60 and 100 keV: NIST XAAMDI (NISTIR 5632).
 NIST = {

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tomo_polysplat.physics.materials import Materials
+from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.quadrature import fit_quadrature, sampled_quadrature
 from tomo_polysplat.physics.spectrum import Spectrum
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tomo_polysplat.physics.materials import Materials
+from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.quadrature import sampled_quadrature
 from tomo_polysplat.physics.ray_estimates import estimate_scatter, matching_factor
 from tomo_polysplat.physics.scatter import add_scatter, without_scatter

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from tomo_polysplat.physics.materials import Materials, density, mass_attenuation
+from tomo_polysplat.physics.base_materials import Materials
+from tomo_polysplat.physics.materials import density, mass_attenuation
 from tomo_polysplat.physics.solids import number_of_solid
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.stand_in import best_stand_in

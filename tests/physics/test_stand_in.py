@@ -2,7 +2,7 @@
 
 import pytest
 
-from tomo_polysplat.physics.materials import Materials
+from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.stand_in import best_stand_in
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from tomo_polysplat.physics.materials import Materials, mass_attenuation
+from tomo_polysplat.physics.base_materials import Materials
+from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.physics.quadrature import fit_quadrature
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.transmission import polychromatic_projection, polychromatic_projection_numpy

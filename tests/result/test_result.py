@@ -6,7 +6,8 @@ import h5py
 import numpy as np
 import pytest
 
-from tomo_polysplat.physics.materials import Materials, mass_attenuation
+from tomo_polysplat.physics.base_materials import Materials
+from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import VolumeGrid

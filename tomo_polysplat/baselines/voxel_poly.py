@@ -22,7 +22,7 @@ from tomo_polysplat.fit.spectral_model import OPAQUE
 from tomo_polysplat.fit.step import held_out_mean
 from tomo_polysplat.fit.stopping import FitState, Watch, patience_of
 from tomo_polysplat.fit.texture import tv_corners
-from tomo_polysplat.physics.materials import Materials
+from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.quadrature import fit_quadrature
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.transmission import polychromatic_projection

@@ -11,8 +11,9 @@ from tomo_polysplat.bench.environment import environment
 from tomo_polysplat.bench.material_rods import RODS, rod_errors, rod_scan
 from tomo_polysplat.checks import require_choice, require_number
 from tomo_polysplat.files import replacing
+from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.material_range import LEAST_U
-from tomo_polysplat.physics.materials import MaterialLike, Materials
+from tomo_polysplat.physics.materials import MaterialLike
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.stand_in import StandIn, best_stand_in
 from tomo_polysplat.report.style import ACCENT, QUIET

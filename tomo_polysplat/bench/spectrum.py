@@ -14,8 +14,9 @@ from tomo_polysplat.bench.scenes import cached_scan, object_of, require_scene
 from tomo_polysplat.checks import require_choice
 from tomo_polysplat.files import replacing
 from tomo_polysplat.fit.short_fit import main_density
+from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.detector import Detector
-from tomo_polysplat.physics.materials import Materials, mass_attenuation
+from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.water import water_linearised
 from tomo_polysplat.reconstruction import reconstruct

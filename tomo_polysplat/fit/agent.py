@@ -20,8 +20,9 @@ from scipy import ndimage
 
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.short_fit import TOO_SHORT, short_fit
+from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.edges import edge_inside
-from tomo_polysplat.physics.materials import Materials, composition
+from tomo_polysplat.physics.materials import composition
 from tomo_polysplat.settings import Settings
 
 __all__ = ["levels_between", "settings_for_agent"]

@@ -11,14 +11,13 @@ import copy
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
 
 import torch
 
+from tomo_polysplat.fit.fitter import Fitter
 from tomo_polysplat.fit.loss import misfit
 from tomo_polysplat.fit.plan import Plan
-from tomo_polysplat.fit.rays import Rays, batches_around
-from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.rays import batches_around
 from tomo_polysplat.fit.stopping import Clock
 from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.model.gaussians import Gaussians
@@ -51,24 +50,6 @@ _SEEN = 0.05
 Made = tuple[float, float, int]
 
 
-class Branching(Protocol):
-    """A fitter that can go on in several ways; see `fit.optimise`."""
-
-    gaussians: Gaussians
-    rays: Rays
-    scene: FitScene
-    settings: Settings
-
-    def branch(self: _Branching, pixel_rays: int) -> _Branching:
-        """The same run from here on, with as many rays a pixel, on Gaussians of its own."""
-
-    def ahead(self, clock: Clock, passes: int) -> list[Made]:
-        """What so many more passes gave."""
-
-
-_Branching = TypeVar("_Branching", bound=Branching)
-
-
 @dataclass(frozen=True)
 class PixelQuestion:
     """The question of one run, whose plan gets the answer."""
@@ -84,7 +65,7 @@ class PixelQuestion:
         _not_asked(self.plan, "the time budget is kept for the fit")
         return False
 
-    def answered(self, fitter: _Branching, clock: Clock) -> tuple[_Branching, Made | None]:
+    def answered(self, fitter: Fitter, clock: Clock) -> tuple[Fitter, Made | None]:
         """The fitter to go on with, two passes later, and what the last of them gave, if time was left for any."""
         other, its_clock = fitter.branch(_RAYS), copy.copy(clock)
         made = [fitter.ahead(clock, _PASSES), other.ahead(its_clock, _PASSES)]
@@ -148,7 +129,7 @@ def _why_not(plan: Plan, gaussians: Gaussians, views: int) -> str:
 
 
 @torch.no_grad()
-def _misfits_at_metal(fitters: Sequence[Branching]) -> list[float]:
+def _misfits_at_metal(fitters: Sequence[Fitter]) -> list[float]:
     """Mean misfit of the fitted rays that meet the first one's metal, and of their neighbours."""
     one, totals, weighed = fitters[0], [0.0 for _ in fitters], 0.0
     for views, measured, weight, _ in batches_around(one.rays):

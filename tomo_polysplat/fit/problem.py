@@ -29,7 +29,7 @@ from tomo_polysplat.fit.spectral_model import OPAQUE, spectral_model
 from tomo_polysplat.kernels import select
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.model.seed import seed_gaussians
-from tomo_polysplat.physics.materials import Materials
+from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.scatter import without_scatter
 from tomo_polysplat.physics.solids import number_of_solid
 from tomo_polysplat.physics.spectrum import Spectrum

@@ -16,7 +16,8 @@ import numpy as np
 import torch
 
 from tomo_polysplat.model.seed_samples import box_mean
-from tomo_polysplat.physics.materials import MaterialLike, Materials, known_density
+from tomo_polysplat.physics.base_materials import Materials
+from tomo_polysplat.physics.materials import MaterialLike, known_density
 from tomo_polysplat.physics.solids import number_of_solid
 from tomo_polysplat.physics.water import transmitted_energy
 from tomo_polysplat.settings import Settings

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.material_range import LEAST_U, least_material_number
-from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.quadrature import Quadrature, fit_quadrature
 from tomo_polysplat.physics.scatter import add_scatter
 from tomo_polysplat.physics.water import transmitted_energy

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tomo_polysplat.physics.materials import Materials
+from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.spectrum import Spectrum
 
 __all__ = ["LEAST_U", "least_material_number"]

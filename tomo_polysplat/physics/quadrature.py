@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from tomo_polysplat.checks import require_number
+from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.beer_lambert import projection
-from tomo_polysplat.physics.materials import Materials
 from tomo_polysplat.physics.quadrature_fit import fit_nodes
 from tomo_polysplat.physics.ray_range import MaxPath, span_rays
 from tomo_polysplat.physics.spectrum import Spectrum

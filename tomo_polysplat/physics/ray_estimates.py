@@ -6,8 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.beer_lambert import projection, shares
-from tomo_polysplat.physics.materials import MaterialLike, Materials, mass_attenuation
+from tomo_polysplat.physics.materials import MaterialLike, mass_attenuation
 from tomo_polysplat.physics.spectrum import Spectrum
 
 __all__ = ["estimate_scatter", "matching_factor"]

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.beer_lambert import projection
 from tomo_polysplat.physics.material_range import LEAST_U
-from tomo_polysplat.physics.materials import MaterialLike, Materials, mass_attenuation
+from tomo_polysplat.physics.materials import MaterialLike, mass_attenuation
 from tomo_polysplat.physics.spectrum import Spectrum
 
 __all__ = ["StandIn", "best_stand_in"]

@@ -19,7 +19,7 @@ import numpy as np
 
 from tomo_polysplat.checks import fail, require_choice
 from tomo_polysplat.files import existing_parent, replacing, require_room, require_writable
-from tomo_polysplat.physics.materials import Materials
+from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.result.result import GAUSSIAN_PARTS, Result
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.scan.hdf5 import (

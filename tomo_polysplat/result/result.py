@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from tomo_polysplat.checks import fail, require_array, require_number, require_shape
-from tomo_polysplat.physics.materials import Materials, require_energies
+from tomo_polysplat.physics.base_materials import Materials
+from tomo_polysplat.physics.materials import require_energies
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.units import cm_per

@@ -26,7 +26,7 @@ from tomo_polysplat.fit.optimise import fit as optimise
 from tomo_polysplat.fit.plan import make_plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.model.gaussians import Gaussians
-from tomo_polysplat.physics.materials import Materials
+from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.quadrature import fit_quadrature
 from tomo_polysplat.physics.transmission import polychromatic_projection
 from tomo_polysplat.render.renderer import detector_views

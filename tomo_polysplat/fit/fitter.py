@@ -1,0 +1,147 @@
+"""One run of the optimiser: its steps, the order of the views, and the moves of Gaussians between passes."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from tomo_polysplat.fit.checkpoint import Snapshot
+from tomo_polysplat.fit.choose_step import make_step
+from tomo_polysplat.fit.metal_numbers import number_metals
+from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.soft_matter import flatten
+from tomo_polysplat.fit.stopping import Clock
+from tomo_polysplat.kernels.spatial_order import spatial_order
+from tomo_polysplat.model.density_control import relocate
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.settings import Settings
+
+__all__ = ["Fitter", "views_of_a_pass"]
+
+# A pass over fewer views than this makes the steps of one over as many.
+_FEWEST_VIEWS = 10
+
+
+class Fitter:
+    """One run: its steps, the order of the views, and the moves of Gaussians between passes."""
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        spacing: float,
+        rays: Rays,
+        scene: FitScene,
+        settings: Settings,
+        batch: int,
+        rng: np.random.Generator,
+    ) -> None:
+        self.gaussians, self.rays, self.scene, self.settings, self.rng = gaussians, rays, scene, settings, rng
+        self.step = make_step(gaussians, spacing, rays, scene, settings, batch=batch)
+        self.spacing, self.batch, self.order = spacing, batch, np.empty(0, int)
+        self.relocated = 0
+        self.relocation_due = False
+
+    def passes(self, clock: Clock) -> Iterator[tuple[float, float, int]]:
+        """Step until the clock runs out; what each pass over the views gave, the last perhaps a part of one.
+
+        That is the mean misfit of the fitted rays and of those held out, and the pairs skipped.
+        """
+        steps, made = max(1, round(views_of_a_pass(self.rays) / self.batch)), 0
+        while (share := clock.share()) < 1:
+            if self.relocation_due:
+                self._relocate()
+            views = self._next_views(self.batch)
+            self.step(views, share)
+            clock.done += 1
+            made += 1
+            if made == steps:
+                self.relocation_due = share < self.settings.relocate_until
+                yield self._end_pass(share)
+                made = 0
+        if made:
+            yield self._end_pass(1.0)
+
+    def ahead(self, clock: Clock, passes: int) -> list[tuple[float, float, int]]:
+        """What so many more passes gave, as `passes` tells it."""
+        return list(itertools.islice(self.passes(clock), passes))
+
+    def branch(self, pixel_rays: int) -> Fitter:
+        """The same run from here on, with so many rays a pixel and axis, on Gaussians of its own."""
+        scene, rng = replace(self.scene, pixel_rays=pixel_rays), copy.deepcopy(self.rng)
+        other = Fitter(self.gaussians.copy(), self.spacing, self.rays, scene, self.settings, self.batch, rng)
+        other.restore(self.snapshot(None, {}))
+        return other
+
+    @torch.no_grad()
+    def _end_pass(self, share: float) -> tuple[float, float, int]:
+        # Once a pass does: in its few steps a Gaussian does not get far beyond the volume.
+        self.scene.keep_within(self.gaussians)
+        # What is not finite any more is nowhere to look at, and `Watch` ends the run.
+        if self.gaussians.finite():
+            flatten(self.gaussians, self.scene, self.settings, share)
+            number_metals(self.gaussians, self.scene, self.settings, share)
+        return self.step.read()
+
+    def snapshot(self, best: Gaussians | None, numbers: dict[str, Any]) -> Snapshot:
+        """Where the fit stands between two passes; ``numbers`` of the run are kept with it."""
+        own = {
+            "steps_made": self.step.done,
+            "largest": self.step.largest,
+            "relocated": self.relocated,
+            "relocation_due": self.relocation_due,
+            "random": self.rng.bit_generator.state,
+        }
+        first, second = ({k: pair[j] for k, pair in self.step.moments.items()} for j in (0, 1))
+        return Snapshot(self.gaussians, best, first, second, self.step.pull, self.order, own | numbers)
+
+    @torch.no_grad()
+    def restore(self, kept: Snapshot) -> None:
+        """Go on from a snapshot, with whose Gaussians this was made."""
+        for name, (first, second) in self.step.moments.items():
+            first.copy_(kept.first[name])
+            second.copy_(kept.second[name])
+        self.step.pull.copy_(kept.pull)
+        self.order = kept.order
+        self.step.done = int(kept.numbers["steps_made"])
+        self.step.largest = kept.numbers["largest"]
+        self.relocated = int(kept.numbers["relocated"])
+        self.relocation_due = bool(kept.numbers["relocation_due"])
+        self.rng.bit_generator.state = kept.numbers["random"]
+
+    @torch.no_grad()
+    def _relocate(self) -> None:
+        """Put Gaussians that hold nothing where they are wanted, with a fresh memory of the optimiser."""
+        self.relocation_due = False
+        changed = relocate(self.gaussians, self.step.pull, self.settings.relocated)
+        self.step.pull.zero_()
+        if not len(changed):
+            return
+        self.relocated += len(changed) // 2
+        own = self.gaussians.each()
+        memory = [moment for name in own for moment in self.step.moments.get(name, ())]
+        for moment in memory:
+            moment[changed] = 0.0
+        # What was moved stands where the dead were in the list: groups of it would reach across the volume, which
+        # makes the kernels' images several times slower.
+        order = spatial_order(self.gaussians.position)
+        for tensor in (*own.values(), *memory):
+            tensor.copy_(tensor[order])
+
+    def _next_views(self, batch: int) -> np.ndarray:
+        """The next views of an order that uses each once before any again."""
+        while len(self.order) < batch:
+            self.order = np.concatenate([self.order, self.rng.permutation(len(self.rays.views))])
+        chosen, self.order = self.order[:batch], self.order[batch:]
+        return chosen
+
+
+def views_of_a_pass(rays: Rays) -> int:
+    """As many as its steps have views in all."""
+    return max(len(rays.views), _FEWEST_VIEWS)
