@@ -16,7 +16,7 @@ import torch
 
 from tomo_polysplat.fit.fitter import Fitter
 from tomo_polysplat.fit.loss import misfit
-from tomo_polysplat.fit.plan import Plan
+from tomo_polysplat.fit.plan import AVERAGED_RAYS, Plan
 from tomo_polysplat.fit.rays import batches_around
 from tomo_polysplat.fit.stopping import Clock
 from tomo_polysplat.kernels.views import DetectorViews
@@ -25,7 +25,7 @@ from tomo_polysplat.render.renderer import project_gaussians
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.initial import FEW_VIEWS
 
-__all__ = ["WHILE_ASKED", "PixelQuestion", "pixel_question"]
+__all__ = ["PixelQuestion", "pixel_question"]
 
 logger = logging.getLogger(__name__)
 
@@ -33,10 +33,6 @@ logger = logging.getLogger(__name__)
 _FROM, _PASSES = 0.4, 2
 # A run of fewer passes is in a hurry.
 _FEWEST_PASSES = 10.0
-# Rays a pixel and axis: with three pins of 36^3 are no better than with two (45.4 and 48.4 dB everywhere).
-_RAYS = 2
-# Runs, and rays a pixel, that there are while it is asked.
-WHILE_ASKED = (2, 1 + _RAYS**2)
 # So many times as long a step of averaged light may take, with two rays a pixel and axis.
 _SLOWER = 4.0
 # Light is averaged where that leaves as much of the misfit of the rays at metal: a fit makes up for most of what it
@@ -67,7 +63,7 @@ class PixelQuestion:
 
     def answered(self, fitter: Fitter, clock: Clock) -> tuple[Fitter, Made | None]:
         """The fitter to go on with, two passes later, and what the last of them gave, if time was left for any."""
-        other, its_clock = fitter.branch(_RAYS), copy.copy(clock)
+        other, its_clock = fitter.branch(AVERAGED_RAYS), copy.copy(clock)
         made = [fitter.ahead(clock, _PASSES), other.ahead(its_clock, _PASSES)]
         if its_clock.late:
             _not_asked(self.plan, "the time budget was used before the rays could tell")
@@ -75,7 +71,7 @@ class PixelQuestion:
         left = _misfits_at_metal([fitter, other])
         share = left[1] / left[0] if left[0] else float("inf")
         averaged = _AS_WELL[0] <= share <= _AS_WELL[1]
-        self.plan.pixel_rays = _RAYS if averaged else 1
+        self.plan.pixel_rays = AVERAGED_RAYS if averaged else 1
         kind = "the light of each pixel is averaged" if averaged else "rays are infinitely thin"
         words = f"averaged light leaves {share:.2f} of the misfit of the rays at metal, and is taken from"
         least, most = _AS_WELL
@@ -142,7 +138,7 @@ def _misfits_at_metal(fitters: Sequence[Fitter]) -> list[float]:
     return [total / weighed if weighed else 0.0 for total in totals]
 
 
-def _at_metal(fitter: Branching, views: DetectorViews) -> torch.Tensor:
+def _at_metal(fitter: Fitter, views: DetectorViews) -> torch.Tensor:
     """(views, rows, columns) whether a ray meets metal, or one beside it does."""
     gaussians, scene = fitter.gaussians, fitter.scene
     metal = torch.where(gaussians.group > 0, gaussians.attenuation, 0.0)

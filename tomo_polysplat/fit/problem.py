@@ -19,8 +19,7 @@ from tomo_polysplat.checks import require_choice
 from tomo_polysplat.fit.inside import matter_is_inside
 from tomo_polysplat.fit.memory import projections_stay, require_room
 from tomo_polysplat.fit.noise import photons_per_ray
-from tomo_polysplat.fit.pixel_question import WHILE_ASKED
-from tomo_polysplat.fit.plan import Plan
+from tomo_polysplat.fit.plan import AVERAGED_RAYS, Plan
 from tomo_polysplat.fit.plan_costs import alternatives, work
 from tomo_polysplat.fit.plan_seeds import finest_spacing
 from tomo_polysplat.fit.rays import Rays
@@ -265,7 +264,8 @@ class Problem:
         plan.reasons["work"] = work(plan, self, settings, len(gaussians))
         plan.reasons["alternatives"] = alternatives(plan, self, settings, len(gaussians))
         values = self.measured(device)
-        runs, rays = (1, plan.pixel_rays**2) if plan.pixel_rays else WHILE_ASKED
+        # While it is asked whether pixels average light there are two runs at once, of thin rays and of averaged ones.
+        runs, rays = (1, plan.pixel_rays**2) if plan.pixel_rays else (2, 1 + AVERAGED_RAYS**2)
         plan.reasons["memory"] = require_room(
             device,
             gaussians=runs * len(gaussians),
