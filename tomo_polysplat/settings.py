@@ -101,7 +101,7 @@ class Settings:
     """Weight of 1 - SSIM of the projections (the paper uses 0.25)."""
     pixel_rays: int = 0
     """Rays a pixel and axis over which the light is averaged; 1: infinitely thin ones; 0 leaves it to the plan, which
-    asks the rays of metal on a CPU."""
+    asks the rays at metal."""
     tv_weight: float = 0.04
     """Weight of the total variation per voxel, in soft references."""
     tv_factor: float = 0.0
