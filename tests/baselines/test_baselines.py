@@ -115,13 +115,15 @@ def test_the_metal_trace_is_where_the_metal_casts_its_shadow(scan, data):
     assert metal.rays.mean() < 0.1
 
 
-def test_no_metal_leaves_water_corrected_fdk():
+def test_no_metal_leaves_water_corrected_fdk(caplog):
     scan = simulate_scan("pins", 32, 60, metal=False)
     data = load(scan)
     expected = water_bhc(*data, scan.spectrum)
     assert not find_metal(*data).mask.any()
     for method in (limar, nmar):
+        caplog.clear()
         np.testing.assert_allclose(method(*data, scan.spectrum), expected, atol=1e-6)
+        assert "No metal" in caplog.text
 
 
 def test_sirt_explains_the_projections(data):

@@ -10,20 +10,25 @@ import tomo_polysplat as tps
 from tomo_polysplat.fit.unit_check import doubt_lengths, tell_impossible
 
 
-def curves(density, voxels):
-    """Iron beside which there is some aluminium, so many voxels of it."""
+def curves(density, voxels, steel=0):
+    """Water, and in so many voxels metal of that density; in others steel."""
     volume = np.zeros((3, 5, 7, 9), np.float32)
     volume[0] = 1.0
     shares = np.array([[0.0], [0.25], [0.75]], np.float32)
     volume.reshape(3, -1)[:, 40 : 40 + voxels] = density * shares
+    volume.reshape(3, -1)[:, 120 : 120 + steel] = 7.9 * shares
     return volume
 
 
-@pytest.mark.parametrize("density, voxels, told", [(22.3, 60, False), (24.0, 60, True), (90.0, 2, False)])
-def test_only_a_piece_denser_than_osmium_is_impossible(density, voxels, told, caplog):
+@pytest.mark.parametrize(
+    "density, voxels, steel, told",
+    [(22.3, 60, 0, False), (24.0, 60, 0, True), (90.0, 2, 0, False), (28.0, 10, 150, False)],
+)
+def test_only_a_piece_denser_than_osmium_is_impossible(density, voxels, steel, told, caplog):
+    """Some voxels of steel that overshoot are none."""
     reasons = {}
     with caplog.at_level(logging.WARNING):
-        tell_impossible(curves(density, voxels), reasons)
+        tell_impossible(curves(density, voxels, steel), reasons)
     assert ("lengths" in reasons) == told == ("unit of length or the size of a pixel" in caplog.text)
 
 

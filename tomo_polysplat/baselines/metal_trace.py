@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,8 @@ from tomo_polysplat.start.levels import mass_level
 from tomo_polysplat.start.voxel_projector import projector_pair
 
 __all__ = ["MetalTrace", "find_metal", "forward_project", "replace_trace"]
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,14 @@ def find_metal(
     """
     start, _ = initial_volume(projections, geometry, grid, device=device)
     soft = mass_level(start)
-    mask = start > (Settings().metal_level if level is None else level) * soft
+    times = Settings().metal_level if level is None else level
+    mask = start > times * soft
+    if not mask.any():
+        logger.warning(
+            "No metal: the densest voxel has %.2g times the main matter, the threshold is %g. No ray is replaced.",
+            float(start.max()) / soft if soft else 0.0,
+            times,
+        )
     path = forward_project(mask.astype(np.float32), geometry, grid, device=device)
     # Half a voxel: less is the blur of the threshold's edge, and a wider trace loses more than it heals.
     return MetalTrace(start, soft, mask, path > 0.5 * float(grid.voxel_size.min()))

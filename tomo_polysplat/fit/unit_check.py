@@ -13,17 +13,20 @@ logger = logging.getLogger(__name__)
 
 # Osmium's, in g/cm3, and the voxels that a piece has which is more than one that is too high by chance.
 _DENSEST_SOLID, _FEWEST = 22.6, 8
+# Single voxels of steel overshoot: what is impossible must be this share of all that is metal, denser than titanium.
+_OF_METAL, _METAL = 0.2, 5.0
+_WRONG_LENGTHS = "The unit of length or the size of a pixel looks wrong"
 
 
-def doubt_lengths(reasons: dict[str, Any], words: str) -> None:
+def doubt_lengths(reasons: dict[str, Any], words: str, what: str = _WRONG_LENGTHS) -> None:
     """Say, once a reconstruction, in the log and as ``reasons["lengths"]`` why lengths look wrong."""
     if "lengths" not in reasons:
         reasons["lengths"] = f"doubtful: {words}"
-        logger.warning("The unit of length or the size of a pixel looks wrong: %s.", words)
+        logger.warning("%s: %s.", what, words)
 
 
 def tell_impossible(curves: np.ndarray, reasons: dict[str, Any]) -> None:
-    """Doubt the lengths of a volume with a piece in it that is denser than any solid.
+    """Doubt the lengths, or the materials, of a volume whose metal is denser than any solid.
 
     Parameters
     ----------
@@ -34,11 +37,15 @@ def tell_impossible(curves: np.ndarray, reasons: dict[str, Any]) -> None:
     """
     if sum(float(curve.max(initial=0.0)) for curve in curves) <= _DENSEST_SOLID:
         return
-    voxels, densest = 0, 0.0
+    voxels, metal, densest = 0, 0, 0.0
     for z in range(curves.shape[1]):  # The sum of whole curves would take another volume of memory.
         density = curves[:, z].sum(axis=0)
         voxels += int(np.count_nonzero(density > _DENSEST_SOLID))
+        metal += int(np.count_nonzero(density > _METAL))
         densest = max(densest, float(density.max(initial=0.0)))
-    if voxels >= _FEWEST:
+    if voxels >= max(_FEWEST, _OF_METAL * metal):
         words = f"{voxels} voxels have more than {_DENSEST_SOLID:g} g/cm3, up to {densest:.3g}, which no solid has"
-        doubt_lengths(reasons, f"{words}; else name what is heavier than the densest of materials=")
+        remedy = (
+            "name in materials= what is heavier than their densest or has an absorption edge in the spectrum"
+        )
+        doubt_lengths(reasons, f"{words}; {remedy}", f"{_WRONG_LENGTHS}, or what the metal is")
