@@ -25,7 +25,7 @@ def test_gaussians_that_were_moved_stand_beside_their_new_neighbours():
 def test_any_order_gives_the_same_volume(monkeypatch):
     ours = reconstruct(fan(), settings=MOVING)
     generator = torch.Generator().manual_seed(3)
-    shuffled = "tomo_polysplat.fit.optimise.spatial_order"
+    shuffled = "tomo_polysplat.fit.fitter.spatial_order"
     monkeypatch.setattr(shuffled, lambda position: torch.randperm(len(position), generator=generator))
     other = reconstruct(fan(), settings=MOVING)
     assert not np.array_equal(other.gaussians["position"], ours.gaussians["position"])
