@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from tomo_polysplat.bench.methods import TURNS, Method, Options, Outcome, Task
+from tomo_polysplat.bench.methods import WHOLE, Method, Options, Outcome, Task
 from tomo_polysplat.physics.materials import MaterialLike
 from tomo_polysplat.reconstruction import reconstruct
 
@@ -46,7 +46,7 @@ class Variant:
 
     def method(self) -> Method:
         """It as a method of a benchmark."""
-        return Method(self.label, self._run, improves=True, turns=TURNS)
+        return Method(self.label, self._run, improves=True, whole=WHOLE)
 
     def _run(self, task: Task, options: Options) -> Outcome:
         scan, settings = task.scan, {**options.settings, **self.settings}

@@ -17,14 +17,14 @@ from tomo_polysplat.baselines.voxel_poly import voxel_poly
 from tomo_polysplat.baselines.water_bhc import water_bhc, water_corrected
 from tomo_polysplat.bench import peers
 from tomo_polysplat.fit.optimise import FitState
-from tomo_polysplat.fit.plan import AVERAGED_RAYS
+from tomo_polysplat.fit.pixel_question import FEWEST_PASSES
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.reconstruction import reconstruct
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, from_astra, projections_from_astra
 from tomo_polysplat.scan.scan import Scan
 
-__all__ = ["METHODS", "TURNS", "Method", "Options", "Task"]
+__all__ = ["METHODS", "WHOLE", "Method", "Options", "Task"]
 
 
 @dataclass(frozen=True)
@@ -83,8 +83,8 @@ class Options:
 
 Outcome = tuple[np.ndarray, dict[str, Any]]
 
-# Runs that ask whether pixels average light go on that way for a while; see `fit.pixel_question`.
-TURNS = {"pixel_rays": AVERAGED_RAYS}
+# In runs of fewer passes it is not asked whether pixels average light; see `fit.pixel_question`.
+WHOLE = {"passes": FEWEST_PASSES}
 
 
 @dataclass(frozen=True)
@@ -99,14 +99,15 @@ class Method:
         From a Task and Options to the volume and what there is to say about the run.
     improves : bool
         Whether it takes a time budget and callbacks.
-    turns : dict
-        Settings that a run may take up on its way, whose kernels are to be compiled before it is timed.
+    whole : dict
+        Settings with which the few views of a warm-up are enough for all that a run does, so that on a GPU nothing is
+        left to compile when it is timed.
     """
 
     label: str
     run: Callable[[Task, Options], Outcome]
     improves: bool = False
-    turns: Mapping[str, Any] = field(default_factory=dict)
+    whole: Mapping[str, Any] = field(default_factory=dict)
 
 
 def _direct(function: Callable[..., np.ndarray], *, spectrum: bool = False, **fixed: Any) -> Any:
@@ -179,5 +180,5 @@ METHODS = {
     "voxel-poly": Method("polychromatic voxels", _voxel_poly, improves=True),
     "mono": Method("Gaussians, one energy", _mono, improves=True),
     "mono-water": Method("Gaussians, one energy, after water correction", _mono_water, improves=True),
-    "polysplat": Method("tomo-polysplat", _polysplat, improves=True, turns=TURNS),
+    "polysplat": Method("tomo-polysplat", _polysplat, improves=True, whole=WHOLE),
 }

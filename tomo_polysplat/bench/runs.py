@@ -42,8 +42,8 @@ def warm_up(
         progress(f"{task.scan.name}: warming up {name}")
         # A first run may take its time, compilers and all: no budget would let it reach its end.
         cold = measure(method, few, Options(None, options.settings))
-        if method.turns:
-            measure(method, few, Options(None, {**options.settings, **method.turns}))
+        if method.whole and task.device.startswith("cuda"):
+            measure(method, few, Options(None, {**options.settings, **method.whole}))
         warm = measure(method, few, options) if cold.seconds is not None else cold
         entries.append({"method": name, "cold_seconds": cold.seconds, "warm_seconds": warm.seconds})
     return entries

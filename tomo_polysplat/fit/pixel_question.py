@@ -25,14 +25,14 @@ from tomo_polysplat.render.renderer import project_gaussians
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.initial import FEW_VIEWS
 
-__all__ = ["PixelQuestion", "pixel_question"]
+__all__ = ["FEWEST_PASSES", "PixelQuestion", "pixel_question"]
 
 logger = logging.getLogger(__name__)
 
 # Share of the run after which it is asked, and the passes of each way: the first is spent on getting used to it.
 _FROM, _PASSES = 0.4, 2
 # A run of fewer passes is in a hurry.
-_FEWEST_PASSES = 10.0
+FEWEST_PASSES = 10.0
 # So many times as long a step of averaged light may take, with two rays a pixel and axis.
 _SLOWER = 4.0
 # Light is averaged where that leaves as much of the misfit of the rays at metal: a fit makes up for most of what it
@@ -117,7 +117,7 @@ def _why_not(plan: Plan, gaussians: Gaussians, views: int) -> str:
     """Why it is not asked, if so."""
     if not bool((gaussians.group > 0).any()):
         return "without metal it matters little"
-    if plan.passes < _FEWEST_PASSES:
+    if plan.passes < FEWEST_PASSES:
         return "in so few passes two more would take too long a part"
     if views < FEW_VIEWS:
         return f"fewer than {FEW_VIEWS} views do not tell"
