@@ -1,6 +1,7 @@
 """The benchmark of reconstructions: shared scans, clocks that stop, failures that show, records that can be read."""
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,10 +14,11 @@ from tomo_polysplat.bench.measure import error_history, measure
 from tomo_polysplat.bench.methods import METHODS, Method, Options, Task
 from tomo_polysplat.bench.recon import ReconBench, run_recon_bench
 from tomo_polysplat.bench.recon_report import as_text, write_figures
-from tomo_polysplat.bench.runs import timed_runs, with_errors
+from tomo_polysplat.bench.runs import timed_runs, warm_up, with_errors
 from tomo_polysplat.bench.scenes import cache_folder, cached_scan, fewer_views
 from tomo_polysplat.cli import main
 from tomo_polysplat.fit.optimise import FitState
+from tomo_polysplat.fit.pixel_question import FEWEST_PASSES
 from tomo_polysplat.result.metrics import compare
 
 QUICK = {"passes": 1.0}
@@ -58,6 +60,23 @@ def test_the_cache_is_private(tmp_path, monkeypatch):
     made = cache_folder()
     assert made == cache_folder() and made.parent == tmp_path
     assert made.stat().st_mode & 0o077 == 0
+
+
+@pytest.mark.parametrize(("device", "asked"), [("cuda:0", True), ("cpu", False)])
+def test_a_warm_up_on_a_gpu_does_all_that_a_whole_run_does(task, device, asked, monkeypatch):
+    """Ours has to be long enough for its pixels to be asked about; a CPU compiles nothing for that."""
+    made = []
+
+    def note(method, task, options):
+        made.append((method.label, options.settings["passes"]))
+        return SimpleNamespace(seconds=1.0)
+
+    monkeypatch.setattr(runs_module, "measure", note)
+    chosen = {name: METHODS[name] for name in ("fdk", "polysplat")}
+    warm_up(chosen, replace(task, device=device), {}, lambda words: None)
+    ours = METHODS["polysplat"].label
+    assert made.count((METHODS["fdk"].label, 1.0)) == made.count((ours, 1.0)) == 2
+    assert len(made) == 4 + asked and ((ours, FEWEST_PASSES) in made) == asked
 
 
 def test_fewer_views_are_views_of_the_same_scan(task):

@@ -82,9 +82,11 @@ def the_slope_by_the_blur_behind_much_matter(device):
 @case
 def what_is_not_a_number_shows_in_the_misfit(device):
     """Hidden, it would spread through the volume and never end the run."""
-    for blurring in (True, False):
-        problem = fit_problem("cone", True, device, "triton", blurring=blurring, held_out=0.0)
+    for blurring, rays in ((True, 1), (False, 1), (True, 2)):
+        problem = fit_problem(
+            "cone", True, device, "triton", blurring=blurring, pixel_rays=rays, held_out=0.0
+        )
         step = _fused(*problem, BATCH)
         problem[0].attenuation[3] = float("nan")
         step(np.array([0, 3]), 0.0)
-        assert np.isnan(step.read()[0]), blurring
+        assert np.isnan(step.read()[0]), (blurring, rays)

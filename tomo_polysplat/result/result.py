@@ -204,39 +204,14 @@ class Result:
     def save_tiff(self, folder: str | os.PathLike, *, overwrite: bool = False) -> None:
         """Write :attr:`volume` as 32-bit TIFF slices ``slice_0000.tif``, ... to a folder, made if need be.
 
-        Parameters
-        ----------
-        folder : str or path
-        overwrite : bool
-            Whether slices that are there are replaced.
-
-        Raises
-        ------
-        FileExistsError
-            If there are slices and `overwrite` is false.
-        OSError
-            If the disk has too little free space.
+        Slices that are there stand for the file of :meth:`save`, whose options and errors these are.
         """
         from tomo_polysplat.result.files import save_tiff
 
         save_tiff(self, folder, overwrite=overwrite)
 
     def save_npy(self, path: str | os.PathLike, *, overwrite: bool = False) -> None:
-        """Write :attr:`volume` as a NumPy array file.
-
-        Parameters
-        ----------
-        path : str or path
-        overwrite : bool
-            Whether an existing file is replaced.
-
-        Raises
-        ------
-        FileExistsError
-            If the file exists and `overwrite` is false.
-        OSError
-            If the disk has too little free space.
-        """
+        """Write :attr:`volume` as a NumPy array file; parameters and errors are those of :meth:`save`."""
         from tomo_polysplat.result.files import save_npy
 
         save_npy(self, path, overwrite=overwrite)
