@@ -6,26 +6,22 @@ import logging
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
-import numpy as np
 import torch
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.fit.beginning import Begun, Wishes, begin, physics
+from tomo_polysplat.fit.beginning import Begun, Wishes
 from tomo_polysplat.fit.calibration import Calibration
 from tomo_polysplat.fit.checkpoint import Checkpoint
-from tomo_polysplat.fit.optimise import FitOutcome, FitState, fit
-from tomo_polysplat.fit.pixel_question import pixel_question
-from tomo_polysplat.fit.plan import Plan
+from tomo_polysplat.fit.optimise import FitOutcome, FitState
 from tomo_polysplat.fit.problem import Problem
-from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.soft_matter import describe_soft
+from tomo_polysplat.fit.solver import Solver
 from tomo_polysplat.fit.unit_check import tell_impossible
 from tomo_polysplat.interrupts import postponed_interrupts
 from tomo_polysplat.kernels.device import one_torch_thread, usual_modes
-from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.parallel import kept_threads
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.detector_blur import describe_blur
@@ -58,7 +54,7 @@ def reconstruct(
     device: str = "auto",
     valid: Any = None,
     water_correction: Sequence[float] | None = None,
-    calibrate: bool | str | Sequence[str] = False,
+    calibrate: bool | str | Sequence[str] | None = None,
     soft_density: float | None = None,
     callbacks: Sequence[Callable[[FitState], Any]] = (),
     progress: bool | Callable[[float, str], Any] | None = None,
@@ -97,11 +93,12 @@ def reconstruct(
         Coefficients c_0 = 0, c_1, ... of the polynomial ``sum_k c_k P^k`` that the scanner has put its
         -log(I/I0) through; it is undone first, so that every ray keeps the noise of its counts. With a
         spectrum only.
-    calibrate : bool or names among "scatter", "kvp", "filter"
-        Fit these by a few short fits first, and use what fits the held-out rays better: a constant scattered
-        signal, and the tube's voltage or its filters, which need ``soft_density``. True calibrates scatter, and
-        the voltage where the density is given. ``result.plan["calibration"]`` tells what came of it; what a time
-        budget leaves no room for is left as it is.
+    calibrate : bool or names among "scatter", "kvp", "filter", optional
+        Fit these by a few short fits first, and use what fits the held-out rays better: a scattered signal, and the
+        tube's voltage or its filters, which need ``soft_density``. True calibrates scatter, and the voltage where
+        the density is given; False nothing; None scatter, where the rays show it in the middle of the fit, which then
+        begins anew. ``result.plan["calibration"]`` and ``["scatter"]`` tell what came of it; what a time budget leaves
+        no room for is left as it is.
     soft_density : float, optional
         Known density in g/cm3, at most 25, of what most of the object is made of, the first of ``materials``.
     callbacks : sequence of callables
@@ -145,14 +142,13 @@ def reconstruct(
     del values
     wanted = Calibration.of(calibrate, soft_density, problem.spectrum)
     flipped = is_planar_geometry(proj_geom)
-    options = wishes.options() | {"calibration": None if wanted is None else asdict(wanted)}
+    options = wishes.options() | {"calibration": calibrate is None if wanted is None else asdict(wanted)}
     saved = _checkpoint(checkpoint, resume, problem, options)
     started -= 0.0 if saved is None else saved.seconds
     with one_torch_thread(wishes.device), kept_threads(), progress_reports(progress) as report:
-        problem, known = physics(problem, wanted, wishes, saved, report)
-        begun = begin(problem, wishes, saved, report)
-        begun.plan.reasons |= known | _undone(water_correction)
-        outcome = _fitted(begun, problem, wishes, saved, started, flipped, report)
+        solver = Solver(wishes, saved, started, flipped, report)
+        problem, begun, outcome = solver.solve(problem, wanted, ask_scatter=calibrate is None)
+        begun.plan.reasons |= _undone(water_correction)
         with postponed_interrupts("the volume") as interruption:
             report(1.0, "volume")
             result = _result(
@@ -187,55 +183,6 @@ def _undone(water_correction: Sequence[float] | None) -> dict[str, str]:
     if water_correction is None:
         return {}
     return {"water_correction": f"undone: {describe_polynomial(water_correction)}"}
-
-
-def _fitted(
-    begun: Begun,
-    problem: Problem,
-    wishes: Wishes,
-    saved: Checkpoint | None,
-    started: float,
-    flipped: bool,
-    report: Callable[[float, str], Any],
-) -> FitOutcome:
-    """The fit; ``started`` is when the reconstruction began."""
-    plan, scene, budget = begun.plan, begun.scene, wishes.time_budget
-    deadline = None
-    if budget is not None:
-        # A volume that takes most of the budget still needs a fit: then the end is late.
-        left = max(started + budget - time.perf_counter(), 0.0)
-        deadline = started + budget - min(scene.seconds_of_basis(begun.gaussians), 0.5 * left)
-    settings = plan.adapted(wishes.settings)
-    question = pixel_question(plan, begun.gaussians, settings, problem.geometry.views)
-    return fit(
-        begun.gaussians,
-        plan.spacing * problem.voxel,
-        begun.rays,
-        scene,
-        replace(settings, passes=plan.passes),
-        views_per_step=plan.views_per_step,
-        rng=np.random.default_rng(wishes.seed),
-        started=started,
-        deadline=deadline,
-        volume=_volume_of(scene, plan, problem, flipped),
-        callbacks=[lambda state: report(state.share, state.describe()), *wishes.callbacks],
-        checkpoint=saved,
-        question=question,
-    )
-
-
-def _volume_of(
-    scene: FitScene, plan: Plan, problem: Problem, flipped: bool
-) -> Callable[[Gaussians], np.ndarray]:
-    """A function from Gaussians to the volume in 1/unit, for callbacks."""
-    factor = plan.reference * problem.soft_attenuation()
-
-    def volume(gaussians: Gaussians) -> np.ndarray:
-        with torch.no_grad():
-            whole = to_host(scene.volume(gaussians) * factor)
-        return np.ascontiguousarray(whole[0, ::-1]) if flipped else whole
-
-    return volume
 
 
 def _result(outcome: FitOutcome, begun: Begun, problem: Problem, grid: VolumeGrid, **about: Any) -> Result:

@@ -13,7 +13,8 @@ from tomo_polysplat.fit.calibration import Calibration, _judge, calibrated, with
 from tomo_polysplat.fit.first_volume import first_volume
 from tomo_polysplat.fit.plan import make_plan
 from tomo_polysplat.fit.problem import Problem
-from tomo_polysplat.fit.short_fit import ShortFit, main_density
+from tomo_polysplat.fit.short_fit import RaySample, ShortFit, main_density
+from tomo_polysplat.physics.scatter import Scatter
 from tomo_polysplat.settings import make_settings
 
 # Enough steps for the density of the main matter to settle.
@@ -24,6 +25,20 @@ SPECTRUM = tps.Spectrum.from_tube(90, filters={"Al": 0.1})
 @cache
 def fan(scatter, views=40):
     return tps.simulate_scan("pins", size=48, views=views, geometry="fan", scatter=scatter, metal=False)
+
+
+def of_fit(fitted, error, *, darkest=None, density=1.0, cut=False):
+    """A short fit that left such errors, with one ray."""
+    rays = RaySample(np.zeros((3, 1)), *np.zeros((4, 1)))
+    return ShortFit(
+        fitted,
+        error,
+        error if darkest is None else darkest,
+        density,
+        rays,
+        fitted.get("scatter", 0.0),
+        cut=cut,
+    )
 
 
 def problem_of(scan, spectrum):
@@ -114,11 +129,11 @@ def test_a_stage_is_taken_where_its_short_fits_had_their_time(seconds, cut, made
         trials.append(fitted)
         number = len(trials) - 1
         time.sleep(seconds[number])
-        return ShortFit(fitted, 0.5**number, 1.0, np.zeros((3, 0)), np.zeros(0), np.zeros(0), cut=cut[number])
+        return of_fit(fitted, 0.5**number, cut=cut[number])
 
     monkeypatch.setattr("tomo_polysplat.fit.calibration.short_fit", fit)
     monkeypatch.setattr("tomo_polysplat.fit.calibration.first_volume", lambda *scan: (None, ""))
-    monkeypatch.setattr("tomo_polysplat.fit.calibration.estimate_scatter", lambda *rays: 0.05)
+    monkeypatch.setattr("tomo_polysplat.fit.calibration.estimate_scatter", lambda *rays: Scatter(0.05))
     problem, wanted = problem_of(fan(0.0), SPECTRUM), Calibration(("scatter",), None)
     found = calibrated(problem, wanted, make_settings(), torch.device("cpu"), 0, 0.6)
     taken = made == 2 and not any(cut)
@@ -156,7 +171,7 @@ def test_a_density_is_not_followed_against_the_rays_or_past_the_end(factor, held
     problem = problem_of(fan(0.0), tps.Spectrum.from_tube(kvp, filters={"Al": 0.05}))
 
     def fit(fitted, error):
-        return ShortFit(fitted, error, 1.0, np.zeros((3, 0)), np.zeros(0), np.zeros(0))
+        return of_fit(fitted, error)
 
     assert _judge("kvp", fit({}, 1.0), [fit({"kvp": factor}, held_out)], problem)[0] == taken
 
@@ -164,8 +179,8 @@ def test_a_density_is_not_followed_against_the_rays_or_past_the_end(factor, held
 def test_other_physics_are_those_of_the_same_measurements():
     problem = problem_of(fan(0.0), SPECTRUM)
     other, device = with_fitted(problem, {"scatter": 0.01, "filter": 2.0}), torch.device("cpu")
-    assert other.scatter == 0.01 and other.spectrum.effective_energy > SPECTRUM.effective_energy
-    assert problem.scatter == 0 and problem.spectrum is SPECTRUM
+    assert other.scatter == Scatter(0.01) and other.spectrum.effective_energy > SPECTRUM.effective_energy
+    assert problem.scatter == Scatter() and problem.spectrum is SPECTRUM
     # On a GPU they would be copied there once for every short fit.
     assert other.measured(device) is problem.measured(device)
 
@@ -207,7 +222,7 @@ def test_walls_do_not_tell_their_density():
     density[::3] = 0.9  # one voxel thick, and lighter than they are
     assert main_density(density) == 0.0
     problem = problem_of(fan(0.0), SPECTRUM)
-    before = ShortFit({}, 1.0, main_density(density), np.zeros((3, 0)), np.zeros(0), np.zeros(0))
+    before = of_fit({}, 1.0, density=main_density(density))
     taken, why = _judge("kvp", before, [], problem)
     assert not taken and "density" in why
     assert _judge("scatter", before, [], problem) == (False, "nothing to change")

@@ -1,12 +1,13 @@
-"""A constant scattered signal in the quadrature, taken out of data, and found from rays."""
+"""Scattered light in the quadrature, made level in data, taken out of them, and found from rays."""
 
 import numpy as np
 import pytest
+import torch
 
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.quadrature import sampled_quadrature
 from tomo_polysplat.physics.ray_estimates import estimate_scatter, matching_factor
-from tomo_polysplat.physics.scatter import add_scatter, without_scatter
+from tomo_polysplat.physics.scatter import Scatter, add_scatter, light_around, made_level, without_scatter
 from tomo_polysplat.physics.spectral_change import with_voltage
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.transmission import polychromatic_projection_numpy
@@ -30,30 +31,81 @@ def test_scatter_adds_to_what_passes(scatter):
     plain = polychromatic_projection_numpy(areal, FULL)
     scattered = polychromatic_projection_numpy(areal, add_scatter(FULL, scatter))
     np.testing.assert_allclose(np.exp(-scattered), np.exp(-plain) + scatter, rtol=1e-12)
-    np.testing.assert_allclose(without_scatter(scattered, scatter, 30.0), plain, rtol=1e-9, atol=1e-12)
+    found = without_scatter(torch.from_numpy(scattered), scatter, 30.0)
+    np.testing.assert_allclose(found, plain, rtol=1e-9, atol=1e-12)
 
 
 def test_a_ray_with_less_signal_than_scatter_gets_the_largest_value():
-    values = without_scatter([5.0, np.nan], 0.02, 12.0)
-    assert values[0] == 12.0 and np.isnan(values[1])
+    values = without_scatter(torch.tensor([5.0, np.nan]), 0.02, 12.0)
+    assert float(values[0]) == pytest.approx(12.0) and torch.isnan(values[1])
 
 
-@pytest.mark.parametrize("scatter", [0.0, 0.02, 0.1])
+@pytest.mark.parametrize(
+    "scatter", [Scatter(), Scatter(0.02), Scatter(0.1), Scatter(0.005, 0.03), Scatter(0.06, -0.05)]
+)
 def test_scatter_is_found_although_the_matter_has_taken_some_of_it_up(scatter):
     areal, noise = rays(), np.random.default_rng(4)
-    measured = polychromatic_projection_numpy(areal, add_scatter(FULL, scatter))
-    measured += noise.normal(0.0, 0.003, measured.shape)
+    light = noise.uniform(0.3, 1.0, areal.shape[1])
+    total = np.exp(-polychromatic_projection_numpy(areal, FULL)) + beside(scatter, light)
+    measured = -np.log(total) + noise.normal(0.0, 0.003, light.shape)
     measured[::97] += 1.0  # rays that nothing explains
     thinner = areal * np.array([[0.97], [1.02], [0.95]])
-    found = estimate_scatter(thinner, measured, np.ones_like(measured), SPECTRUM, MATERIALS)
-    assert found == pytest.approx(scatter, abs=1e-3)
+    found = estimate_scatter(thinner, measured, np.ones_like(measured), light, SPECTRUM, MATERIALS)
+    assert found.varies == scatter.varies
+    np.testing.assert_allclose(beside(found, light), beside(scatter, light), atol=1.5e-3)
 
 
 def test_rays_that_nothing_passes_tell_nothing():
     areal = np.concatenate([rays(), np.full((3, 5), 1e6)], axis=1)
     measured = polychromatic_projection_numpy(rays(), FULL)
     measured = np.append(measured, np.full(5, 700.0))
-    assert estimate_scatter(areal, measured, np.ones_like(measured), SPECTRUM, MATERIALS) < 1e-3
+    light = np.linspace(0.2, 1.0, len(measured))
+    found = estimate_scatter(areal, measured, np.ones_like(measured), light, SPECTRUM, MATERIALS)
+    assert not found.varies and found.constant < 1e-3
+
+
+def test_the_light_around_a_ray_is_a_mean_of_its_view():
+    rng = np.random.default_rng(5)
+    values = torch.from_numpy(rng.uniform(0.5, 1.5, (3, 41, 53)).astype(np.float32))
+    values[1] = 1.0
+    values[1, 4:9, 7:30] = torch.nan  # which rays are not used does not matter
+    values[2, :, 26:] = 40.0
+    light = light_around(values)
+    assert light.shape == values.shape and torch.isfinite(light).all()
+    mean = float(torch.exp(-values[0]).mean())
+    np.testing.assert_allclose(light[0], mean, rtol=0.1)
+    np.testing.assert_allclose(light[1], np.exp(-1.0), rtol=1e-5)
+    # No light comes from the dark half, and where the other begins there is half as much as far from it.
+    assert (light[2, :, 1:] <= light[2, :, :-1] + 1e-6).all()
+    assert float(light[2, 20, 26]) == pytest.approx(0.5 * mean, rel=0.15)
+
+
+def test_light_of_a_detector_of_one_row():
+    values = torch.linspace(0.0, 2.0, 37).reshape(1, 1, 37)
+    light = light_around(values)[0, 0]
+    assert (light.diff() < 0).all() and float(light[18]) == pytest.approx(
+        float(torch.exp(-values).mean()), rel=0.1
+    )
+
+
+@pytest.mark.parametrize("scatter", [Scatter(0.005, 0.03), Scatter(0.06, -0.05), Scatter(0.02)])
+def test_scatter_made_level_is_the_same_everywhere(scatter):
+    rng = np.random.default_rng(6)
+    plain = torch.from_numpy(rng.uniform(0.0, 6.0, (5, 13, 17)).astype(np.float32))
+    plain[0, 3, 4], light = torch.nan, light_around(plain)
+    scattered = -torch.log(torch.exp(-plain) + scatter.beside(light))
+    scatter_of = scatter.beside(light_around(scattered))
+    made, level = made_level(scattered, scatter)
+    expected = -torch.log(torch.exp(-scattered) - scatter_of + level)
+    np.testing.assert_allclose(made, expected, rtol=1e-5, atol=1e-6)
+    assert 0 <= level <= float(scatter_of[torch.isfinite(plain)].max()) + 1e-6
+    kept = torch.isfinite(plain)
+    assert torch.equal(torch.isfinite(made), kept)
+    assert (torch.exp(-made)[kept] >= 0.89 * torch.exp(-scattered)[kept]).all()
+
+
+def beside(scatter, light):
+    return scatter.beside(torch.from_numpy(light)).numpy()
 
 
 @pytest.mark.parametrize("kvp", [81, 99])

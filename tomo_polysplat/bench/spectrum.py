@@ -170,7 +170,9 @@ def _run(bench: SpectrumBench, scene: str, scan: Scan, case: Case, calibrated: b
     assert scan.truth is not None and scan.truth_energy_kev is not None
     materials = Materials("pmma") if object_of(scene) == "pins" else Materials()
     per_gram = float(mass_attenuation(materials.soft, scan.truth_energy_kev)) * cm_per(scan.unit)
-    asked = {"calibrate": True, "soft_density": _known_density(scan, per_gram)} if calibrated else {}
+    asked = {"calibrate": calibrated}
+    if calibrated:
+        asked["soft_density"] = _known_density(scan, per_gram)
     result = reconstruct(
         scan.projections,
         scan.proj_geom,

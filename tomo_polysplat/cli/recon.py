@@ -66,11 +66,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar=("SOFT", "MIDDLE", "DENSE"),
         help="base materials (default: water aluminium iron)",
     )
-    group.add_argument(
+    calibrated = group.add_mutually_exclusive_group()
+    calibrated.add_argument(
         "--calibrate",
         nargs="*",
         metavar="WHAT",
         help="fit scatter, kvp or filter first; alone: scatter, and kvp with --soft-density",
+    )
+    calibrated.add_argument(
+        "--no-calibrate", action="store_true", help="do not look for scatter in the rays either"
     )
     group.add_argument(
         "--soft-density", type=float, metavar="G/CM3", help="known density of what most of the object is"
@@ -109,7 +113,7 @@ def run(arguments: argparse.Namespace) -> int:
             seed=arguments.seed,
             device=arguments.device,
             valid=scan.valid,
-            calibrate=arguments.calibrate or arguments.calibrate is not None,
+            calibrate=_calibrated(arguments),
             soft_density=arguments.soft_density,
             water_correction=None if spectrum is None else scan.water_correction,
             progress=progress,
@@ -124,6 +128,13 @@ def run(arguments: argparse.Namespace) -> int:
         _write(result, scan, arguments)
     interrupted = interruption.asked or "interrupted" in result.plan.get("stop", "")
     return INTERRUPTED if interrupted else 0
+
+
+def _calibrated(arguments: argparse.Namespace) -> bool | list[str] | None:
+    """What `reconstruct` is to calibrate; None leaves it to the rays."""
+    if arguments.calibrate is None:
+        return False if arguments.no_calibrate else None
+    return arguments.calibrate or True
 
 
 def _spectrum_of(scan: Scan, arguments: argparse.Namespace) -> Spectrum | None:

@@ -10,7 +10,7 @@ import torch
 
 from tomo_polysplat.checks import fail, require_number
 from tomo_polysplat.fit.agent import settings_for_agent
-from tomo_polysplat.fit.calibration import Calibration, calibrated, with_fitted
+from tomo_polysplat.fit.calibration import Calibration, calibrated, describe_scatter, with_fitted
 from tomo_polysplat.fit.checkpoint import Checkpoint
 from tomo_polysplat.fit.first_volume import first_volume
 from tomo_polysplat.fit.plan import Plan, make_plan
@@ -24,7 +24,7 @@ from tomo_polysplat.kernels.device import pick_device
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings, make_settings
 
-__all__ = ["Begun", "Wishes", "begin", "physics"]
+__all__ = ["Begun", "Wishes", "begin", "calibrate", "physics", "under"]
 
 
 @dataclass(frozen=True)
@@ -80,14 +80,27 @@ def physics(
     report: Callable[[float, str], Any],
 ) -> tuple[Problem, dict[str, Any]]:
     """The problem under the physics that short fits, or those before a checkpoint, have found, and its record."""
+    if saved is not None and saved.plan is not None:
+        return under(problem, saved.plan.reasons.get("calibration"))
     if wanted is None:
         return problem, {}
-    if saved is not None and saved.plan is not None:
-        found = saved.plan.reasons["calibration"]
-    else:
-        report(0.0, "calibration")
-        found = calibrated(problem, wanted, wishes.settings, wishes.device, wishes.seed, wishes.time_budget)
-    return with_fitted(problem, found["fitted"]), {"calibration": found}
+    report(0.0, "calibration")
+    return under(problem, calibrate(problem, wanted, wishes))
+
+
+def calibrate(problem: Problem, wanted: Calibration, wishes: Wishes) -> dict[str, Any]:
+    """The record of a calibration."""
+    return calibrated(problem, wanted, wishes.settings, wishes.device, wishes.seed, wishes.time_budget)
+
+
+def under(problem: Problem, found: dict[str, Any] | None) -> tuple[Problem, dict[str, Any]]:
+    """The problem under what a calibration has found, and what the plan tells of it."""
+    if found is None:
+        return problem, {}
+    reasons: dict[str, Any] = {"calibration": found}
+    if found["fitted"].get("scatter"):
+        reasons["scatter"] = f"modelled: {describe_scatter(found['fitted'])}"
+    return with_fitted(problem, found["fitted"]), reasons
 
 
 def begin(

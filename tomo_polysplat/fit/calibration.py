@@ -1,9 +1,9 @@
 """Finding what is wrong with the assumed physics before the fit: scatter, and a tube's voltage or filters.
 
-Short fits say how a change of the physics fits the rays that were held out. Scatter shows in air and behind
-metal, so the rays alone tell it. A tube voltage does not show in them: its change by 10 % scales the object and
-leaves the rest of a fitted volume within half a per cent (``docs/spectrum.md``). What tells it is the
-density of the object's main matter, where that is known.
+Short fits say how a change of the physics fits the rays that were held out, and the darkest ones. Scatter shows in air
+and behind metal, so the rays alone tell it. A tube voltage does not show in them: its change by 10 % scales the object
+and leaves the rest of a fitted volume within half a per cent (``docs/spectrum.md``). What tells it is the density of the
+object's main matter, where that is known.
 """
 
 from __future__ import annotations
@@ -22,12 +22,13 @@ from tomo_polysplat.fit.first_volume import first_volume
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.short_fit import TOO_SHORT, ShortFit, Untold, short_fit
 from tomo_polysplat.physics.ray_estimates import estimate_scatter, matching_factor
+from tomo_polysplat.physics.scatter import Scatter
 from tomo_polysplat.physics.spectral_change import tube_voltage, with_filtration, with_voltage
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.tube_tables import voltage_range
 from tomo_polysplat.settings import Settings
 
-__all__ = ["Calibration", "calibrated", "with_fitted"]
+__all__ = ["Calibration", "calibrated", "describe_scatter", "scatter_as_fitted", "with_fitted"]
 
 logger = logging.getLogger(__name__)
 
@@ -68,7 +69,10 @@ class Calibration:
 
     @classmethod
     def of(
-        cls, calibrate: bool | str | Sequence[str], soft_density: float | None, spectrum: Spectrum | None
+        cls,
+        calibrate: bool | str | Sequence[str] | None,
+        soft_density: float | None,
+        spectrum: Spectrum | None,
     ) -> Calibration | None:
         """What a caller asks for, checked; None for nothing."""
         if not calibrate:
@@ -107,13 +111,31 @@ class Calibration:
 
 
 def with_fitted(problem: Problem, fitted: Mapping[str, float]) -> Problem:
-    """The problem under other physics: ``scatter``, and factors ``kvp`` and ``filter`` of the spectrum."""
+    """The problem under other physics.
+
+    Parameters
+    ----------
+    problem : Problem
+        Polychromatic.
+    fitted : mapping
+        ``scatter`` and ``scatter_of_light`` (the attributes of `Scatter`), and factors ``kvp`` and ``filter`` of the
+        spectrum, as far as they differ.
+    """
     spectrum = problem.spectrum
     assert spectrum is not None
     for name, change in _CHANGES.items():
         if fitted.get(name, 1.0) != 1.0:
             spectrum = change(spectrum, fitted[name])
-    return problem.under(spectrum, float(fitted.get("scatter", 0.0)))
+    return problem.under(spectrum, _scatter_in(fitted))
+
+
+def _scatter_in(fitted: Mapping[str, float]) -> Scatter:
+    return Scatter(float(fitted.get("scatter", 0.0)), float(fitted.get("scatter_of_light", 0.0)))
+
+
+def scatter_as_fitted(scatter: Scatter) -> dict[str, float]:
+    """As `with_fitted` takes it."""
+    return {"scatter": scatter.constant} | ({"scatter_of_light": scatter.of_light} if scatter.varies else {})
 
 
 def calibrated(
@@ -225,31 +247,41 @@ def _stage(
     made: list[ShortFit] = []
     for _ in range(_ROUNDS):
         last = made[-1] if made else begin
-        old = last.fitted.get(name, 0.0 if name == "scatter" else 1.0)
-        value = _estimate(name, old, last, wanted, problem)
-        least = max(_LEAST_SCATTER, 0.02 * old) if name == "scatter" else 0.0
-        settled = abs(value - old) <= least
-        if settled:
+        moved = _scatter_moved(last, problem) if name == "scatter" else _moved(name, last, wanted, problem)
+        if not moved:
             break
-        made.append(trial({**last.fitted, name: value}))
+        made.append(trial({k: v for k, v in last.fitted.items() if not k.startswith(name)} | moved))
     return made
 
 
-def _estimate(name: str, old: float, last: ShortFit, wanted: Calibration, problem: Problem) -> float:
-    """Where the last short fit says that a quantity is."""
-    physics = with_fitted(problem, last.fitted)
+def _scatter_moved(last: ShortFit, problem: Problem) -> dict[str, float]:
+    """The scatter where the last short fit says that it is; nothing where that is where it was."""
+    physics, rays = with_fitted(problem, last.fitted), last.rays
     assert physics.spectrum is not None and physics.materials is not None
-    if name == "scatter":
-        rays = (last.areal, last.measured, last.weight)
-        return estimate_scatter(*rays, physics.spectrum, physics.materials, old)
+    level, was = last.scatter_level, physics.scatter
+    sample = (rays.areal, rays.measured, rays.weight, rays.light)
+    found = estimate_scatter(*sample, physics.spectrum, physics.materials, level)
+    new = Scatter(was.constant + found.constant - level, was.of_light + found.of_light)
+    light = torch.as_tensor(rays.light)
+    old, now = was.beside(light), new.beside(light)
+    if not len(light) or float((now - old).abs().max()) <= max(_LEAST_SCATTER, 0.02 * float(old.max())):
+        return {}
+    return scatter_as_fitted(new)
+
+
+def _moved(name: str, last: ShortFit, wanted: Calibration, problem: Problem) -> dict[str, float]:
+    """The factor of the spectrum under which the main matter has its density; nothing where it has it."""
+    physics, old = with_fitted(problem, last.fitted), last.fitted.get(name, 1.0)
+    assert physics.spectrum is not None and physics.materials is not None
     assert wanted.soft_density is not None
     ratio = wanted.soft_density / last.soft_density if last.soft_density > 0 else 1.0
     if abs(ratio - 1.0) < _LEAST_CHANGE:
-        return old
+        return {}
     low, high = _bounds(name, problem)
-    longest, bounds = float(np.quantile(last.areal[0], 0.95)), (low / old, high / old)
+    longest, bounds = float(np.quantile(last.rays.areal[0], 0.95)), (low / old, high / old)
     change, soft = _CHANGES[name], physics.materials.soft
-    return old * matching_factor(change, physics.spectrum, soft, longest, ratio, bounds)
+    value = old * matching_factor(change, physics.spectrum, soft, longest, ratio, bounds)
+    return {} if value == old else {name: value}
 
 
 def _bounds(name: str, problem: Problem) -> tuple[float, float]:
@@ -274,13 +306,22 @@ def _judge(name: str, before: ShortFit, stage: Sequence[ShortFit], problem: Prob
         return False, "too little of the main matter lies inside of it to show its density"
     if not stage:
         return False, "nothing to change"
-    after, change = _last(name, stage).held_out, f"{_last(name, stage).fitted[name]:.4g}"
-    errors = f"held-out error {before.held_out:.3e} before, {after:.3e} after"
+    after = _last(name, stage)
+    errors = f"held-out error {before.held_out:.3e} before, {after.held_out:.3e} after"
     if name == "scatter":
-        better = after < (1 - _MARGIN) * before.held_out
-        return better, f"{change} of the open beam, {'accepted' if better else 'not accepted'}: {errors}"
+        better = after.held_out < (1 - _MARGIN) * before.held_out and after.darkest < before.darkest
+        errors += f", of the darkest rays {before.darkest:.3e} and {after.darkest:.3e}"
+        return better, f"{describe_scatter(after.fitted)}, {'' if better else 'not '}accepted: {errors}"
     low, high = _bounds(name, problem)
-    if not 1.001 * low < _last(name, stage).fitted[name] < 0.999 * high:
+    change = f"{after.fitted[name]:.4g}"
+    if not 1.001 * low < after.fitted[name] < 0.999 * high:
         return False, f"times {change} is as far as is looked, and the density asks for more: not accepted"
-    fits = after < (1 + _CONTRADICTION) * before.held_out
+    fits = after.held_out < (1 + _CONTRADICTION) * before.held_out
     return fits, f"times {change} by the known density, {'accepted' if fits else 'not accepted'}: {errors}"
+
+
+def describe_scatter(fitted: Mapping[str, float]) -> str:
+    """In words; `with_fitted` tells what is in ``fitted``."""
+    scatter = _scatter_in(fitted)
+    words = f"{scatter.constant:.4g} of the open beam"
+    return words + (f" and {scatter.of_light:.4g} of the light around a ray" if scatter.varies else "")

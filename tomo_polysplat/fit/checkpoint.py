@@ -159,8 +159,7 @@ class Checkpoint:
             about = _content(arrays["about"])
             self._require_same(about)
             self.plan = _plan(about["plan"])
-            if self.options.get("calibration") is not None:
-                _require_calibration(self.plan)
+            _require_calibration(self.plan, self.options.get("calibration"))
             self.snapshot = _snapshot(arrays, dict(about["numbers"]), self._views)
         except _DAMAGES as error:
             raise self._damaged(f"{type(error).__name__} {error}") from error
@@ -226,7 +225,9 @@ def _plan(parts: dict[str, Any]) -> Plan:
     return plan
 
 
-def _require_calibration(plan: Plan) -> None:
+def _require_calibration(plan: Plan, asked: Any) -> None:
+    if not isinstance(asked, dict) and "calibration" not in plan.reasons:
+        return
     found = plan.reasons["calibration"]
     if not (isinstance(found, dict) and isinstance(found.get("fitted"), dict)):
         raise TypeError(f"what the calibration found, got {found}")

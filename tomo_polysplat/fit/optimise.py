@@ -57,6 +57,7 @@ class _Run:
     started: float
     checkpoint: Checkpoint | None
     question: PixelQuestion | None
+    look: Callable[[Fitter, Clock], Any] | None
 
     def keep(self, *, now: bool) -> None:
         """Offer the checkpoint the state between two passes."""
@@ -110,6 +111,8 @@ class _Run:
         """What each pass gave; where the question is asked, two at once, so that no checkpoint lies between them."""
         passes = self.fitter.passes(self.clock)
         while True:
+            if self.look is not None:
+                self.look(self.fitter, self.clock)
             if self.question is not None and self.question.due(self.clock):
                 self.fitter, made = self.question.answered(self.fitter, self.clock)
                 passes = self.fitter.passes(self.clock)
@@ -142,13 +145,15 @@ def fit(
     callbacks: Sequence[Callable[[FitState], Any]] = (),
     checkpoint: Checkpoint | None = None,
     question: PixelQuestion | None = None,
+    look: Callable[[Fitter, Clock], Any] | None = None,
 ) -> FitOutcome:
     """Fit Gaussians to rays.
 
     Stops after ``settings.passes`` over the views, at ``deadline`` (``time.perf_counter`` seconds), when the
     held-out rays have not improved for `patience_of` passes, when a callback returns True, or on
     KeyboardInterrupt; returns the Gaussians that `Watch` holds for the best. Where ``checkpoint``
-    holds a snapshot, ``gaussians`` are its own and the fit goes on from there. ``question`` is asked on the way.
+    holds a snapshot, ``gaussians`` are its own and the fit goes on from there. ``question`` is asked on the way, and
+    ``look`` called before each pass.
     """
     if not len(gaussians):
         logger.warning("The start volume is empty: no Gaussians, a volume of zeros.")
@@ -160,7 +165,7 @@ def fit(
     clock = Clock(steps, deadline)
     outcome = FitOutcome(gaussians)
     watch: Watch[Gaussians] = Watch(patience_of(settings, settings.passes))
-    run = _Run(fitter, outcome, watch, clock, started, checkpoint, question)
+    run = _Run(fitter, outcome, watch, clock, started, checkpoint, question, look)
     run.restore()
     try:
         if not outcome.reason:

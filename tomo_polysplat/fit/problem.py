@@ -29,7 +29,7 @@ from tomo_polysplat.kernels import select
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.model.seed import seed_gaussians
 from tomo_polysplat.physics.base_materials import Materials
-from tomo_polysplat.physics.scatter import without_scatter
+from tomo_polysplat.physics.scatter import Scatter, made_level, without_scatter
 from tomo_polysplat.physics.solids import number_of_solid
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.render.renderer import detector_views, voxel_box
@@ -51,6 +51,7 @@ class _Known:
     """What is made once for a scan, whatever the physics that it is fitted under."""
 
     copies: dict[torch.device, torch.Tensor] = field(default_factory=dict)
+    level: dict[torch.device, tuple[Scatter, torch.Tensor, float]] = field(default_factory=dict)
     closed: tuple[bool, str] | None = None
     agreement: list[float | None] | None = None
     photons: float | None = None
@@ -78,8 +79,8 @@ class Problem:
         Two-dimensional: one row and one slice in one plane.
     spectrum, materials : Spectrum, Materials, or None
         None for a monochromatic model.
-    scatter : float
-        Constant scattered signal, as a fraction of the open beam.
+    scatter : Scatter
+        That the rays hold besides what passes.
     """
 
     projections: np.ndarray
@@ -91,7 +92,7 @@ class Problem:
     planar: bool
     spectrum: Spectrum | None = None
     materials: Materials | None = None
-    scatter: float = 0.0
+    scatter: Scatter = Scatter()
     _known: _Known = field(default_factory=_Known, init=False, repr=False)
 
     @classmethod
@@ -145,7 +146,7 @@ class Problem:
         """Shortest edge of a voxel, in the solver's coordinates."""
         return float(self.grid.voxel_size[: self.dimensions].min())
 
-    def under(self, spectrum: Spectrum, scatter: float) -> Problem:
+    def under(self, spectrum: Spectrum, scatter: Scatter) -> Problem:
         """The same measurements under other physics; copies of them on devices serve both."""
         other = replace(self, spectrum=spectrum, scatter=scatter)
         object.__setattr__(other, "_known", self._known)
@@ -159,7 +160,30 @@ class Problem:
         return float(per_gram) * self.depth / self.length
 
     def measured(self, device: torch.device) -> torch.Tensor:
-        """The projections on a device, copied there once; on the host where they do not fit there."""
+        """The projections on a device, copied there once; on the host where they do not fit there.
+
+        Scatter that varies is made level (`tomo_polysplat.physics.scatter.made_level`).
+        """
+        return self._level(device)[0]
+
+    def scatter_level(self, device: torch.device) -> float:
+        """The constant scatter of what was measured, as a fraction of the open beam."""
+        return self._level(device)[1]
+
+    def _level(self, device: torch.device) -> tuple[torch.Tensor, float]:
+        """What was measured, made level, and its scatter; of scatter that varies the last one asked for is kept."""
+        values = self._copied(device)
+        if not self.scatter.varies:
+            return values, self.scatter.constant
+        known = self._known.level.get(device)
+        if known is None or known[0] != self.scatter:
+            self._known.level.pop(device, None)
+            values = values if projections_stay(values.nbytes, device) else values.cpu()
+            known = (self.scatter, *made_level(values, self.scatter))
+            self._known.level[device] = known
+        return known[1:]
+
+    def _copied(self, device: torch.device) -> torch.Tensor:
         copies = self._known.copies
         if device not in copies:
             stay = projections_stay(self.projections.nbytes, device)
@@ -222,10 +246,8 @@ class Problem:
 
     def primary(self, device: torch.device) -> torch.Tensor:
         """The projections as they would be without scatter, on a device."""
-        if not self.scatter:
-            return self.measured(device)
-        primary = without_scatter(self.projections, self.scatter, OPAQUE)
-        return torch.from_numpy(primary).to(self.measured(device).device, torch.float32)
+        values, level = self._level(device)
+        return without_scatter(values, level, OPAQUE) if level else values
 
     def _solid_number(self, plan: Plan, settings: Settings) -> Callable[[np.ndarray], np.ndarray] | None:
         """Numbers of solids by attenuation at the volume's energy, for curves that they are known for."""

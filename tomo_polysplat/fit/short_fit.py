@@ -11,17 +11,29 @@ import torch
 from scipy import ndimage
 
 from tomo_polysplat.fit.depth import weights_by_depth
+from tomo_polysplat.fit.loss import misfit
 from tomo_polysplat.fit.optimise import FitOutcome, fit
 from tomo_polysplat.fit.plan import Plan, make_plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays, batches_around
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.physics.scatter import light_around
 from tomo_polysplat.render.renderer import project_gaussians
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.levels import mass_level
 
-__all__ = ["TOO_SHORT", "ShortFit", "Untold", "cut_short", "fitted_shortly", "main_density", "short_fit"]
+__all__ = [
+    "TOO_SHORT",
+    "RaySample",
+    "ShortFit",
+    "Untold",
+    "cut_short",
+    "fitted_shortly",
+    "main_density",
+    "sample_rays",
+    "short_fit",
+]
 
 # Why a short fit that the time budget ended tells nothing.
 TOO_SHORT = "the time budget is too short to tell"
@@ -31,11 +43,36 @@ _FEWEST_STEPS = 120
 # Of the seconds that a reconstruction may take, the share for each short fit.
 _SHARE_OF_BUDGET = 0.1
 _RAYS = 60_000
+# Share of the rays that count as the darkest.
+_DARKEST = 0.02
 # The main matter's voxels: this share of those inside of it, the ones closest to each other.
 _CROWD = 0.3
 # As large a share of them has to lie inside. Walls a voxel or two thick look lighter than they are: those of a pepper
 # by up to 40 %, with shares of at most 0.19, while a chest wall with 0.22 is right to 2 %.
 _SOLID = 0.2
+
+
+@dataclass(frozen=True)
+class RaySample:
+    """Some rays of a fit.
+
+    Attributes
+    ----------
+    areal : (curves, rays) array
+        Areal densities in g/cm2.
+    measured, weight : (rays,) arrays
+        Their P, and the inverse of its deviation, 1 for a ray without noise.
+    light : (rays,) array
+        That around them; see `tomo_polysplat.physics.scatter.light_around`.
+    view : (rays,) array
+        Which of the views looked at they belong to.
+    """
+
+    areal: np.ndarray
+    measured: np.ndarray
+    weight: np.ndarray
+    light: np.ndarray
+    view: np.ndarray
 
 
 @dataclass
@@ -48,28 +85,31 @@ class ShortFit:
         The physics that was assumed; see ``fit.calibration.with_fitted``.
     held_out : float
         Misfit of the held-out rays, or of the fitted ones where there are too few.
+    darkest : float
+        Misfit of the rays with the least light.
     soft_density : float
         Density in g/cm3 of what most of the object is made of besides metal, were it the first material; 0 where that
         is too thin.
-    areal : (3, rays) array
-        Areal densities in g/cm2 of some of the rays.
-    measured, weight : (rays,) arrays
-        Their P, and the inverse of its deviation, 1 for a ray without noise.
+    rays : RaySample
+        Some of the rays.
+    scatter_level : float
+        Constant scatter that was assumed, as a fraction of the open beam.
     cut : bool
         Whether the time budget ended it, so that it tells nothing.
     """
 
     fitted: dict[str, float]
     held_out: float
+    darkest: float
     soft_density: float
-    areal: np.ndarray
-    measured: np.ndarray
-    weight: np.ndarray
+    rays: RaySample
+    scatter_level: float
     cut: bool = False
 
     def record(self) -> dict[str, float]:
         """Its numbers, for the plan."""
-        return {**self.fitted, "held_out": self.held_out, "soft_density": self.soft_density}
+        known = {"held_out": self.held_out, "darkest": self.darkest, "soft_density": self.soft_density}
+        return self.fitted | known
 
 
 def short_fit(
@@ -114,10 +154,12 @@ def short_fit(
     outcome = fitted_shortly(seeds, plan, problem, scene, rays, short, seed, time_budget)
     with torch.no_grad():
         density = scene.volume(outcome.gaussians).cpu().numpy() * plan.reference
-        sample = _sample(outcome.gaussians, scene, rays, seed)
+        sample = sample_rays(outcome.gaussians, scene, rays, seed)
+        darkest = _darkest(outcome.gaussians, scene, rays, short)
     errors = [entry["held_out"] or entry["loss"] for entry in outcome.history] or [np.inf]
     main = main_density(density, settings.metal_level * plan.reference)
-    return ShortFit(fitted, float(min(errors)), main, *sample, cut=cut_short(outcome))
+    level = problem.scatter_level(device)
+    return ShortFit(fitted, float(min(errors)), darkest, main, sample, level, cut=cut_short(outcome))
 
 
 def fitted_shortly(
@@ -188,20 +230,35 @@ def main_density(density: np.ndarray, metal: float = math.inf) -> float:
     return float(inside[first : first + width].mean())
 
 
-def _sample(
-    gaussians: Gaussians, scene: FitScene, rays: Rays, seed: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Areal densities, measured values and weights of some of the rays."""
-    parts: list[list[np.ndarray]] = []
-    weights = gaussians.weights(scene.reference_curve)
+def _darkest(gaussians: Gaussians, scene: FitScene, rays: Rays, settings: Settings) -> float:
+    """Mean misfit of the rays with the least light."""
+    parts: list[list[torch.Tensor]] = []
     for views, measured, weight, aside in batches_around(rays):
+        predicted, _ = scene.projections(gaussians, views)
+        used = (weight + aside) > 0
+        parts.append([values[used] for values in (predicted, measured, weight + aside)])
+    predicted, measured, weight = (torch.cat(part) for part in zip(*parts))
+    if not len(measured):
+        return 0.0
+    chosen = measured.topk(max(1, round(_DARKEST * len(measured)))).indices
+    return float(misfit(predicted[chosen], measured[chosen], weight[chosen], settings))
+
+
+@torch.no_grad()
+def sample_rays(gaussians: Gaussians, scene: FitScene, rays: Rays, seed: int, most: int = _RAYS) -> RaySample:
+    """So many of the rays at most, of views all around."""
+    parts: list[list[np.ndarray]] = []
+    weights, rng = gaussians.weights(scene.reference_curve), np.random.default_rng(seed)
+    batches, seen = list(batches_around(rays)), 0
+    for views, measured, weight, aside in batches:
         areal, _ = project_gaussians(gaussians, weights, views, scene.kernel, scene.cutoff)
-        tensors = (
-            areal.reshape(3, -1) * scene.areal_scale,
-            measured.reshape(-1),
-            (weight + aside).reshape(-1),
-        )
-        parts.append([tensor.double().cpu().numpy() for tensor in tensors])
-    amounts, values, weighed = (np.concatenate(part, axis=-1) for part in zip(*parts))
-    chosen = np.random.default_rng(seed).permutation(np.flatnonzero(weighed > 0))[:_RAYS]
-    return amounts[:, chosen], values[chosen], weighed[chosen]
+        weight = weight + aside
+        light = light_around(torch.where(weight > 0, measured, torch.nan))
+        used = (weight.reshape(-1) > 0).nonzero()[:, 0]
+        many = min(len(used), -(-most // len(batches)))
+        chosen = used[torch.from_numpy(rng.choice(len(used), many, replace=False)).to(used.device)]
+        view, seen = seen + chosen // measured[0].numel(), seen + len(measured)
+        flat = [areal.reshape(len(areal), -1)[:, chosen] * scene.areal_scale]
+        flat += [values.reshape(-1)[chosen] for values in (measured, weight, light)]
+        parts.append([tensor.double().cpu().numpy() for tensor in (*flat, view)])
+    return RaySample(*(np.concatenate(part, axis=-1) for part in zip(*parts)))

@@ -53,7 +53,7 @@ def spectral_model(
     quadrature = fit_quadrature(spectrum, materials, largest, nodes, curves=plan.curves)
     plan.reasons["spectrum"] = quadrature.describe()
     plan.reasons["hardening"] = quadrature.describe_hardening(most)
-    lit_by_scatter = add_scatter(quadrature, problem.scatter)
+    lit_by_scatter = add_scatter(quadrature, problem.scatter_level(device))
     if plan.curves == 1:
         return lit_by_scatter, None, None, LEAST_U
     least_u = least_material_number(materials, spectrum, quadrature.attenuation)

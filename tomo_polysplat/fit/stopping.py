@@ -85,10 +85,14 @@ class Clock:
 
     def allows(self, slower: float) -> bool:
         """Whether the steps left, so many times slower than those so far, would end before the deadline."""
+        return self.room_for(slower * (self.steps - self.done))
+
+    def room_for(self, steps: float) -> bool:
+        """Whether so many steps would end before the deadline."""
         if self.deadline is None:
             return True
-        now, left = time.perf_counter(), self.steps - self.done
-        return now + slower * left * (now - self.begun) / max(self.done, 1) <= self.deadline
+        now = time.perf_counter()
+        return now + steps * (now - self.begun) / max(self.done, 1) <= self.deadline
 
 
 def patience_of(settings: Settings, passes: float) -> int:

@@ -9,12 +9,14 @@ import numpy as np
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.beer_lambert import projection, shares
 from tomo_polysplat.physics.materials import MaterialLike, mass_attenuation
+from tomo_polysplat.physics.scatter import LARGEST_SCATTER, Scatter
 from tomo_polysplat.physics.spectrum import Spectrum
 
 __all__ = ["estimate_scatter", "matching_factor"]
 
-_LARGEST_SCATTER = 0.2
 _GAUSS_NEWTON_STEPS = 8
+# Scatter varies where that leaves so much less of the squared residuals: of constant scatter chance takes 0.5 %.
+_BETTER = 0.03
 # Residuals count absolutely beyond this many deviations (Huber 1964, doi:10.1214/aoms/1177703732).
 _HUBER_CORNER = 1.345
 _DEVIATION = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
@@ -24,46 +26,68 @@ def estimate_scatter(
     areal: np.ndarray,
     measured: np.ndarray,
     weight: np.ndarray,
+    light: np.ndarray,
     spectrum: Spectrum,
     materials: Materials,
     start: float = 0.0,
-) -> float:
-    """Constant scatter that explains the residuals of rays best.
+) -> Scatter:
+    """Scatter that explains the residuals of rays best, one that varies where that is needed.
 
     Gauss-Newton steps with Huber's weights on the scatter together with one factor for the amount of each of
-    the three curves, so that matter which has taken up some of the scatter gives it back.
+    the curves, so that matter which has taken up some of the scatter gives it back.
 
     Parameters
     ----------
-    areal : (3, rays) array
-        Areal densities in g/cm2 of a fit that assumed ``start``.
+    areal : (curves, rays) array
+        Areal densities in g/cm2 of a fit that assumed ``start``, of the first curve alone or of all.
     measured, weight : (rays,) arrays
         ``-log(I / I0)``, and what residuals are multiplied with.
+    light : (rays,) array
+        See `tomo_polysplat.physics.scatter.light_around`.
     spectrum : Spectrum
     materials : Materials
     start : float
-        Fraction of the open beam.
-
-    Returns
-    -------
-    float
-        Fraction of the open beam, 0 to 0.2.
+        Constant scatter, as a fraction of the open beam.
     """
     lit = spectrum.weights > 0
-    curves = materials.mass_attenuation(spectrum.energies[lit])
+    curves = materials.mass_attenuation(spectrum.energies[lit])[: len(areal)]
     value, share = shares(areal, np.log(spectrum.weights[lit]), curves)
     primary, slopes = np.exp(-value), (curves @ share) * areal
-    scatter, robust = start, np.ones_like(value)
+    kinds = np.stack([np.ones_like(light), light])
+    rays = (primary, slopes, measured, weight)
+    (constant,), plain = _scatter_of(kinds[:1], np.array([start]), *rays)
+    (base, of_light), varied = _scatter_of(kinds, np.array([constant, 0.0]), *rays)
+    corner = _corner(plain)
+    left = [float((np.minimum(deviation, corner) ** 2).sum()) for deviation in (plain, varied)]
+    if left[1] < (1 - _BETTER) * left[0]:
+        return Scatter(base, of_light)
+    return Scatter(min(max(constant, 0.0), LARGEST_SCATTER))
+
+
+def _scatter_of(
+    kinds: np.ndarray,
+    amounts: np.ndarray,
+    primary: np.ndarray,
+    slopes: np.ndarray,
+    measured: np.ndarray,
+    weight: np.ndarray,
+) -> tuple[list[float], np.ndarray]:
+    """Amounts of some kinds of scatter, from the first ones on, that explain rays best, and what these then lack."""
+    robust = np.ones_like(measured)
     for _ in range(_GAUSS_NEWTON_STEPS):
-        total = np.maximum(primary + scatter, np.finfo(np.float64).tiny)
-        columns = np.concatenate([(-1.0 / total)[None], slopes * (primary / total)]) * weight
+        total = primary + np.clip(amounts @ kinds, 0.0, LARGEST_SCATTER) + np.finfo(np.float64).tiny
+        columns = np.concatenate([-kinds / total, slopes * (primary / total)]) * weight
         target = (measured + np.log(total)) * weight
         step = np.linalg.lstsq((columns * robust).T, target * robust, rcond=None)[0]
-        scatter = float(np.clip(scatter + step[0], 0.0, _LARGEST_SCATTER))
+        amounts = amounts + step[: len(kinds)]
         deviation = np.abs(target - step @ columns)
-        corner = _HUBER_CORNER * _DEVIATION * np.median(deviation) + 1e-12
+        corner = _corner(deviation)
         robust = np.sqrt(corner / np.maximum(deviation, corner))
-    return scatter
+    return [float(amount) for amount in amounts], deviation
+
+
+def _corner(deviation: np.ndarray) -> float:
+    return _HUBER_CORNER * _DEVIATION * float(np.median(deviation)) + 1e-12
 
 
 def matching_factor(

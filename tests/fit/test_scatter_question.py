@@ -1,0 +1,101 @@
+"""Scatter that nobody has told of: found in the middle of a run, which begins anew with it, and when nobody asks."""
+
+import dataclasses
+from functools import cache
+
+import numpy as np
+import pytest
+
+import tomo_polysplat as tps
+from tomo_polysplat.fit import solver
+from tomo_polysplat.fit.beginning import begin
+
+QUICK = {"passes": 6.0, "tv_factor": 1.0, "edges": "blurred", "pixel_rays": 1}
+
+
+@cache
+def pins(scatter=0.0, views=60):
+    return tps.simulate_scan("pins", size=40, views=views, geometry="fan", scatter=scatter)
+
+
+def reconstruct(scan, **options):
+    options = {"unit": scan.unit, "spectrum": scan.spectrum, "settings": QUICK, "progress": False} | options
+    return tps.reconstruct(scan.projections, scan.proj_geom, scan.vol_geom, **options)
+
+
+def error(result, scan):
+    return float(np.sqrt(np.mean((result.volume - scan.truth) ** 2)))
+
+
+def test_scatter_that_nobody_told_of_is_modelled():
+    scan = pins(0.05)
+    asked, told, without = (reconstruct(scan, calibrate=calibrate) for calibrate in (None, True, False))
+    assert asked.plan["scatter"].startswith("modelled: 0.0")
+    assert asked.plan["calibration"] == told.plan["calibration"]
+    # Begun anew, the run is that of a scan whose scatter was known from the first.
+    assert np.array_equal(asked.volume, told.volume)
+    assert "scatter" not in without.plan
+    assert error(asked, scan) < 0.6 * error(without, scan)
+
+
+def test_a_scan_without_any_is_fitted_as_if_nobody_had_asked():
+    scan = pins()
+    asked, without = reconstruct(scan), reconstruct(scan, calibrate=False)
+    assert asked.plan["scatter"].startswith("none: the rays show") and "calibration" not in asked.plan
+    assert np.array_equal(asked.volume, without.volume)
+
+
+def test_a_beam_that_drifts_does_not_scatter():
+    scan = pins()
+    brighter = 0.02 * (1 + np.sin(np.arange(scan.projections.shape[1]) / 5.0))[None, :, None]
+    drifting = dataclasses.replace(scan, projections=(scan.projections - brighter).astype(np.float32))
+    assert "drift" in reconstruct(drifting).plan["scatter"]
+
+
+@pytest.mark.parametrize(
+    ("views", "options", "words"),
+    [(39, {}, "fewer than 40 views"), (60, {"time_budget": 0.5}, "time budget")],
+)
+def test_nobody_asks_where_it_cannot_be_told(views, options, words):
+    told = reconstruct(pins(0.05, views), **options).plan["scatter"]
+    assert told.startswith("none: ") and words in told
+
+
+def test_one_energy_knows_no_scatter():
+    assert "scatter" not in reconstruct(pins(0.05), spectrum=None).plan
+
+
+class Stopped(Exception):
+    pass
+
+
+@pytest.mark.parametrize("passes", [1, 4])
+def test_an_interrupted_run_goes_on_whether_it_had_begun_anew_or_not(passes, tmp_path):
+    scan, path, seen = pins(0.05), tmp_path / "fit.npz", []
+
+    def stop(state):
+        seen.append(state)
+        if len(seen) > passes:
+            raise Stopped
+
+    whole = reconstruct(scan)
+    with pytest.raises(Stopped):
+        reconstruct(scan, checkpoint=path, callbacks=[stop])
+    rest = reconstruct(scan, checkpoint=path, resume=True)
+    assert rest.plan["scatter"] == whole.plan["scatter"]
+    assert np.array_equal(rest.volume, whole.volume)
+
+
+def test_ctrl_c_while_it_begins_anew_returns_what_it_had_come_to(monkeypatch):
+    begun = []
+
+    def once(*scan):
+        begun.append(scan)
+        if len(begun) > 1:
+            raise KeyboardInterrupt
+        return begin(*scan)
+
+    monkeypatch.setattr(solver, "begin", once)
+    result = reconstruct(pins(0.05))
+    assert result.plan["stop"] == "interrupted" and len(begun) == 2
+    assert result.volume.max() > 0.5 * pins(0.05).truth.max() and np.isfinite(result.volume).all()

@@ -1,0 +1,138 @@
+"""The fit of a scan from its physics to the fitted Gaussians, begun anew where the rays show other physics."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from tomo_polysplat.fit.beginning import Begun, Wishes, begin, calibrate, physics, under
+from tomo_polysplat.fit.calibration import Calibration
+from tomo_polysplat.fit.checkpoint import Checkpoint
+from tomo_polysplat.fit.optimise import FitOutcome, fit
+from tomo_polysplat.fit.pixel_question import pixel_question
+from tomo_polysplat.fit.plan import Plan
+from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.fit.scatter_question import OtherPhysics, ScatterQuestion, scatter_question
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.transfer import to_host
+
+__all__ = ["Solver"]
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Solver:
+    """How a scan is fitted.
+
+    Attributes
+    ----------
+    wishes : Wishes
+    saved : Checkpoint or None
+    started : float
+        When the reconstruction began, in seconds of ``time.perf_counter``.
+    flipped : bool
+        Whether callbacks get slices with row 0 at the largest y.
+    report : callable
+        Gets the share done, and words.
+    """
+
+    wishes: Wishes
+    saved: Checkpoint | None
+    started: float
+    flipped: bool
+    report: Callable[[float, str], Any]
+
+    def solve(
+        self, problem: Problem, wanted: Calibration | None, *, ask_scatter: bool
+    ) -> tuple[Problem, Begun, FitOutcome]:
+        """The problem under the physics that were found, with what its fit began from and came to.
+
+        Parameters
+        ----------
+        problem : Problem
+        wanted : Calibration or None
+            What is calibrated first.
+        ask_scatter : bool
+            Whether the rays are asked about scatter on the way.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            After Ctrl-C before the fit has begun.
+        """
+        under_found, found = physics(problem, wanted, self.wishes, self.saved, self.report)
+        begun = self._begin(under_found, found)
+        try:
+            return under_found, begun, self._fit(begun, under_found, ask_scatter)
+        except OtherPhysics as other:
+            other_problem, found = under(under_found, other.found)
+            try:
+                anew = self._begin(other_problem, found)
+            except KeyboardInterrupt:
+                logger.warning("Interrupted before the fit had begun anew; what it had come to is returned.")
+                return under_found, begun, FitOutcome(other.gaussians, reason="interrupted")
+            return other_problem, anew, self._fit(anew, other_problem, ask_scatter)
+
+    def _begin(self, problem: Problem, found: dict[str, Any]) -> Begun:
+        begun = begin(problem, self.wishes, self.saved, self.report)
+        begun.plan.reasons |= found
+        return begun
+
+    def _fit(self, begun: Begun, problem: Problem, ask_scatter: bool) -> FitOutcome:
+        plan, scene, wishes = begun.plan, begun.scene, self.wishes
+        settings = plan.adapted(wishes.settings)
+        return fit(
+            begun.gaussians,
+            plan.spacing * problem.voxel,
+            begun.rays,
+            scene,
+            replace(settings, passes=plan.passes),
+            views_per_step=plan.views_per_step,
+            rng=np.random.default_rng(wishes.seed),
+            started=self.started,
+            deadline=self._deadline(begun),
+            volume=_volume_of(scene, plan, problem, self.flipped),
+            callbacks=[lambda state: self.report(state.share, state.describe()), *wishes.callbacks],
+            checkpoint=self.saved,
+            question=pixel_question(plan, begun.gaussians, settings, problem.geometry.views),
+            look=self._scatter_question(begun, problem) if ask_scatter else None,
+        )
+
+    def _deadline(self, begun: Begun) -> float | None:
+        """When the fit ends at the latest, so that the volume is made in time."""
+        budget = self.wishes.time_budget
+        if budget is None:
+            return None
+        # A volume that takes most of the budget still needs a fit: then the end is late.
+        end = self.started + budget
+        left = max(end - time.perf_counter(), 0.0)
+        return end - min(begun.scene.seconds_of_basis(begun.gaussians), 0.5 * left)
+
+    def _scatter_question(self, begun: Begun, problem: Problem) -> ScatterQuestion | None:
+        def scatter() -> dict[str, Any]:
+            self.report(0.0, "scatter")
+            return calibrate(problem, Calibration(("scatter",), None), self.wishes)
+
+        return scatter_question(begun.plan, problem, begun.scene, scatter)
+
+
+def _volume_of(
+    scene: FitScene, plan: Plan, problem: Problem, flipped: bool
+) -> Callable[[Gaussians], np.ndarray]:
+    """A function from Gaussians to the volume in 1/unit, for callbacks."""
+    factor = plan.reference * problem.soft_attenuation()
+
+    def volume(gaussians: Gaussians) -> np.ndarray:
+        with torch.no_grad():
+            whole = to_host(scene.volume(gaussians) * factor)
+        return np.ascontiguousarray(whole[0, ::-1]) if flipped else whole
+
+    return volume
