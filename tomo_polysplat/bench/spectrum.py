@@ -170,9 +170,7 @@ def _run(bench: SpectrumBench, scene: str, scan: Scan, case: Case, calibrated: b
     assert scan.truth is not None and scan.truth_energy_kev is not None
     materials = Materials("pmma") if object_of(scene) == "pins" else Materials()
     per_gram = float(mass_attenuation(materials.soft, scan.truth_energy_kev)) * cm_per(scan.unit)
-    asked = {"calibrate": calibrated}
-    if calibrated:
-        asked["soft_density"] = _known_density(scan, per_gram)
+    density = _known_density(scan, per_gram) if calibrated else None
     result = reconstruct(
         scan.projections,
         scan.proj_geom,
@@ -186,7 +184,8 @@ def _run(bench: SpectrumBench, scene: str, scan: Scan, case: Case, calibrated: b
         seed=bench.seed,
         device=bench.device,
         progress=False,
-        **asked,  # type: ignore[arg-type]
+        calibrate=calibrated,
+        soft_density=density,
     )
     volume = result.attenuation(scan.truth_energy_kev)
     rest = np.ones(volume.shape, bool) if scan.metal_mask is None else ~scan.metal_mask

@@ -2,8 +2,8 @@
 
 Short fits say how a change of the physics fits the rays that were held out, and the darkest ones. Scatter shows in air
 and behind metal, so the rays alone tell it. A tube voltage does not show in them: its change by 10 % scales the object
-and leaves the rest of a fitted volume within half a per cent (``docs/spectrum.md``). What tells it is the density of the
-object's main matter, where that is known.
+and leaves the rest of a fitted volume within half a per cent (``docs/spectrum.md``). What tells it is the density of
+the object's main matter, where that is known.
 """
 
 from __future__ import annotations
