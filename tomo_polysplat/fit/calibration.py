@@ -208,9 +208,9 @@ class _Trials:
         """A short fit, cut or not."""
         physics, settings, device = with_fitted(self.problem, fitted), self.settings, self.device
         start, _ = first_volume(physics, device, settings)
-        steps = () if self.wanted.soft_density is None else (_STEPS_FOR_DENSITY,)
-        rest = (self.seed, self.budget, *steps)
-        self.made.append(short_fit(physics, start, dict(fitted), settings, device, *rest))
+        density = self.wanted.soft_density is not None
+        rest = (self.seed, self.budget, *((_STEPS_FOR_DENSITY,) if density else ()))
+        self.made.append(short_fit(physics, start, dict(fitted), settings, device, *rest, density=density))
         return self.made[-1]
 
     def another(self, fitted: Mapping[str, float]) -> ShortFit:
@@ -274,7 +274,7 @@ def _moved(name: str, last: ShortFit, wanted: Calibration, problem: Problem) -> 
     physics, old = with_fitted(problem, last.fitted), last.fitted.get(name, 1.0)
     assert physics.spectrum is not None and physics.materials is not None
     assert wanted.soft_density is not None
-    ratio = wanted.soft_density / last.soft_density if last.soft_density > 0 else 1.0
+    ratio = wanted.soft_density / last.soft_density if last.soft_density else 1.0
     if abs(ratio - 1.0) < _LEAST_CHANGE:
         return {}
     low, high = _bounds(name, problem)

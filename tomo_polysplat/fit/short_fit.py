@@ -87,9 +87,9 @@ class ShortFit:
         Misfit of the held-out rays, or of the fitted ones where there are too few.
     darkest : float
         Misfit of the rays with the least light.
-    soft_density : float
+    soft_density : float or None
         Density in g/cm3 of what most of the object is made of besides metal, were it the first material; 0 where that
-        is too thin.
+        is too thin, None where it was not asked for.
     rays : RaySample
         Some of the rays.
     scatter_level : float
@@ -101,15 +101,15 @@ class ShortFit:
     fitted: dict[str, float]
     held_out: float
     darkest: float
-    soft_density: float
+    soft_density: float | None
     rays: RaySample
     scatter_level: float
     cut: bool = False
 
     def record(self) -> dict[str, float]:
         """Its numbers, for the plan."""
-        known = {"held_out": self.held_out, "darkest": self.darkest, "soft_density": self.soft_density}
-        return self.fitted | known
+        numbers = self.fitted | {"held_out": self.held_out, "darkest": self.darkest}
+        return numbers if self.soft_density is None else numbers | {"soft_density": self.soft_density}
 
 
 def short_fit(
@@ -121,6 +121,8 @@ def short_fit(
     seed: int,
     time_budget: float | None,
     fewest_steps: int = _FEWEST_STEPS,
+    *,
+    density: bool = False,
 ) -> ShortFit:
     """Two passes over the views, or more where they are few.
 
@@ -137,6 +139,8 @@ def short_fit(
         Seconds of the whole reconstruction.
     fewest_steps : int
         Steps of the optimiser at least.
+    density : bool
+        Whether the density of the main matter is to be told.
 
     Raises
     ------
@@ -152,12 +156,14 @@ def short_fit(
     seeds = problem.seeds(start, plan, short, device)
     short = replace(short, tv_weight=weights_by_depth(plan.depth, rays)[0] * settings.tv_weight)
     outcome = fitted_shortly(seeds, plan, problem, scene, rays, short, seed, time_budget)
+    main = None
     with torch.no_grad():
-        density = scene.volume(outcome.gaussians).cpu().numpy() * plan.reference
+        if density:
+            volume = scene.volume(outcome.gaussians).cpu().numpy() * plan.reference
+            main = main_density(volume, settings.metal_level * plan.reference)
         sample = sample_rays(outcome.gaussians, scene, rays, seed)
         darkest = _darkest(outcome.gaussians, scene, rays, short)
     errors = [entry["held_out"] or entry["loss"] for entry in outcome.history] or [np.inf]
-    main = main_density(density, settings.metal_level * plan.reference)
     level = problem.scatter_level(device)
     return ShortFit(fitted, float(min(errors)), darkest, main, sample, level, cut=cut_short(outcome))
 
