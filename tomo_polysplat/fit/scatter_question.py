@@ -34,8 +34,8 @@ logger = logging.getLogger(__name__)
 _FROM, _RAYS = 0.3, 8000
 # Less scatter than this share of the open beam, in every ray, is none: scans without any come to 0.0025 at most.
 _LEAST = 0.004
-# Beside the object, views that differ by more than this share of what they have in common tell of a drifting beam; and
-# the rays of a view that tell it, and the views.
+# Beside the object, views that differ by more than this share of the most scatter tell of a drifting beam; and the rays
+# of a view that tell it, and the views.
 _DRIFT, _FEWEST_RAYS, _FEWEST_VIEWS = 0.3, 10, 5
 # Steps that the short fits and a new run take, as a share of those of the run and besides.
 _ANEW, _SHORT = 1.0, 360
@@ -89,7 +89,7 @@ class ScatterQuestion:
         most = float(scatter.beside(torch.as_tensor(rays.light)).max()) if len(rays.light) else 0.0
         if most < _LEAST:
             self._none(f"the rays show {most:.1g} of the open beam at most")
-        elif _drifts(rays):
+        elif _drift(rays) > _DRIFT * most:
             words = "the light beside the object differs from view to view, as a beam's drift does"
             self._none(f"{words}; calibrate=True fits it all the same")
         else:
@@ -119,14 +119,15 @@ def scatter_question(
     return None if "scatter" in plan.reasons else ScatterQuestion(plan, problem, calibrate)
 
 
-def _drifts(rays: RaySample) -> bool:
-    """Whether the light beside the object differs from view to view."""
+def _drift(rays: RaySample) -> float:
+    """Standard deviation of the views' light beside the object, as far as noise does not explain it; 0 if unknown."""
     beside = rays.areal.sum(axis=0) == 0
-    many = np.bincount(rays.view[beside].astype(int))
-    sums = np.bincount(rays.view[beside].astype(int), rays.measured[beside])
+    view, values = rays.view[beside].astype(int), rays.measured[beside]
+    many = np.bincount(view)
     enough = many >= _FEWEST_RAYS
     if enough.sum() < _FEWEST_VIEWS:
-        return False
-    means = sums[enough] / many[enough]
-    noise = float(rays.measured[beside].std()) / np.sqrt(many[enough].mean())
-    return bool(max(float(means.std()) - noise, 0.0) > _DRIFT * abs(float(means.mean())))
+        return 0.0
+    means = np.bincount(view, values)[enough] / many[enough]
+    within = values - (np.bincount(view, values) / np.maximum(many, 1))[view]
+    noise = float(within.var()) * float((1 / many[enough]).mean())
+    return float(np.sqrt(max(float(means.var()) - noise, 0.0)))

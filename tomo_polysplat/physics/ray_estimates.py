@@ -15,8 +15,8 @@ from tomo_polysplat.physics.spectrum import Spectrum
 __all__ = ["estimate_scatter", "matching_factor"]
 
 _GAUSS_NEWTON_STEPS = 8
-# Scatter varies where that leaves so much less of the squared residuals: of constant scatter chance takes 0.5 %.
-_BETTER = 0.03
+# Scatter varies where that leaves so much less of the squared residuals: of constant one chance takes 0.2 % at most.
+_BETTER = 0.01
 # Residuals count absolutely beyond this many deviations (Huber 1964, doi:10.1214/aoms/1177703732).
 _HUBER_CORNER = 1.345
 _DEVIATION = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
