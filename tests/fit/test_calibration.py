@@ -14,7 +14,7 @@ from tomo_polysplat.fit.first_volume import first_volume
 from tomo_polysplat.fit.plan import make_plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.short_fit import RaySample, ShortFit, main_density
-from tomo_polysplat.physics.scatter import Scatter
+from tomo_polysplat.physics.scatter import Scatter, light_around
 from tomo_polysplat.settings import make_settings
 
 # Enough steps for the density of the main matter to settle.
@@ -173,7 +173,9 @@ def test_a_density_is_not_followed_against_the_rays_or_past_the_end(factor, held
     def fit(fitted, error):
         return of_fit(fitted, error)
 
-    assert _judge("kvp", fit({}, 1.0), [fit({"kvp": factor}, held_out)], problem)[0] == taken
+    stage = [fit({"kvp": factor}, held_out)]
+    chosen, _ = _judge("kvp", fit({}, 1.0), stage, problem, Calibration(("kvp",), 1.0))
+    assert chosen is (stage[0] if taken else None)
 
 
 def test_other_physics_are_those_of_the_same_measurements():
@@ -183,6 +185,18 @@ def test_other_physics_are_those_of_the_same_measurements():
     assert problem.scatter == Scatter() and problem.spectrum is SPECTRUM
     # On a GPU they would be copied there once for every short fit.
     assert other.measured(device) is problem.measured(device)
+
+
+@pytest.mark.parametrize("fitted", [{"beam": 1.02}, {"scatter": 0.03, "scatter_of_light": -0.02}])
+def test_a_brighter_beam_and_scatter_that_varies_are_taken_out_of_the_rays(fitted):
+    problem, device = problem_of(fan(0.0), SPECTRUM), torch.device("cpu")
+    plain, other = problem.measured(device), with_fitted(problem, fitted)
+    light = torch.exp(-plain) / fitted.get("beam", 1.0)
+    if "scatter" in fitted:
+        light -= Scatter(*fitted.values()).beside(light_around(plain))
+    found = torch.exp(-other.measured(device)) - other.scatter_level(device)
+    torch.testing.assert_close(found, light, rtol=1e-5, atol=1e-6)
+    assert problem.measured(device) is plain
 
 
 def test_whether_matter_is_inside_is_looked_up_once_whatever_the_physics(monkeypatch):
@@ -223,6 +237,30 @@ def test_walls_do_not_tell_their_density():
     assert main_density(density) == 0.0
     problem = problem_of(fan(0.0), SPECTRUM)
     before = of_fit({}, 1.0, density=main_density(density))
-    taken, why = _judge("kvp", before, [], problem)
-    assert not taken and "density" in why
-    assert _judge("scatter", before, [], problem) == (False, "nothing to change")
+    wanted = Calibration(("scatter", "kvp"), 1.0)
+    chosen, why = _judge("kvp", before, [], problem, wanted)
+    assert chosen is None and "density" in why
+    assert _judge("scatter", before, [], problem, wanted) == (None, "nothing to change")
+
+
+@pytest.mark.parametrize(
+    ("scatter", "beam", "taken"),
+    [
+        *((((0.5, 0.5), (0.6, 0.9), "scatter"), ((0.5, 0.9), (0.49, 0.8), "beam"))),
+        # Not the darkest rays as well; not better than the other; neither better than before.
+        *((((0.5, 1.1), None, None), ((0.5, 0.9), (0.6, 0.8), None), ((0.99, 0.9), (1.1, 0.95), None))),
+    ],
+)
+def test_scatter_that_only_the_rays_ask_for_has_to_explain_the_darkest_and_beat_a_brighter_beam(
+    scatter, beam, taken
+):
+    before, problem = of_fit({}, 1.0), problem_of(fan(0.0), SPECTRUM)
+    stage = [of_fit({"scatter": 0.02}, scatter[0], darkest=scatter[1])]
+    if beam is not None:
+        stage.append(of_fit({"beam": 1.02}, beam[0], darkest=beam[1]))
+    chosen, why = _judge("scatter", before, stage, problem, Calibration(("scatter",), None, suspected=True))
+    assert ([*chosen.fitted] if chosen else []) == ([taken] if taken else [])
+    assert ("not accepted" in why) == (taken is None)
+    # Who asks for scatter means it.
+    asked, _ = _judge("scatter", before, stage[:1], problem, Calibration(("scatter",), None))
+    assert (asked is stage[0]) == (scatter[0] < 0.97)

@@ -98,7 +98,7 @@ def under(problem: Problem, found: dict[str, Any] | None) -> tuple[Problem, dict
     if found is None:
         return problem, {}
     reasons: dict[str, Any] = {"calibration": found}
-    if found["fitted"].get("scatter"):
+    if found["accepted"].get("scatter"):
         reasons["scatter"] = f"modelled: {describe_scatter(found['fitted'])}"
     return with_fitted(problem, found["fitted"]), reasons
 

@@ -51,7 +51,7 @@ class _Known:
     """What is made once for a scan, whatever the physics that it is fitted under."""
 
     copies: dict[torch.device, torch.Tensor] = field(default_factory=dict)
-    level: dict[torch.device, tuple[Scatter, torch.Tensor, float]] = field(default_factory=dict)
+    level: dict[torch.device, tuple[tuple[Scatter, float], torch.Tensor, float]] = field(default_factory=dict)
     closed: tuple[bool, str] | None = None
     agreement: list[float | None] | None = None
     photons: float | None = None
@@ -81,6 +81,8 @@ class Problem:
         None for a monochromatic model.
     scatter : Scatter
         That the rays hold besides what passes.
+    beam : float
+        Brightness of the beam, in those of the open field that the rays are relative to.
     """
 
     projections: np.ndarray
@@ -93,6 +95,7 @@ class Problem:
     spectrum: Spectrum | None = None
     materials: Materials | None = None
     scatter: Scatter = Scatter()
+    beam: float = 1.0
     _known: _Known = field(default_factory=_Known, init=False, repr=False)
 
     @classmethod
@@ -146,9 +149,9 @@ class Problem:
         """Shortest edge of a voxel, in the solver's coordinates."""
         return float(self.grid.voxel_size[: self.dimensions].min())
 
-    def under(self, spectrum: Spectrum, scatter: Scatter) -> Problem:
+    def under(self, spectrum: Spectrum, scatter: Scatter, beam: float) -> Problem:
         """The same measurements under other physics; copies of them on devices serve both."""
-        other = replace(self, spectrum=spectrum, scatter=scatter)
+        other = replace(self, spectrum=spectrum, scatter=scatter, beam=beam)
         object.__setattr__(other, "_known", self._known)
         return other
 
@@ -162,24 +165,25 @@ class Problem:
     def measured(self, device: torch.device) -> torch.Tensor:
         """The projections on a device, copied there once; on the host where they do not fit there.
 
-        Scatter that varies is made level (`tomo_polysplat.physics.scatter.made_level`).
+        They are relative to the beam, and scatter that varies is made level
+        (`tomo_polysplat.physics.scatter.made_level`).
         """
         return self._level(device)[0]
 
     def scatter_level(self, device: torch.device) -> float:
-        """The constant scatter of what was measured, as a fraction of the open beam."""
+        """The constant scatter of what was measured, as a fraction of the beam."""
         return self._level(device)[1]
 
     def _level(self, device: torch.device) -> tuple[torch.Tensor, float]:
-        """What was measured, made level, and its scatter; of scatter that varies the last one asked for is kept."""
-        values = self._copied(device)
-        if not self.scatter.varies:
+        """What was measured, made level, and its scatter; of what differs from the copies the last one is kept."""
+        values, light = self._copied(device), (self.scatter, self.beam)
+        if not self.scatter.varies and self.beam == 1.0:
             return values, self.scatter.constant
         known = self._known.level.get(device)
-        if known is None or known[0] != self.scatter:
+        if known is None or known[0] != light:
             self._known.level.pop(device, None)
             values = values if projections_stay(values.nbytes, device) else values.cpu()
-            known = (self.scatter, *made_level(values, self.scatter))
+            known = (light, *made_level(values + math.log(self.beam), self.scatter))
             self._known.level[device] = known
         return known[1:]
 

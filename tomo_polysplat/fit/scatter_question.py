@@ -121,8 +121,7 @@ def scatter_question(
 
 def _drift(rays: RaySample) -> float:
     """Standard deviation of the views' light beside the object, as far as noise does not explain it; 0 if unknown."""
-    beside = rays.areal.sum(axis=0) == 0
-    view, values = rays.view[beside].astype(int), rays.measured[beside]
+    view, values = rays.view[rays.beside].astype(int), rays.measured[rays.beside]
     many = np.bincount(view)
     enough = many >= _FEWEST_RAYS
     if enough.sum() < _FEWEST_VIEWS:

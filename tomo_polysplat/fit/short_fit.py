@@ -43,6 +43,8 @@ _FEWEST_STEPS = 120
 # Of the seconds that a reconstruction may take, the share for each short fit.
 _SHARE_OF_BUDGET = 0.1
 _RAYS = 60_000
+# As few rays beside the object do not tell how bright the beam is.
+_FEWEST_BESIDE = 100
 # Share of the rays that count as the darkest.
 _DARKEST = 0.02
 # The main matter's voxels: this share of those inside of it, the ones closest to each other.
@@ -73,6 +75,16 @@ class RaySample:
     weight: np.ndarray
     light: np.ndarray
     view: np.ndarray
+
+    @property
+    def beside(self) -> np.ndarray:
+        """Which of them pass beside the object."""
+        return self.areal.sum(axis=0) == 0
+
+    def beam(self) -> float:
+        """How many times as bright as the open field the rays beside the object are; 1 where there are too few."""
+        values = self.measured[self.beside]
+        return float(np.exp(-np.median(values))) if len(values) >= _FEWEST_BESIDE else 1.0
 
 
 @dataclass

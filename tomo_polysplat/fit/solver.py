@@ -119,7 +119,7 @@ class Solver:
     def _scatter_question(self, begun: Begun, problem: Problem) -> ScatterQuestion | None:
         def scatter() -> dict[str, Any]:
             self.report(0.0, "scatter")
-            return calibrate(problem, Calibration(("scatter",), None), self.wishes)
+            return calibrate(problem, Calibration(("scatter",), None, suspected=True), self.wishes)
 
         return scatter_question(begun.plan, problem, begun.scene, scatter)
 
