@@ -122,6 +122,20 @@ def test_recon_energy_spectrum_and_mono(scan_file, tmp_path, solver):
     assert solver[-1]["spectrum"].effective_energy == pytest.approx(55.0)
 
 
+@pytest.mark.parametrize(
+    ("options", "asked"),
+    [
+        ([], None),
+        (["--no-calibrate"], False),
+        (["--calibrate"], True),
+        (["--calibrate", "scatter"], ["scatter"]),
+    ],
+)
+def test_scatter_is_looked_for_unless_told_otherwise(scan_file, tmp_path, solver, options, asked):
+    assert main(["recon", str(scan_file), "-o", str(tmp_path / "volume.h5"), *options]) == 0
+    assert solver[0]["calibrate"] == asked
+
+
 def test_recon_reads_counts_with_the_options_given(tmp_path, solver):
     path = tmp_path / "counts.h5"
     with h5py.File(path, "w") as file:
