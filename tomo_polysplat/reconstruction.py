@@ -6,7 +6,6 @@ import logging
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -96,9 +95,10 @@ def reconstruct(
     calibrate : bool or names among "scatter", "kvp", "filter", optional
         Fit these by a few short fits first, and use what fits the held-out rays better: a scattered signal, and the
         tube's voltage or its filters, which need ``soft_density``. True calibrates scatter, and the voltage where
-        the density is given; False nothing; None scatter, where the rays show it in the middle of the fit, which then
-        begins anew. ``result.plan["calibration"]`` and ``["scatter"]`` tell what came of it; what a time budget leaves
-        no room for is left as it is.
+        the density is given; False nothing; None scatter, where the rays show it after a third of the fit, which
+        then begins anew (and callbacks see its iterations and share begin again).
+        ``result.plan["calibration"]`` and ``["scatter"]`` tell what came of it; what a time budget leaves no room for
+        is left as it is.
     soft_density : float, optional
         Known density in g/cm3, at most 25, of what most of the object is made of, the first of ``materials``.
     callbacks : sequence of callables
@@ -142,7 +142,8 @@ def reconstruct(
     del values
     wanted = Calibration.of(calibrate, soft_density, problem.spectrum)
     flipped = is_planar_geometry(proj_geom)
-    options = wishes.options() | {"calibration": calibrate is None if wanted is None else asdict(wanted)}
+    asked = None if wanted is None else {"names": wanted.names, "soft_density": wanted.soft_density}
+    options = wishes.options() | {"calibration": asked or ("as the rays ask" if calibrate is None else None)}
     saved = _checkpoint(checkpoint, resume, problem, options)
     started -= 0.0 if saved is None else saved.seconds
     with one_torch_thread(wishes.device), kept_threads(), progress_reports(progress) as report:

@@ -193,7 +193,7 @@ def test_a_brighter_beam_and_scatter_that_varies_are_taken_out_of_the_rays(fitte
     plain, other = problem.measured(device), with_fitted(problem, fitted)
     light = torch.exp(-plain) / fitted.get("beam", 1.0)
     if "scatter" in fitted:
-        light -= Scatter(*fitted.values()).beside(light_around(plain))
+        light -= Scatter(*fitted.values()).at(light_around(plain))
     found = torch.exp(-other.measured(device)) - other.scatter_level(device)
     torch.testing.assert_close(found, light, rtol=1e-5, atol=1e-6)
     assert problem.measured(device) is plain

@@ -93,8 +93,8 @@ def test_scatter_made_level_is_the_same_everywhere(scatter):
     rng = np.random.default_rng(6)
     plain = torch.from_numpy(rng.uniform(0.0, 6.0, (5, 13, 17)).astype(np.float32))
     plain[0, 3, 4], light = torch.nan, light_around(plain)
-    scattered = -torch.log(torch.exp(-plain) + scatter.beside(light))
-    scatter_of = scatter.beside(light_around(scattered))
+    scattered = -torch.log(torch.exp(-plain) + scatter.at(light))
+    scatter_of = scatter.at(light_around(scattered))
     made, level = made_level(scattered, scatter)
     expected = -torch.log(torch.exp(-scattered) - scatter_of + level)
     np.testing.assert_allclose(made, expected, rtol=1e-5, atol=1e-6)
@@ -105,7 +105,7 @@ def test_scatter_made_level_is_the_same_everywhere(scatter):
 
 
 def beside(scatter, light):
-    return scatter.beside(torch.from_numpy(light)).numpy()
+    return scatter.at(torch.from_numpy(light)).numpy()
 
 
 @pytest.mark.parametrize("kvp", [81, 99])

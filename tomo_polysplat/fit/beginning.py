@@ -98,8 +98,10 @@ def under(problem: Problem, found: dict[str, Any] | None) -> tuple[Problem, dict
     if found is None:
         return problem, {}
     reasons: dict[str, Any] = {"calibration": found}
-    if found["accepted"].get("scatter"):
-        reasons["scatter"] = f"modelled: {describe_scatter(found['fitted'])}"
+    if "scatter" in found["accepted"]:
+        modelled = found["accepted"]["scatter"]
+        what = f"modelled: {describe_scatter(found['fitted'])}" if modelled else f"none: {found['why']}"
+        reasons["scatter"] = what
     return with_fitted(problem, found["fitted"]), reasons
 
 

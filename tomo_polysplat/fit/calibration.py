@@ -272,7 +272,7 @@ def _scatter_moved(last: ShortFit, problem: Problem) -> dict[str, float]:
     found = estimate_scatter(*sample, physics.spectrum, physics.materials, level)
     new = Scatter(was.constant + found.constant - level, was.of_light + found.of_light)
     light = torch.as_tensor(rays.light)
-    old, now = was.beside(light), new.beside(light)
+    old, now = was.at(light), new.at(light)
     if not len(light) or float((now - old).abs().max()) <= max(_LEAST_SCATTER, 0.02 * float(old.max())):
         return {}
     return scatter_as_fitted(new)

@@ -32,7 +32,7 @@ __all__ = ["Checkpoint", "Snapshot"]
 
 logger = logging.getLogger(__name__)
 
-FORMAT = 13
+FORMAT = 14
 # Writing takes at most this share of the time.
 _LARGEST_SHARE = 0.05
 _PARTS = tuple(field.name for field in fields(Gaussians))
@@ -229,7 +229,9 @@ def _require_calibration(plan: Plan, asked: Any) -> None:
     if not isinstance(asked, dict) and "calibration" not in plan.reasons:
         return
     found = plan.reasons["calibration"]
-    if not (isinstance(found, dict) and isinstance(found.get("fitted"), dict)):
+    fitted, accepted = found["fitted"], found["accepted"]
+    numbers = all(isinstance(value, float) and math.isfinite(value) for value in fitted.values())
+    if not (numbers and isinstance(accepted, dict)):
         raise TypeError(f"what the calibration found, got {found}")
 
 

@@ -21,7 +21,7 @@ from tomo_polysplat.fit.stopping import Clock, FitState, Watch, patience_of
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 
-__all__ = ["FitOutcome", "FitState", "fit"]
+__all__ = ["FitOutcome", "FitState", "OtherPhysics", "fit"]
 
 logger = logging.getLogger(__name__)
 
@@ -44,6 +44,24 @@ class FitOutcome:
             "gaussians_relocated": self.relocated,
             "pairs_skipped_at_source": self.skipped_pairs,
         }
+
+
+class OtherPhysics(Exception):
+    """A fit is to begin anew, under physics that its rays have shown.
+
+    Attributes
+    ----------
+    found : dict
+        The record of what told so; see `fit.calibration.calibrated`.
+    outcome : FitOutcome
+        What the fit had come to.
+    """
+
+    outcome: FitOutcome
+
+    def __init__(self, found: dict[str, Any]) -> None:
+        super().__init__(found["why"])
+        self.found = found
 
 
 @dataclass
@@ -153,7 +171,12 @@ def fit(
     held-out rays have not improved for `patience_of` passes, when a callback returns True, or on
     KeyboardInterrupt; returns the Gaussians that `Watch` holds for the best. Where ``checkpoint``
     holds a snapshot, ``gaussians`` are its own and the fit goes on from there. ``question`` is asked on the way, and
-    ``look`` called before each pass.
+    ``look`` called between passes.
+
+    Raises
+    ------
+    OtherPhysics
+        That ``look`` raises, with what the fit had come to.
     """
     if not len(gaussians):
         logger.warning("The start volume is empty: no Gaussians, a volume of zeros.")
@@ -173,6 +196,10 @@ def fit(
     except KeyboardInterrupt:
         logger.warning("Interrupted after %d steps; the best state so far is returned.", clock.done)
         outcome.reason = "interrupted"
+    except OtherPhysics as other:
+        outcome.gaussians, outcome.reason = watch.best or gaussians.copy(), "interrupted"
+        other.outcome = outcome
+        raise
     outcome.reason = outcome.reason or _used_up(clock, settings)
     outcome.gaussians = watch.best or gaussians.copy()
     return outcome

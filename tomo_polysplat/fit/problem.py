@@ -181,9 +181,11 @@ class Problem:
             return values, self.scatter.constant
         known = self._known.level.get(device)
         if known is None or known[0] != light:
+            # Let go of first: there may be no room for both.
+            known = None
             self._known.level.pop(device, None)
-            values = values if projections_stay(values.nbytes, device) else values.cpu()
-            known = (light, *made_level(values + math.log(self.beam), self.scatter))
+            values = values if projections_stay(values.nbytes, device) else torch.from_numpy(self.projections)
+            known = (light, *made_level(values, self.scatter, self.beam))
             self._known.level[device] = known
         return known[1:]
 
@@ -197,7 +199,7 @@ class Problem:
     def agreement(self, bodies: Sequence[torch.Tensor]) -> list[float | None]:
         """How much of what varies in bodies of voxels is the object's, told once a scan; see ``start.agreement``."""
         if self._known.agreement is None:
-            values = self.measured(bodies[0].device)
+            values = self._copied(bodies[0].device)
             try:
                 self._known.agreement = halves_agree(values, self.geometry, self.grid, bodies)
             except RuntimeError as problem:
@@ -211,13 +213,13 @@ class Problem:
     def _photons(self, device: torch.device) -> float:
         """Photons of an unattenuated ray, told once a scan; see ``fit.noise``."""
         if self._known.photons is None:
-            self._known.photons = photons_per_ray(self.measured(device))
+            self._known.photons = photons_per_ray(self._copied(device))
         return self._known.photons
 
     def _closed(self, device: torch.device) -> tuple[bool, str]:
         """Whether no matter lies beside the volume, and words that say so."""
         if self._known.closed is None:
-            self._known.closed = matter_is_inside(self.measured(device), self.geometry, self.grid)
+            self._known.closed = matter_is_inside(self._copied(device), self.geometry, self.grid)
         return self._known.closed
 
     def scene(self, plan: Plan, settings: Settings, device: torch.device) -> FitScene:

@@ -15,18 +15,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.calibration import describe_scatter, scatter_as_fitted
 from tomo_polysplat.fit.fitter import Fitter
+from tomo_polysplat.fit.optimise import OtherPhysics
 from tomo_polysplat.fit.plan import Plan
 from tomo_polysplat.fit.problem import Problem
-from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.short_fit import RaySample, sample_rays
 from tomo_polysplat.fit.stopping import Clock
-from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.ray_estimates import estimate_scatter
 from tomo_polysplat.start.initial import FEW_VIEWS
 
-__all__ = ["OtherPhysics", "ScatterQuestion", "scatter_question"]
+__all__ = ["ScatterQuestion", "scatter_question"]
 
 logger = logging.getLogger(__name__)
 
@@ -37,16 +35,8 @@ _LEAST = 0.004
 # Beside the object, views that differ by more than this share of the most scatter tell of a drifting beam; and the rays
 # of a view that tell it, and the views.
 _DRIFT, _FEWEST_RAYS, _FEWEST_VIEWS = 0.3, 10, 5
-# Steps that the short fits and a new run take, as a share of those of the run and besides.
-_ANEW, _SHORT = 1.0, 360
-
-
-class OtherPhysics(Exception):
-    """A run is to begin anew: ``found`` is the record of what told so, ``gaussians`` what it has come to."""
-
-    def __init__(self, found: dict[str, Any], gaussians: Gaussians) -> None:
-        super().__init__(found["why"])
-        self.found, self.gaussians = found, gaussians
+# Steps of the short fits that follow.
+_SHORT = 480
 
 
 @dataclass(frozen=True)
@@ -75,57 +65,72 @@ class ScatterQuestion:
         """
         if "scatter" in self.plan.reasons or clock.share() < _FROM:
             return
-        if clock.room_for(_SHORT + _ANEW * clock.steps):
-            self._ask(fitter)
+        if not clock.room_for(_SHORT + clock.steps):
+            self._tell("not asked: the time budget is kept for the fit")
+            return
+        rays = sample_rays(fitter.gaussians, fitter.scene, fitter.rays, 0, _RAYS)
+        most, drift = self._most(rays, straight=fitter.scene.quadrature is None), _drift(rays)
+        if most < _LEAST:
+            self._tell(f"none: the rays show {most:.1g} of the open beam at most")
+        elif drift is None:
+            words = "too few rays pass beside the object to tell it from a drifting beam"
+            self._tell(f"not modelled: the rays may show {most:.2g} of the open beam, but {words}")
+        elif drift > _DRIFT * most:
+            words = "the light beside the object differs from view to view, as that of a drifting beam does"
+            self._tell(f"not modelled: {words}; calibrate=True fits it all the same")
         else:
-            self._none("the time budget is kept for the fit")
+            self._ask(most)
 
-    def _ask(self, fitter: Fitter) -> None:
+    def _ask(self, most: float) -> None:
+        """Have short fits tell it; what ends these does not end the run."""
+        try:
+            found = self.calibrate()
+        except (RuntimeError, FloatingPointError, ValueError) as error:
+            # Torch's or ours, of a GPU that has no room for a second cloud, or a fit that did not converge.
+            logger.warning("Scatter is not looked for: %s", error)
+            self._tell(f"not asked: {error}")
+            return
+        self.plan.reasons["calibration"] = found
+        if found["accepted"]["scatter"]:
+            raise OtherPhysics(found)
+        self._tell(f"not modelled: the rays may show {most:.2g} of the open beam; {found['why']}")
+
+    def _most(self, rays: RaySample, *, straight: bool) -> float:
+        """The most scatter in any ray, as a fraction of the open beam."""
         spectrum, materials = self.problem.spectrum, self.problem.materials
         assert spectrum is not None and materials is not None
-        rays = sample_rays(fitter.gaussians, fitter.scene, fitter.rays, 0, _RAYS)
+        if not len(rays.light):
+            return 0.0
+        if straight:
+            # Without hardening there are no areal densities in g/cm2; beside the object it shows all the same.
+            return max(0.0, rays.beam() - 1.0)
         sample = (rays.areal, rays.measured, rays.weight, rays.light)
         scatter = estimate_scatter(*sample, spectrum, materials)
-        most = float(scatter.beside(torch.as_tensor(rays.light)).max()) if len(rays.light) else 0.0
-        if most < _LEAST:
-            self._none(f"the rays show {most:.1g} of the open beam at most")
-        elif _drift(rays) > _DRIFT * most:
-            words = "the light beside the object differs from view to view, as a beam's drift does"
-            self._none(f"{words}; calibrate=True fits it all the same")
-        else:
-            found = self.calibrate()
-            if found["accepted"]["scatter"]:
-                raise OtherPhysics(found, fitter.gaussians.copy())
-            self._none(f"looked for {describe_scatter(scatter_as_fitted(scatter))}; {found['why']}")
+        return float(scatter.at(torch.as_tensor(rays.light)).max())
 
-    def _none(self, why: str) -> None:
-        self.plan.reasons["scatter"] = f"none: {why}"
-        logger.info("Scatter: %s.", self.plan.reasons["scatter"])
+    def _tell(self, words: str) -> None:
+        self.plan.reasons["scatter"] = words
+        logger.info("Scatter: %s.", words)
 
 
 def scatter_question(
-    plan: Plan, problem: Problem, scene: FitScene, calibrate: Callable[[], dict[str, Any]]
+    plan: Plan, problem: Problem, calibrate: Callable[[], dict[str, Any]]
 ) -> ScatterQuestion | None:
     """The question where it can be answered; else the plan gets the answer now, unless it has it."""
-    why_not = ""
     if not problem.polychromatic:
         return None
-    if scene.quadrature is None:
-        why_not = "with rays that are straight sums nothing tells it from matter"
-    elif problem.geometry.views < FEW_VIEWS:
-        why_not = f"fewer than {FEW_VIEWS} views do not tell"
-    if why_not:
-        plan.reasons.setdefault("scatter", f"none: {why_not}")
+    if problem.geometry.views < FEW_VIEWS:
+        plan.reasons.setdefault("scatter", f"not asked: fewer than {FEW_VIEWS} views do not tell")
     return None if "scatter" in plan.reasons else ScatterQuestion(plan, problem, calibrate)
 
 
-def _drift(rays: RaySample) -> float:
-    """Standard deviation of the views' light beside the object, as far as noise does not explain it; 0 if unknown."""
+def _drift(rays: RaySample) -> float | None:
+    """How much the views' light beside the object differs, as far as noise does not explain it; None if unknown."""
     view, values = rays.view[rays.beside].astype(int), rays.measured[rays.beside]
     many = np.bincount(view)
     enough = many >= _FEWEST_RAYS
     if enough.sum() < _FEWEST_VIEWS:
-        return 0.0
+        return None
     means = np.bincount(view, values)[enough] / many[enough]
     within = values - (np.bincount(view, values) / np.maximum(many, 1))[view]
     noise = float(within.var()) * float((1 / many[enough]).mean())

@@ -43,6 +43,8 @@ _FEWEST_STEPS = 120
 # Of the seconds that a reconstruction may take, the share for each short fit.
 _SHARE_OF_BUDGET = 0.1
 _RAYS = 60_000
+# Rays that see no more than this share of what the densest one sees pass beside the object.
+_HAZE = 1e-3
 # As few rays beside the object do not tell how bright the beam is.
 _FEWEST_BESIDE = 100
 # Share of the rays that count as the darkest.
@@ -78,8 +80,9 @@ class RaySample:
 
     @property
     def beside(self) -> np.ndarray:
-        """Which of them pass beside the object."""
-        return self.areal.sum(axis=0) == 0
+        """Which of them pass beside the object, but for a haze."""
+        seen = self.areal.sum(axis=0)
+        return seen <= _HAZE * seen.max(initial=0.0)
 
     def beam(self) -> float:
         """How many times as bright as the open field the rays beside the object are; 1 where there are too few."""

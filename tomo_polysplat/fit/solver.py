@@ -14,11 +14,11 @@ import torch
 from tomo_polysplat.fit.beginning import Begun, Wishes, begin, calibrate, physics, under
 from tomo_polysplat.fit.calibration import Calibration
 from tomo_polysplat.fit.checkpoint import Checkpoint
-from tomo_polysplat.fit.optimise import FitOutcome, fit
+from tomo_polysplat.fit.optimise import FitOutcome, OtherPhysics, fit
 from tomo_polysplat.fit.pixel_question import pixel_question
 from tomo_polysplat.fit.plan import Plan
 from tomo_polysplat.fit.problem import Problem
-from tomo_polysplat.fit.scatter_question import OtherPhysics, ScatterQuestion, scatter_question
+from tomo_polysplat.fit.scatter_question import ScatterQuestion, scatter_question
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.transfer import to_host
@@ -68,22 +68,34 @@ class Solver:
         KeyboardInterrupt
             After Ctrl-C before the fit has begun.
         """
-        under_found, found = physics(problem, wanted, self.wishes, self.saved, self.report)
-        begun = self._begin(under_found, found)
+        problem, found = physics(problem, wanted, self.wishes, self.saved, self.report)
+        begun = self._begin(problem, found)
         try:
-            return under_found, begun, self._fit(begun, under_found, ask_scatter)
+            return problem, begun, self._fit(begun, problem, ask_scatter)
         except OtherPhysics as other:
-            other_problem, found = under(under_found, other.found)
-            try:
-                anew = self._begin(other_problem, found)
-            except KeyboardInterrupt:
-                logger.warning("Interrupted before the fit had begun anew; what it had come to is returned.")
-                return under_found, begun, FitOutcome(other.gaussians, reason="interrupted")
-            return other_problem, anew, self._fit(anew, other_problem, ask_scatter)
+            found, so_far = other.found, other.outcome
+        # Outside of the handler, which would keep all of the first fit in memory.
+        return self._anew(problem, begun, found, so_far)
+
+    def _anew(
+        self, problem: Problem, begun: Begun, found: dict[str, Any], so_far: FitOutcome
+    ) -> tuple[Problem, Begun, FitOutcome]:
+        """What `solve` gives, under other physics than those that a fit had begun with."""
+        other, reasons = under(problem, found)
+        try:
+            anew = self._begin(other, reasons)
+            outcome = self._fit(anew, other, ask_scatter=False)
+            if outcome.history or outcome.reason != "interrupted":
+                return other, anew, outcome
+        except KeyboardInterrupt:
+            logger.warning("Interrupted before the fit had begun anew; what it had come to is returned.")
+        begun.plan.reasons["scatter"] = f"not modelled: interrupted; {found['why']}"
+        return problem, begun, so_far
 
     def _begin(self, problem: Problem, found: dict[str, Any]) -> Begun:
         begun = begin(problem, self.wishes, self.saved, self.report)
-        begun.plan.reasons |= found
+        # A plan from a checkpoint tells it already.
+        begun.plan.reasons = found | begun.plan.reasons
         return begun
 
     def _fit(self, begun: Begun, problem: Problem, ask_scatter: bool) -> FitOutcome:
@@ -121,7 +133,7 @@ class Solver:
             self.report(0.0, "scatter")
             return calibrate(problem, Calibration(("scatter",), None, suspected=True), self.wishes)
 
-        return scatter_question(begun.plan, problem, begun.scene, scatter)
+        return scatter_question(begun.plan, problem, scatter)
 
 
 def _volume_of(

@@ -12,10 +12,10 @@ def projection(areal: np.ndarray, log_weights: np.ndarray, attenuation: np.ndarr
 
     Parameters
     ----------
-    areal : (3, ...) array
-        Areal densities in g/cm2 of the three base materials along each ray.
+    areal : (k, ...) array
+        Areal densities in g/cm2 of k base materials along each ray.
     log_weights : (n,) array
-    attenuation : (3, n) array
+    attenuation : (k, n) array
         Mass attenuation in cm2/g.
 
     Returns

@@ -17,6 +17,8 @@ __all__ = ["estimate_scatter", "matching_factor"]
 _GAUSS_NEWTON_STEPS = 8
 # Scatter varies where that leaves so much less of the squared residuals: of constant one chance takes 0.2 % at most.
 _BETTER = 0.01
+# Where the light around the rays differs by less, no other scatter than a constant one is told.
+_LEAST_SPREAD = 0.03
 # Residuals count absolutely beyond this many deviations (Huber 1964, doi:10.1214/aoms/1177703732).
 _HUBER_CORNER = 1.345
 _DEVIATION = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
@@ -53,14 +55,17 @@ def estimate_scatter(
     curves = materials.mass_attenuation(spectrum.energies[lit])[: len(areal)]
     value, share = shares(areal, np.log(spectrum.weights[lit]), curves)
     primary, slopes = np.exp(-value), (curves @ share) * areal
-    kinds = np.stack([np.ones_like(light), light])
     rays = (primary, slopes, measured, weight)
+    mean = float(light.mean()) if len(light) else 0.0
+    kinds = np.stack([np.ones_like(light), light - mean])
     (constant,), plain = _scatter_of(kinds[:1], np.array([start]), *rays)
-    (base, of_light), varied = _scatter_of(kinds, np.array([constant, 0.0]), *rays)
-    corner = _corner(plain)
-    left = [float((np.minimum(deviation, corner) ** 2).sum()) for deviation in (plain, varied)]
-    if left[1] < (1 - _BETTER) * left[0]:
-        return Scatter(base, of_light)
+    spread = float(np.ptp(light)) if len(light) else 0.0
+    if spread >= _LEAST_SPREAD:
+        (level, of_light), varied = _scatter_of(kinds, np.array([constant, 0.0]), *rays)
+        corner = _corner(plain)
+        left = [float((np.minimum(deviation, corner) ** 2).sum()) for deviation in (plain, varied)]
+        if left[1] < (1 - _BETTER) * left[0] and abs(of_light) * spread < LARGEST_SCATTER:
+            return Scatter(level - of_light * mean, of_light)
     return Scatter(min(max(constant, 0.0), LARGEST_SCATTER))
 
 
@@ -75,15 +80,32 @@ def _scatter_of(
     """Amounts of some kinds of scatter, from the first ones on, that explain rays best, and what these then lack."""
     robust = np.ones_like(measured)
     for _ in range(_GAUSS_NEWTON_STEPS):
-        total = primary + np.clip(amounts @ kinds, 0.0, LARGEST_SCATTER) + np.finfo(np.float64).tiny
-        columns = np.concatenate([-kinds / total, slopes * (primary / total)]) * weight
-        target = (measured + np.log(total)) * weight
+        columns, target = _linearised(kinds, amounts @ kinds, primary, slopes, measured, weight)
         step = np.linalg.lstsq((columns * robust).T, target * robust, rcond=None)[0]
         amounts = amounts + step[: len(kinds)]
+        # The mean scatter; what it differs by is bounded ray by ray.
+        amounts[0] = np.clip(amounts[0], 0.0, LARGEST_SCATTER)
         deviation = np.abs(target - step @ columns)
         corner = _corner(deviation)
         robust = np.sqrt(corner / np.maximum(deviation, corner))
-    return [float(amount) for amount in amounts], deviation
+    columns, target = _linearised(kinds[:0], amounts @ kinds, primary, slopes, measured, weight)
+    step = np.linalg.lstsq((columns * robust).T, target * robust, rcond=None)[0]
+    return [float(amount) for amount in amounts], np.abs(target - step @ columns)
+
+
+def _linearised(
+    kinds: np.ndarray,
+    scatter: np.ndarray,
+    primary: np.ndarray,
+    slopes: np.ndarray,
+    measured: np.ndarray,
+    weight: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """What rays under some scatter change by with each kind of it and each curve's amount, and what they lack."""
+    within = (scatter >= 0) & (scatter <= LARGEST_SCATTER)
+    total = primary + np.clip(scatter, 0.0, LARGEST_SCATTER) + np.finfo(np.float64).tiny
+    columns = np.concatenate([-kinds * within / total, slopes * (primary / total)]) * weight
+    return columns, (measured + np.log(total)) * weight
 
 
 def _corner(deviation: np.ndarray) -> float:

@@ -2,8 +2,9 @@
 
 The open beam I0 is taken without the object, so scatter from the object adds to every ray, air included. It varies
 slowly over the detector: here it is a constant plus a share of the light that passes in the wide neighbourhood of a
-ray, as in convolution models (Ohnesorge, Flohr, Klingenbeck-Regn 1999, doi:10.1007/s003300050710). A share below 0
-puts most of it behind the most matter.
+ray. That is cruder than a convolution of what matter scatters (as Ohnesorge, Flohr, Klingenbeck-Regn 1999,
+doi:10.1007/s003300050710), but needs to know nothing of the scanner; a share below 0 puts most of it behind the most
+matter.
 
 A model of the rays with a constant scattered signal is the one node of a quadrature more which nothing attenuates.
 For scatter that varies, what it lacks of a level is added to the rays, whose scatter then is that level everywhere.
@@ -11,6 +12,7 @@ For scatter that varies, what it lacks of a level is added to the rays, whose sc
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -51,7 +53,7 @@ class Scatter:
         """Whether it differs from ray to ray."""
         return self.of_light != 0.0
 
-    def beside(self, light: torch.Tensor) -> torch.Tensor:
+    def at(self, light: torch.Tensor) -> torch.Tensor:
         """The scatter of rays with so much light around them."""
         return (self.constant + self.of_light * light).clamp(0.0, LARGEST_SCATTER)
 
@@ -83,7 +85,7 @@ def _neighbourhood(pixels: int, like: torch.Tensor) -> torch.Tensor:
     return torch.exp(-0.5 * ((place[:, None] - place[None]) / _WIDTH) ** 2)
 
 
-def made_level(values: torch.Tensor, scatter: Scatter) -> tuple[torch.Tensor, float]:
+def made_level(values: torch.Tensor, scatter: Scatter, beam: float = 1.0) -> tuple[torch.Tensor, float]:
     """Rays as they would be if the scatter were a level everywhere, and that level.
 
     Parameters
@@ -91,21 +93,27 @@ def made_level(values: torch.Tensor, scatter: Scatter) -> tuple[torch.Tensor, fl
     values : (views, rows, columns) tensor
         ``-log(I / I0)``; NaN is kept.
     scatter : Scatter
+        As a fraction of the beam.
+    beam : float
+        Brightness of the beam, in those of the open field I0.
     """
+    if beam != 1.0:
+        values = values + math.log(beam)
     if not scatter.varies:
         return values, scatter.constant
     chunks = values.split(max(1, _CHUNK // values[0].numel()))
     level = max(0.0, *(_least_level(chunk, scatter) for chunk in chunks))
     made = torch.empty_like(values)
     for chunk, place in zip(chunks, made.split(len(chunks[0]))):
-        light = torch.exp(-chunk) + level - scatter.beside(light_around(chunk))
-        place.copy_(-torch.log(light))
+        light = torch.exp(-chunk) + (level - scatter.at(light_around(chunk)))
+        # Rounding leaves some rays without any.
+        place.copy_(-torch.log(light.clamp(min=torch.finfo(light.dtype).tiny)))
     return made, level
 
 
 def _least_level(values: torch.Tensor, scatter: Scatter) -> float:
     """The level below which some of the rays would lose too much light."""
-    needed = scatter.beside(light_around(values)) - _LOWERED * torch.exp(-values)
+    needed = scatter.at(light_around(values)) - _LOWERED * torch.exp(-values)
     return float(needed.nan_to_num(nan=0.0).max())
 
 
