@@ -39,7 +39,7 @@ _SHARE_OF_BUDGET = 0.6
 _STEPS_FOR_DENSITY = 240
 # Scatter below this share of the open beam, and densities closer than this, are left as they are.
 _LEAST_SCATTER, _LEAST_CHANGE = 2e-3, 0.02
-# Held-out errors of two fits of the same scan differ by up to 2 % by chance.
+# Held-out errors of two fits of the same scan under nearly the same physics, with one seed, differ by up to 2 %.
 _MARGIN = 0.03
 # Scatter, and a brighter beam, have to explain the darkest rays by so much better than each other. Scatter of 1 and 2 %
 # in scenes with metal did by 8 to 36 %; beams 1 % brighter are taken for scatter where iron is opaque (10 and 12 %).
