@@ -189,6 +189,10 @@ class Problem:
             self._known.level[device] = known
         return known[1:]
 
+    def let_go_of_level(self) -> None:
+        """Forget rays made level for physics that is not used: they take as much memory as those measured."""
+        self._known.level.clear()
+
     def _copied(self, device: torch.device) -> torch.Tensor:
         copies = self._known.copies
         if device not in copies:

@@ -131,7 +131,10 @@ class Solver:
     def _scatter_question(self, begun: Begun, problem: Problem) -> ScatterQuestion | None:
         def scatter() -> dict[str, Any]:
             self.report(0.0, "scatter")
-            return calibrate(problem, Calibration(("scatter",), None, suspected=True), self.wishes)
+            found = calibrate(problem, Calibration(("scatter",), None, suspected=True), self.wishes)
+            if not found["accepted"]["scatter"]:
+                problem.let_go_of_level()
+            return found
 
         return scatter_question(begun.plan, problem, scatter)
 
