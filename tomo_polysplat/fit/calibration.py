@@ -28,7 +28,7 @@ from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.tube_tables import voltage_range
 from tomo_polysplat.settings import Settings
 
-__all__ = ["Calibration", "calibrated", "describe_scatter", "scatter_as_fitted", "with_fitted"]
+__all__ = ["Calibration", "calibrated", "describe_scatter", "with_fitted"]
 
 logger = logging.getLogger(__name__)
 
@@ -140,7 +140,7 @@ def _scatter_in(fitted: Mapping[str, float]) -> Scatter:
     return Scatter(float(fitted.get("scatter", 0.0)), float(fitted.get("scatter_of_light", 0.0)))
 
 
-def scatter_as_fitted(scatter: Scatter) -> dict[str, float]:
+def _as_fitted(scatter: Scatter) -> dict[str, float]:
     """As `with_fitted` takes it."""
     return {"scatter": scatter.constant} | ({"scatter_of_light": scatter.of_light} if scatter.varies else {})
 
@@ -267,15 +267,17 @@ def _scatter_moved(last: ShortFit, problem: Problem) -> dict[str, float]:
     """The scatter where the last short fit says that it is; nothing where that is where it was."""
     physics, rays = with_fitted(problem, last.fitted), last.rays
     assert physics.spectrum is not None and physics.materials is not None
+    if not len(rays.light):
+        return {}
     level, was = last.scatter_level, physics.scatter
     sample = (rays.areal, rays.measured, rays.weight, rays.light)
     found = estimate_scatter(*sample, physics.spectrum, physics.materials, level)
     new = Scatter(was.constant + found.constant - level, was.of_light + found.of_light)
     light = torch.as_tensor(rays.light)
     old, now = was.at(light), new.at(light)
-    if not len(light) or float((now - old).abs().max()) <= max(_LEAST_SCATTER, 0.02 * float(old.max())):
+    if float((now - old).abs().max()) <= max(_LEAST_SCATTER, 0.02 * float(old.max())):
         return {}
-    return scatter_as_fitted(new)
+    return _as_fitted(new)
 
 
 def _moved(name: str, last: ShortFit, wanted: Calibration, problem: Problem) -> dict[str, float]:

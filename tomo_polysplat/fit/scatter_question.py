@@ -132,7 +132,6 @@ def _drift(rays: RaySample) -> float | None:
     enough = many >= _FEWEST_RAYS
     if enough.sum() < _FEWEST_VIEWS:
         return None
-    means = np.bincount(view, values)[enough] / many[enough]
-    within = values - (np.bincount(view, values) / np.maximum(many, 1))[view]
-    noise = float(within.var()) * float((1 / many[enough]).mean())
-    return float(np.sqrt(max(float(means.var()) - noise, 0.0)))
+    means = np.bincount(view, values) / np.maximum(many, 1)
+    noise = float((values - means[view]).var()) * float((1 / many[enough]).mean())
+    return float(np.sqrt(max(float(means[enough].var()) - noise, 0.0)))

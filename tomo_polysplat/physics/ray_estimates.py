@@ -33,7 +33,7 @@ def estimate_scatter(
     materials: Materials,
     start: float = 0.0,
 ) -> Scatter:
-    """Scatter that explains the residuals of rays best, one that varies where that is needed.
+    """Scatter that explains the residuals of rays, at least one, best; it varies where that is needed.
 
     Gauss-Newton steps with Huber's weights on the scatter together with one factor for the amount of each of
     the curves, so that matter which has taken up some of the scatter gives it back.
@@ -56,10 +56,10 @@ def estimate_scatter(
     value, share = shares(areal, np.log(spectrum.weights[lit]), curves)
     primary, slopes = np.exp(-value), (curves @ share) * areal
     rays = (primary, slopes, measured, weight)
-    mean = float(light.mean()) if len(light) else 0.0
+    mean = float(light.mean())
     kinds = np.stack([np.ones_like(light), light - mean])
     (constant,), plain = _scatter_of(kinds[:1], np.array([start]), *rays)
-    spread = float(np.ptp(light)) if len(light) else 0.0
+    spread = float(np.ptp(light))
     if spread >= _LEAST_SPREAD:
         (level, of_light), varied = _scatter_of(kinds, np.array([constant, 0.0]), *rays)
         corner = _corner(plain)
