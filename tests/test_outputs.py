@@ -13,7 +13,8 @@ from small_scans import QUICK, fan, reconstruct
 
 import tomo_polysplat as tps
 from tomo_polysplat.cli.main import main
-from tomo_polysplat.files import replacing
+from tomo_polysplat.files import replacing, write_text
+from tomo_polysplat.simulate.scenes import scan_bytes, simulate_scan
 
 # What stays of a killed process
 
@@ -142,3 +143,20 @@ def test_a_file_that_appears_meanwhile_is_not_replaced(tmp_path):
         temporary.write_text("new")
         path.write_text("somebody else's")
     assert path.read_text() == "somebody else's" and os.listdir(tmp_path) == ["volume.h5"]
+
+
+def test_a_new_file_has_the_usual_permissions_and_a_replaced_one_those_it_had(tmp_path):
+    (tmp_path / "usual").touch()
+    path = tmp_path / "volume.h5"
+    for permissions in ((tmp_path / "usual").stat().st_mode, 0o100640):
+        if path.exists():
+            path.chmod(permissions)
+        write_text(path, "new", overwrite=True)
+        assert path.stat().st_mode == permissions
+
+
+def test_the_room_that_a_simulation_needs_is_what_it_writes(tmp_path):
+    for geometry in ("cone", "fan", "parallel"):
+        scan = simulate_scan("pins", 13, 7, geometry=geometry)
+        arrays = (scan.projections, np.ones_like(scan.projections, bool), scan.truth, scan.metal_mask)
+        assert scan_bytes(13, 7, geometry) == sum(array.nbytes for array in arrays)

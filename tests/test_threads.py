@@ -135,8 +135,9 @@ def test_a_solve_does_not_know_what_was_solved_before():
         torch.inference_mode,
         lambda: torch.autocast("cpu", dtype=torch.bfloat16),
         lambda: np.errstate(all="raise"),
+        lambda: torch.device("meta"),
     ],
-    ids=["no gradients", "inference", "autocast", "NumPy raises"],
+    ids=["no gradients", "inference", "autocast", "NumPy raises", "another device"],
 )
 def test_modes_of_the_caller_do_not_matter(mode):
     alone = digest()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -21,6 +22,7 @@ __all__ = [
     "require_room",
     "require_room_for",
     "require_writable",
+    "write_text",
 ]
 
 # Deflate, the strongest compression met in these formats, cannot shrink data by more than 1032.
@@ -52,20 +54,25 @@ def replacing(path: str | os.PathLike, *, overwrite: bool, needed_bytes: int = 0
     target = Path(path)
     require_replaceable(target, overwrite)
     require_room(target.parent, needed_bytes)
-    handle, name = tempfile.mkstemp(
-        prefix=f".{target.stem}-", suffix=f".part{target.suffix}", dir=target.parent
-    )
-    os.close(handle)
-    temporary = Path(name)
+    temporary = target.with_name(f".{target.stem}-{secrets.token_hex(6)}.part{target.suffix}")
+    # With the usual permissions, which a temporary file of the library's does not have.
+    temporary.touch(exist_ok=False)
     try:
         yield temporary
         _flush(temporary)
-        _take_default_mode(temporary)
+        if target.exists():
+            shutil.copymode(target, temporary)
         require_replaceable(target, overwrite)
         os.replace(temporary, target)
     finally:
         with suppress(FileNotFoundError):
             temporary.unlink()
+
+
+def write_text(path: str | os.PathLike, text: str, *, overwrite: bool) -> None:
+    """Write a file of text by `replacing`."""
+    with replacing(path, overwrite=overwrite, needed_bytes=len(text)) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def require_replaceable(
@@ -98,13 +105,6 @@ def _flush(path: Path) -> None:
     # Without this a crash of the machine could leave the new name with none of the new contents.
     with open(path, "rb+") as file:
         os.fsync(file.fileno())
-
-
-def _take_default_mode(path: Path) -> None:
-    # mkstemp makes files that only their owner can read; a result should get the usual permissions.
-    mask = os.umask(0)
-    os.umask(mask)
-    path.chmod(0o666 & ~mask)
 
 
 def require_room(folder: str | os.PathLike, needed_bytes: int) -> None:

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from tomo_polysplat.checks import fail
+
 __all__ = ["progress_reports"]
 
 
@@ -24,6 +26,8 @@ def progress_reports(
     if callable(wanted):
         yield wanted
         return
+    if not (wanted is None or isinstance(wanted, bool)):
+        raise fail("progress", "True, False, None or a function", repr(wanted), error=TypeError)
     from tqdm import tqdm
 
     layout = "{l_bar}{bar:24}| {elapsed}<{remaining} {postfix}"

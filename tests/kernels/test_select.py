@@ -4,16 +4,17 @@ import pytest
 import torch
 
 from tomo_polysplat.kernels import select
+from tomo_polysplat.kernels.project import autograd
 
 CPU = torch.device("cpu")
 
 
 @pytest.fixture
 def fresh_availability():
-    """Availability is found once a process; these tests change what would be found."""
-    select.availability.cache_clear()
+    """The self-check is made once a process; these tests change what would be found."""
+    select._self_check.cache_clear()
     yield
-    select.availability.cache_clear()
+    select._self_check.cache_clear()
 
 
 def test_cpu_runs_the_compiled_kernel_and_says_why():
@@ -39,7 +40,7 @@ def test_kernel_that_cannot_run_on_the_device():
         select.choose(CPU, "triton")
 
 
-def test_a_kernel_that_is_wrong_is_not_used(monkeypatch, fresh_availability):
+def test_a_kernel_that_is_wrong_is_not_used_and_the_log_warns(monkeypatch, caplog):
     monkeypatch.setattr(select, "_self_check", lambda name, device: 0.25)
     usable, reason = select.availability("numba", "cpu")
     assert not usable
@@ -47,15 +48,40 @@ def test_a_kernel_that_is_wrong_is_not_used(monkeypatch, fresh_availability):
     name, reason = select.choose(CPU)
     assert name == "reference"
     assert "not numba: self-check differs" in reason
+    assert "far slower" in caplog.text
 
 
-def test_a_self_check_that_gives_nan_is_a_failure(monkeypatch, fresh_availability):
+@pytest.fixture
+def gpu_without_compiler(monkeypatch):
+    """A GPU that torch finds and nothing compiles for."""
+
+    def broken(name, device):
+        raise RuntimeError("no C compiler")
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    monkeypatch.setattr(select, "_self_check", broken)
+
+
+def test_a_gpu_without_compiled_kernels_is_refused_before_the_work(gpu_without_compiler):
+    with pytest.raises(RuntimeError, match="no C compiler.*use device='cpu'"):
+        select.choose(torch.device("cuda"))
+    assert select.choose(torch.device("cuda"), "reference") == ("reference", "asked for")
+
+
+def test_auto_is_the_cpu_where_the_gpu_has_no_compiled_kernels(gpu_without_compiler, caplog):
+    assert select.pick_fast_device("auto") == CPU
+    assert "no C compiler" in caplog.text
+    assert select.pick_fast_device("cuda") == torch.device("cuda")
+
+
+def test_a_self_check_that_gives_nan_is_a_failure(monkeypatch):
     monkeypatch.setattr(select, "_self_check", lambda name, device: float("nan"))
     assert not select.availability("numba", "cpu")[0]
 
 
 @pytest.mark.parametrize("problem", [RuntimeError("no compiler\nlong story"), AssertionError()])
-def test_a_kernel_that_does_not_compile_is_not_used(monkeypatch, fresh_availability, problem):
+def test_a_kernel_that_does_not_compile_is_not_used(monkeypatch, problem):
     def broken(name, device):
         raise problem
 
@@ -67,11 +93,22 @@ def test_a_kernel_that_does_not_compile_is_not_used(monkeypatch, fresh_availabil
     assert select.choose(CPU)[0] == "reference"
 
 
-def test_availability_is_found_once(monkeypatch, fresh_availability):
+def test_what_runs_is_found_once_and_a_failure_is_not_remembered(monkeypatch, fresh_availability):
     calls = []
-    monkeypatch.setattr(select, "_self_check", lambda name, device: calls.append(name) or 0.0)
-    assert select.availability("numba", "cpu") == select.availability("numba", "cpu")
-    assert calls == ["numba"]
+
+    def counted(*arguments, **options):
+        calls.append(options["kernel"])
+        if len(calls) == 1:
+            raise MemoryError("full just now")
+        return project(*arguments, **options)
+
+    project = autograd.project
+    monkeypatch.setattr(autograd, "project", counted)
+    assert not select.availability("numba", "cpu")[0]
+    assert select.availability("numba", "cpu")[0]
+    made = len(calls)
+    assert select.availability("numba", "cpu")[0]
+    assert len(calls) == made
 
 
 def test_description_covers_every_kernel_and_device():

@@ -1,5 +1,7 @@
 """A water correction undone: the inverse of a polynomial, and polynomials that have none."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -56,3 +58,13 @@ def test_it_is_described_as_it_is_written():
 def test_wrong_coefficients(wrong):
     with pytest.raises((ValueError, TypeError), match="water_correction"):
         require_water_correction(wrong)
+
+
+def test_a_large_scan_is_undone_in_little_more_memory_than_it_takes():
+    values = np.linspace(0, 6, 1 << 23, dtype=np.float32)
+    tracemalloc.start()
+    undone = undo_water_correction(values, (0.0, 1.0, 0.03), np.float32)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    np.testing.assert_allclose(undone + 0.03 * undone.astype(np.float64) ** 2, values, rtol=1e-5, atol=1e-6)
+    assert peak < 5 * values.nbytes

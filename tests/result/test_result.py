@@ -225,3 +225,19 @@ def test_a_result_is_not_taken_for_a_scan(tmp_path):
     polychromatic().save(tmp_path / "volume.h5")
     with pytest.raises(ValueError, match=r"expected a scan, got the result.*Result\.load"):
         load_scan(tmp_path / "volume.h5")
+
+
+def test_what_is_done_to_a_volume_does_not_change_what_is_saved(tmp_path):
+    attenuation = np.random.default_rng(2).random((1, *GRID.shape)).astype(np.float32)
+    alone = Result(attenuation.copy(), GRID, energy_kev=60.0)
+    for result in (alone, polychromatic()):
+        before, kept = result.basis.copy(), result.attenuation(result.energy_kev).copy()
+        result.attenuation(result.energy_kev)[:] = 7
+        np.testing.assert_array_equal(result.volume, kept)
+        result.volume[:] *= 2
+        np.testing.assert_array_equal(result.basis, before)
+
+
+def test_results_are_compared_as_objects():
+    one = polychromatic()
+    assert one == one and one != polychromatic()

@@ -1,5 +1,6 @@
 """Planted defects are found, named and measured; clean scans have none."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,8 @@ from tomo_polysplat.cli import main
 from tomo_polysplat.scan.check import check_scan
 from tomo_polysplat.scan.dropouts import dropped_rays
 from tomo_polysplat.scan.io import save_scan
+from tomo_polysplat.scan.probes.measured import Measured
+from tomo_polysplat.scan.probes.rays import bad_rays
 from tomo_polysplat.simulate.scenes import simulate_scan
 
 SCANS = [
@@ -170,7 +173,39 @@ def test_views_in_any_order_with_their_angles_are_fine():
 def test_an_empty_scan_breaks_nothing():
     scan = simulate_scan("pins", 12, 20)
     for empty in (np.zeros_like(scan.projections), np.full_like(scan.projections, np.nan)):
-        assert check_scan(replace(scan, projections=empty, valid=np.isfinite(empty)))
+        first, *others = check_scan(replace(scan, projections=empty, valid=np.isfinite(empty)))
+        assert first.probe == "bad rays"
+        assert {finding.verdict for finding in others} == {"unknown"}
+
+
+def test_the_command_describes_a_scan_without_a_good_ray(tmp_path, capsys):
+    scan = simulate_scan("pins", 12, 20)
+    nothing = np.zeros(scan.projections.shape, bool)
+    save_scan(replace(scan, valid=nothing), tmp_path / "nothing.npz")
+    assert main(["check", str(tmp_path / "nothing.npz")]) == 3
+    printed = capsys.readouterr().out
+    assert "none that is good" in printed and "100 % of dead pixels" in printed
+
+
+def test_two_columns_tell_nothing():
+    scan = simulate_scan("pins", 12, 30, columns=2)
+    assert {finding.verdict for finding in check_scan(scan)[1:]} == {"unknown"}
+
+
+def test_looking_for_bad_rays_takes_few_times_the_memory_of_what_is_looked_at():
+    scan = simulate_scan("pins", 8, 13, rows=128, columns=128, noise=False)
+    large = replace(
+        scan,
+        projections=np.repeat(scan.projections, 8, axis=0),
+        proj_geom=scan.proj_geom | {"DetectorRowCount": 1024},
+    )
+    measured = Measured(large)
+    assert measured.level > 0
+    tracemalloc.start()
+    bad_rays(measured)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 20 * large.projections.nbytes
 
 
 def test_the_command_prints_the_remedy_and_its_status_tells(tmp_path, capsys):

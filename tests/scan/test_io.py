@@ -3,6 +3,7 @@
 import io
 import logging
 import zipfile
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -11,6 +12,7 @@ from discs import CENTRE, COLUMNS, ROWS, discs
 
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.scan.geometry import from_astra
+from tomo_polysplat.scan.hdf5 import opened
 from tomo_polysplat.scan.io import load_scan, save_scan
 from tomo_polysplat.scan.layout import vector_geometry, volume_geometry
 from tomo_polysplat.scan.scan import Scan
@@ -266,3 +268,22 @@ def test_loading_is_quiet_when_nothing_is_wrong(exchange, caplog):
     with caplog.at_level(logging.WARNING):
         load_scan(path)
     assert not caplog.records
+
+
+def test_an_error_of_what_is_done_with_a_file_stays_what_it_is(tmp_path):
+    save_scan(cone_scan(), tmp_path / "scan.h5")
+    for error in (KeyError("proj_geom"), RuntimeError("no thread"), OSError(28, "No space left on device")):
+        with pytest.raises(type(error)) as raised, opened(tmp_path / "scan.h5"):
+            raise error
+        assert raised.value is error
+    with pytest.raises(ValueError, match="readable HDF5"), opened(tmp_path / "scan.h5") as file:
+        file["nothing here"]
+
+
+def test_a_scan_is_checked_when_it_is_made():
+    scan = cone_scan()
+    assert scan == scan and scan != replace(scan)
+    with pytest.raises(ValueError, match="unit: expected one of"):
+        replace(scan, unit="inch")
+    with pytest.raises(ValueError, match="projections.*as proj_geom says"):
+        replace(scan, projections=scan.projections[:, :-1], valid=None)

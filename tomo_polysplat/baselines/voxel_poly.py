@@ -20,7 +20,7 @@ from tomo_polysplat.fit.plan import PASSES
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.spectral_model import OPAQUE
 from tomo_polysplat.fit.step import held_out_mean
-from tomo_polysplat.fit.stopping import FitState, Watch, patience_of
+from tomo_polysplat.fit.stopping import FitState, Watch, is_true, patience_of
 from tomo_polysplat.fit.texture import tv_corners
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.quadrature import fit_quadrature
@@ -178,7 +178,7 @@ class _Fit:
             seconds = time.perf_counter() - started
             state = FitState(seconds, step, 0, loss, held_out, share(), lambda: self.volume(self.model))
             ended = bool(watch.judge(state, self.model))
-            if any([callback(state) is True for callback in callbacks]) or ended:
+            if any([is_true(callback(state)) for callback in callbacks]) or ended:
                 break
         return watch.best or self.model.copy()
 

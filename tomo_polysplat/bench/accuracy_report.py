@@ -12,7 +12,7 @@ from tomo_polysplat.bench.methods import METHODS
 from tomo_polysplat.bench.recon_report import colour, dress, error_figure, machine
 from tomo_polysplat.bench.runs import without_figures
 from tomo_polysplat.bench.tables import Column, cell, grouped, html_table, markdown_table, text_table
-from tomo_polysplat.files import replacing
+from tomo_polysplat.files import write_text
 from tomo_polysplat.report.figures import png_bytes, slices_figure
 from tomo_polysplat.report.html import image, page
 from tomo_polysplat.report.slices import display_window, planes_through
@@ -146,9 +146,7 @@ def write_page(path: Path, record: Record, pictures: Mapping[tuple[Any, ...], by
     if record["stopping"]:
         body += [f"<h2>{_TRUST}</h2>", html_table(*_kept(record))]
     body += [f'<p class="note">{html.escape(words)}</p>' for words in _reasons(record)]
-    content = page("tomo-polysplat accuracy", body)
-    with replacing(path, overwrite=True, needed_bytes=len(content)) as temporary:
-        temporary.write_text(content, encoding="utf-8")
+    write_text(path, page("tomo-polysplat accuracy", body), overwrite=True)
 
 
 def _about(record: Record) -> str:

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 
 from tomo_polysplat.bench.environment import environment
-from tomo_polysplat.files import replacing
 from tomo_polysplat.physics.water import water_linearised
 from tomo_polysplat.reconstruction import reconstruct
 from tomo_polysplat.report.figures import comparison_figure
-from tomo_polysplat.result.files import plain
+from tomo_polysplat.result.files import write_json
 from tomo_polysplat.result.metrics import compare
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, from_astra, projections_from_astra
@@ -107,8 +106,6 @@ def _describe(scan: Scan) -> dict[str, Any]:
 def _write(
     folder: Path, scan: Scan, volumes: dict[str, np.ndarray], result: Result, content: dict[str, Any]
 ) -> None:
-    import json
-
     assert scan.truth is not None
     comparison_figure(
         folder / "demo.png",
@@ -121,5 +118,4 @@ def _write(
         overwrite=True,
     )
     result.save(folder / "demo.h5", overwrite=True)
-    with replacing(folder / "demo.json", overwrite=True) as temporary:
-        temporary.write_text(json.dumps(plain(content), indent=2) + "\n", encoding="utf-8")
+    write_json(folder / "demo.json", content, overwrite=True)

@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tomo_polysplat.cli import bench_physics, bench_plan
-from tomo_polysplat.cli.options import add_solver_options, write_json
+from tomo_polysplat.cli.options import add_solver_options
+from tomo_polysplat.files import write_text
+from tomo_polysplat.result.files import write_json
 
 if TYPE_CHECKING:
     from tomo_polysplat.bench.recon import ReconBench
@@ -277,11 +279,8 @@ def _write(arguments: argparse.Namespace, name: str, content: dict[str, Any], *,
 
 
 def _write_text(arguments: argparse.Namespace, name: str, text: str) -> None:
-    from tomo_polysplat.files import replacing
-
     if arguments.record is None:
         return
     path = Path(arguments.record) / name
-    with replacing(path, overwrite=True) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_text(path, text, overwrite=True)
     print(f"wrote {path}")

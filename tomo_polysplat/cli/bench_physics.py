@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tomo_polysplat.cli.options import add_solver_options
-from tomo_polysplat.files import replacing
+from tomo_polysplat.files import write_text
 
 __all__ = ["add_parsers", "materials", "spectrum"]
 
@@ -83,8 +83,7 @@ def _tell(
     print(table)
     if arguments.record:
         folder = Path(arguments.record)
-        with replacing(folder / f"{name}.md", overwrite=True) as temporary:
-            temporary.write_text(table, encoding="utf-8")
+        write_text(folder / f"{name}.md", table, overwrite=True)
         figure(folder / f"{name}.png", record)
         print(f"wrote {folder / name}.md and .png")
     return 0

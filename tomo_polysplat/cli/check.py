@@ -37,7 +37,9 @@ def run(arguments: argparse.Namespace) -> int:
         "spectrum": "unknown: pass --kvp or --spectrum to recon"
         if scan.spectrum is None
         else repr(scan.spectrum),
-        "line integrals": f"{values.min():.3g} to {values.max():.3g}, median {np.median(values):.3g}",
+        "line integrals": f"{values.min():.3g} to {values.max():.3g}, median {np.median(values):.3g}"
+        if values.size
+        else "none that is good",
         "rays left out": f"{lost} of {scan.projections.size}",
         "truth": "none" if scan.truth is None else f"largest value {scan.truth.max():.3g} 1/{scan.unit}",
     }

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from tomo_polysplat.cli.options import ProgressBar, add_solver_options
+from tomo_polysplat.cli.options import add_solver_options
 from tomo_polysplat.files import require_replaceable, require_writable
+from tomo_polysplat.progress import progress_reports
 
 NAME = "demo"
 HELP = "simulate a scan with metal, reconstruct it four ways, and write demo.png, demo.h5 and demo.json"
@@ -37,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
             folder / name, arguments.overwrite, "pass --overwrite or another folder", "--output"
         )
     require_writable(folder, "--output")
-    with ProgressBar() as progress:
+    with progress_reports(None) as progress:
         outcome = run_demo(folder, device=arguments.device, seed=arguments.seed, progress=progress)
     print(as_text(outcome["methods"], "cm"))
     for name in FILES:

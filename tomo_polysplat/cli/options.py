@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.files import existing_file, replacing
+from tomo_polysplat.files import existing_file
 
 if TYPE_CHECKING:
     from tomo_polysplat.physics.detector import Detector
     from tomo_polysplat.physics.spectrum import Spectrum
 
 __all__ = [
-    *("INTERRUPTED", "ProgressBar", "add_scan_options", "add_solver_options", "add_spectrum_options"),
-    *("scan_from", "spectrum_from", "write_json"),
+    *("INTERRUPTED", "add_scan_options", "add_solver_options", "add_spectrum_options"),
+    *("scan_from", "spectrum_from"),
 ]
 
 
@@ -154,34 +152,3 @@ def add_solver_options(parser: argparse._ActionsContainer) -> None:
     """Where and from what seed to compute."""
     parser.add_argument("--device", default="auto", help="auto (default), cpu, cuda or cuda:N")
     parser.add_argument("--seed", type=int, default=0, help="seed of everything random (default: 0)")
-
-
-def write_json(path: str | Path, content: Any, *, overwrite: bool) -> None:
-    """Write `content` as JSON, with numbers of NumPy turned into Python's."""
-    from tomo_polysplat.result.files import plain
-
-    with replacing(path, overwrite=overwrite) as temporary:
-        temporary.write_text(json.dumps(plain(content), indent=2) + "\n", encoding="utf-8")
-
-
-class ProgressBar:
-    """A bar on standard error; called with the share done (0 to 1) and a few words.
-
-    Only shown on a terminal, so that logs stay readable.
-    """
-
-    def __enter__(self) -> ProgressBar:
-        from tqdm import tqdm
-
-        layout = "{l_bar}{bar:24}| {elapsed}<{remaining} {postfix}"
-        self._bar = tqdm(total=1.0, bar_format=layout, disable=None, leave=False)
-        return self
-
-    def __call__(self, share: float, words: str = "") -> None:
-        self._bar.set_postfix_str(words, refresh=False)
-        self._bar.update(min(share, 1.0) - self._bar.n)
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._bar.close()

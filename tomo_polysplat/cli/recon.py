@@ -14,16 +14,16 @@ import tomo_polysplat
 from tomo_polysplat.checks import fail
 from tomo_polysplat.cli.options import (
     INTERRUPTED,
-    ProgressBar,
     add_scan_options,
     add_solver_options,
     add_spectrum_options,
     scan_from,
     spectrum_from,
-    write_json,
 )
 from tomo_polysplat.files import require_replaceable, require_room_for, require_writable
 from tomo_polysplat.interrupts import postponed_interrupts
+from tomo_polysplat.progress import progress_reports
+from tomo_polysplat.result.files import write_json
 
 if TYPE_CHECKING:
     from tomo_polysplat.physics.spectrum import Spectrum
@@ -100,7 +100,7 @@ def run(arguments: argparse.Namespace) -> int:
     spectrum = _spectrum_of(scan, arguments)
     _require_room(arguments, scan)
     print(scan)
-    with ProgressBar() as progress:
+    with progress_reports(None) as progress:
         result = tomo_polysplat.reconstruct(
             scan.projections,
             scan.proj_geom,

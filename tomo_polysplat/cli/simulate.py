@@ -39,13 +39,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Simulate and write."""
     from tomo_polysplat.scan.io import save_scan
-    from tomo_polysplat.simulate.scenes import simulate_scan
+    from tomo_polysplat.simulate.scenes import scan_bytes, simulate_scan
 
     output = Path(arguments.output)
     require_replaceable(output, arguments.overwrite, "pass --overwrite", "--output")
     require_writable(output.parent, "--output")
-    # The truth with its metal, and views of about as many pixels as a side of the volume has voxels.
-    require_room(output.parent, 5 * arguments.size**3 + 4 * arguments.views * arguments.size**2)
+    require_room(output.parent, scan_bytes(arguments.size, arguments.views, arguments.geometry))
     scan = simulate_scan(
         arguments.scene,
         arguments.size,

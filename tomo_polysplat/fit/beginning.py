@@ -20,7 +20,7 @@ from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.sharpness import seeds_for_edges
 from tomo_polysplat.fit.smoothing import choose_smoothing
 from tomo_polysplat.fit.stopping import FitState
-from tomo_polysplat.kernels.device import pick_device
+from tomo_polysplat.kernels.select import pick_fast_device
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings, make_settings
 
@@ -55,7 +55,7 @@ class Wishes:
         chosen = make_settings(quality, settings)
         if time_budget is not None:
             time_budget = require_number("time_budget", time_budget, above=0)
-        return cls(chosen, time_budget, _whole(seed), pick_device(device), _functions(callbacks))
+        return cls(chosen, time_budget, _whole(seed), pick_fast_device(device), _functions(callbacks))
 
     def options(self) -> dict[str, Any]:
         """All that the result depends on, for a checkpoint."""
@@ -146,7 +146,7 @@ def _whole(seed: Any) -> int:
     number = require_number("seed", seed, at_least=0)
     if number != int(number):
         raise fail("seed", "a whole number", repr(seed))
-    return int(seed)
+    return int(number)
 
 
 def _functions(callbacks: Any) -> list[Callable[[FitState], Any]]:

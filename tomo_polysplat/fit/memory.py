@@ -7,6 +7,7 @@ import logging
 import torch
 
 from tomo_polysplat.checks import fail
+from tomo_polysplat.files import available_memory
 
 __all__ = ["free_bytes", "projections_stay", "require_room"]
 
@@ -65,6 +66,9 @@ def require_room(
     words = ", ".join(f"{name} {_gigabytes(size)}" for name, size in parts.items())
     words = f"about {_gigabytes(need)} ({words})"
     if device.type == "cpu":
+        there = available_memory()
+        if there is not None and need > there:
+            logger.warning("Memory: %s, and %s are free.", words, _gigabytes(there))
         return words
     free = free_bytes(device)
     where = f"on the GPU, {_gigabytes(projections)}" if projections else "streamed from the host"

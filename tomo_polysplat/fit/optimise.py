@@ -17,7 +17,7 @@ from tomo_polysplat.fit.learning_rates import hurried
 from tomo_polysplat.fit.pixel_question import PixelQuestion
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.fit.stopping import Clock, FitState, Watch, patience_of
+from tomo_polysplat.fit.stopping import Clock, FitState, Watch, is_true, patience_of
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 
@@ -119,7 +119,7 @@ class _Run:
             outcome.history.append(state.record())
             outcome.reason = self.watch.judge(state, self.fitter.gaussians)
             self.keep(now=bool(outcome.reason) or self.clock.share() >= 1)
-            if any([_is_true(callback(state)) for callback in callbacks]):
+            if any([is_true(callback(state)) for callback in callbacks]):
                 self.keep(now=True)
                 outcome.reason = "a callback ended it"
             if outcome.reason:
@@ -213,8 +213,3 @@ def _used_up(clock: Clock, settings: Settings) -> str:
         return "the time budget was used"
     logger.warning("The time budget ended before the first step: the result is no better than its start.")
     return "the time budget was used before the first step"
-
-
-def _is_true(answer: Any) -> bool:
-    """Whether a callback said True; whatever else a function happens to return is no answer."""
-    return isinstance(answer, (bool, np.bool_)) and bool(answer)

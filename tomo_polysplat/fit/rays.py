@@ -11,7 +11,7 @@ import torch
 
 from tomo_polysplat.kernels.views import DetectorViews
 
-__all__ = ["Rays", "batches_around"]
+__all__ = ["Rays", "batches_around", "views_around"]
 
 # Rays whose weights are added up at once.
 _CHUNK = 1 << 22
@@ -105,10 +105,15 @@ class Rays:
         return (mixed >> 16) < self.threshold
 
 
+def views_around(rays: Rays, most: int = _VIEWS) -> int:
+    """How many views `batches_around` gives in all."""
+    return min(most, len(rays.views))
+
+
 def batches_around(
     rays: Rays, most: int = _VIEWS
 ) -> Iterator[tuple[DetectorViews, torch.Tensor, torch.Tensor, torch.Tensor]]:
     """What `Rays.batch` gives for so many of the views at most, evenly spread over the scan."""
-    views = np.unique(np.linspace(0, len(rays.views) - 1, min(most, len(rays.views))).astype(int))
+    views = np.unique(np.linspace(0, len(rays.views) - 1, views_around(rays, most)).astype(int))
     for first in range(0, len(views), _AT_ONCE):
         yield rays.batch(views[first : first + _AT_ONCE])

@@ -15,7 +15,7 @@ from tomo_polysplat.fit.loss import misfit
 from tomo_polysplat.fit.optimise import FitOutcome, fit
 from tomo_polysplat.fit.plan import Plan, make_plan
 from tomo_polysplat.fit.problem import Problem
-from tomo_polysplat.fit.rays import Rays, batches_around
+from tomo_polysplat.fit.rays import Rays, batches_around, views_around
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.scatter import light_around
@@ -270,13 +270,13 @@ def sample_rays(gaussians: Gaussians, scene: FitScene, rays: Rays, seed: int, mo
     """So many of the rays at most, of views all around."""
     parts: list[list[np.ndarray]] = []
     weights, rng = gaussians.weights(scene.reference_curve), np.random.default_rng(seed)
-    batches, seen = list(batches_around(rays)), 0
-    for views, measured, weight, aside in batches:
+    seen, views_in_all = 0, views_around(rays)
+    for views, measured, weight, aside in batches_around(rays):
         areal, _ = project_gaussians(gaussians, weights, views, scene.kernel, scene.cutoff)
         weight = weight + aside
         light = light_around(torch.where(weight > 0, measured, torch.nan))
         used = (weight.reshape(-1) > 0).nonzero()[:, 0]
-        many = min(len(used), -(-most // len(batches)))
+        many = min(len(used), -(-most * len(measured) // views_in_all))
         chosen = used[torch.from_numpy(rng.choice(len(used), many, replace=False)).to(used.device)]
         view, seen = seen + chosen // measured[0].numel(), seen + len(measured)
         flat = [areal.reshape(len(areal), -1)[:, chosen] * scene.areal_scale]

@@ -12,7 +12,7 @@ import numpy as np
 
 from tomo_polysplat.settings import Settings
 
-__all__ = ["Clock", "FitState", "Fitted", "Watch", "patience_of"]
+__all__ = ["Clock", "FitState", "Fitted", "Watch", "is_true", "patience_of"]
 
 _Fitted = TypeVar("_Fitted", bound="Fitted")
 
@@ -159,3 +159,8 @@ class Watch(Generic[_Fitted]):
         best = score <= self.lowest
         self.lowest = min(score, self.lowest)
         return best
+
+
+def is_true(answer: Any) -> bool:
+    """Whether a callback said True; whatever else a function happens to return is no answer."""
+    return isinstance(answer, (bool, np.bool_)) and bool(answer)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 
 import numpy as np
 import torch
@@ -60,9 +60,12 @@ def usual_modes() -> Iterator[None]:
     """torch and NumPy as they come, whatever modes the caller has chosen for work of its own.
 
     A call from within ``torch.no_grad()``, ``inference_mode()`` or ``autocast()``, or where NumPy raises at an
-    underflow, gives the same result as any other.
+    underflow, gives the same result as any other, and so does one under another default device.
     """
+    # Entered only where it is needed: torch asks it at every call.
+    elsewhere = torch.get_default_device().type != "cpu"
     with (
+        torch.device("cpu") if elsewhere else nullcontext(),
         torch.inference_mode(False),
         torch.enable_grad(),
         torch.autocast("cpu", enabled=False),

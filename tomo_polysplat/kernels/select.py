@@ -12,9 +12,10 @@ import numpy as np
 import torch
 
 from tomo_polysplat.checks import fail
+from tomo_polysplat.kernels.device import pick_device
 from tomo_polysplat.kernels.views import DetectorViews
 
-__all__ = ["KERNELS", "availability", "choose", "describe"]
+__all__ = ["KERNELS", "availability", "choose", "describe", "pick_fast_device"]
 
 logger = logging.getLogger(__name__)
 
@@ -29,23 +30,42 @@ def choose(device: torch.device, requested: str = "auto") -> tuple[str, str]:
     ------
     ValueError
         If ``requested`` is unknown or cannot run on the device.
+    RuntimeError
+        If none that is made for a GPU runs on it: with the reference, work of seconds would take hours there.
     """
     if requested not in ("auto", *KERNELS):
         raise fail("kernel", f"auto or one of {', '.join(KERNELS)}", repr(requested))
     if requested != "auto":
-        usable, reason = availability(requested, device.type)
+        usable, reason = availability(requested, str(device))
         if not usable:
             raise fail(
                 "kernel", f"a kernel that runs on {device}", f"{requested!r} ({reason})", "use kernel='auto'"
             )
         return requested, "asked for"
     refused: list[str] = []
-    for name in KERNELS:
-        usable, reason = availability(name, device.type)
+    for name in KERNELS[:-1]:
+        usable, reason = availability(name, str(device))
         if usable:
             return name, "; ".join([reason, *refused])
         refused.append(f"not {name}: {reason}")
-    raise RuntimeError("; ".join(refused))
+    words = "; ".join(refused)
+    if device.type == "cuda":
+        remedy = "use device='cpu', or settings={'kernel': 'reference'}, which is slow"
+        got = f"{device} ({words})"
+        raise fail("device", "a GPU that compiled kernels run on", got, remedy, RuntimeError)
+    logger.warning("No compiled kernel runs here (%s): the reference does, which is far slower.", words)
+    return KERNELS[-1], "; ".join([availability(KERNELS[-1], str(device))[1], *refused])
+
+
+def pick_fast_device(name: str | torch.device) -> torch.device:
+    """The device of a name, as `pick_device`; ``"auto"`` is a GPU only where a compiled kernel runs on it."""
+    device = pick_device(name)
+    if name == "auto" and device.type == "cuda":
+        usable, reason = availability("triton", str(device))
+        if not usable:
+            logger.warning("The GPU is not used: no compiled kernel runs on it (triton: %s).", reason)
+            return torch.device("cpu")
+    return device
 
 
 def describe() -> list[tuple[str, str, bool, str]]:
@@ -54,9 +74,9 @@ def describe() -> list[tuple[str, str, bool, str]]:
     return [(name, device, *availability(name, device)) for name, device in pairs]
 
 
-@functools.cache
-def availability(name: str, device_type: str) -> tuple[bool, str]:
-    """Whether a kernel runs on a kind of device ("cpu", "cuda"), found by running it, and why (not)."""
+def availability(name: str, device: str) -> tuple[bool, str]:
+    """Whether a kernel runs on a device ("cpu", "cuda", "cuda:1"), found by running it, and why (not)."""
+    device_type = torch.device(device).type
     if device_type == "cuda" and not torch.cuda.is_available():
         return False, "torch finds no CUDA device"
     if name == "reference":
@@ -65,7 +85,7 @@ def availability(name: str, device_type: str) -> tuple[bool, str]:
     if device_type != wanted:
         return False, f"runs on {wanted} only"
     try:
-        error = _self_check(name, device_type)
+        error = _self_check(name, device)
     except Exception as problem:  # a broken compiler or driver can raise anything; it must not end the run
         logger.debug("self-check of %s failed", name, exc_info=True)
         message = f"{type(problem).__name__}: {problem}".splitlines()[0]
@@ -75,7 +95,9 @@ def availability(name: str, device_type: str) -> tuple[bool, str]:
     return True, f"compiled, self-check within {error:.0e} of the reference"
 
 
-def _self_check(name: str, device_type: str) -> float:
+# What raises is tried again: a GPU that was full is not so for ever.
+@functools.cache
+def _self_check(name: str, device: str) -> float:
     """Largest relative difference of images and gradients to the reference on five Gaussians."""
     from tomo_polysplat.kernels.project.autograd import project
 
@@ -91,11 +113,11 @@ def _self_check(name: str, device_type: str) -> float:
     ]
     target = torch.rand((3, 1, 9, 13), generator=generator)
     outcomes = []
-    for kernel, device, dtype in (("reference", "cpu", torch.float64), (name, device_type, torch.float32)):
-        inputs = [t.to(device, dtype).requires_grad_() for t in scene]
+    for kernel, place, dtype in (("reference", "cpu", torch.float64), (name, device, torch.float32)):
+        inputs = [t.to(place, dtype).requires_grad_() for t in scene]
         position, scale, rotation, weight = inputs
         image, _ = project(position, scale, rotation, weight, views, kernel=kernel, cutoff=3.0)
-        (image * target.to(device, dtype)).sum().backward()
+        (image * target.to(place, dtype)).sum().backward()
         results = [image, *(t.grad for t in inputs if t.grad is not None)]
         outcomes.append([t.detach().cpu().double() for t in results])
     return max(float((a - b).norm() / a.norm()) for a, b in zip(*outcomes))

@@ -43,6 +43,8 @@ class Detector:
         require_number("thickness_cm", self.thickness_cm, at_least=0.0)
         require_number("threshold_kev", self.threshold_kev, at_least=0.0)
         if self.sensor is not None:
+            if not isinstance(self.sensor, str):
+                raise fail("sensor", "the name of a material", repr(self.sensor), error=TypeError)
             composition(self.sensor)
             require_number(
                 "thickness_cm", self.thickness_cm, above=0.0, remedy="or leave the sensor out: all absorbed"

@@ -111,6 +111,9 @@ def composition(material: MaterialLike) -> tuple[tuple[str, float], ...]:
         return _composition_of_name(material)
     if not isinstance(material, Mapping):
         raise fail("material", "a name, a formula or mass fractions", repr(material), error=TypeError)
+    for part in material:
+        if not isinstance(part, str):
+            raise fail("material", "mass fractions by element symbol or name", repr(part), error=TypeError)
     fractions = {
         part: require_number(f"mass fraction of {part}", f, at_least=0.0) for part, f in material.items()
     }

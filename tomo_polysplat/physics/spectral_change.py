@@ -13,6 +13,8 @@ __all__ = ["aluminium_equivalent", "tube_voltage", "with_filtration", "with_volt
 
 # Where a tube emits less than this share of its peak, what is left of it says little about filters.
 _FLOOR = 1e-4
+# As few energies are no tube's.
+_FEWEST = 10
 # keV below the end point over which filters and detector are continued beyond it by a straight line.
 _END_RANGE = 12.0
 
@@ -27,10 +29,9 @@ def tube_voltage(spectrum: Spectrum) -> float:
     """
     energies = spectrum.energies
     lowest, highest = voltage_range("W")
-    if (
-        len(energies) < 10
-        or not lowest <= (end := energies[-1] + 0.5 * (energies[-1] - energies[-2])) <= highest
-    ):
+    # The last bin is cut at the voltage, and narrower than those before it.
+    end = 2 * energies[-1] - (1.5 * energies[-2] - 0.5 * energies[-3]) if len(energies) >= _FEWEST else 0.0
+    if not lowest <= end <= highest:
         expected = f"the spectrum of an x-ray tube of {lowest:g} to {highest:g} kV"
         remedy = "leave its voltage and filters as they are"
         raise fail("spectrum", expected, spectrum.describe(), remedy)

@@ -12,13 +12,16 @@ from typing import Any
 
 import numpy as np
 from numpy.polynomial import Polynomial
+from numpy.typing import DTypeLike
 
 from tomo_polysplat.checks import fail, require_array
+from tomo_polysplat.parallel import run_tasks, split_range
 
 __all__ = ["describe_polynomial", "require_water_correction", "undo_water_correction"]
 
 _TABLE = 4096
 _NEWTON_STEPS = 3
+_PART = 1 << 20
 _REMEDY = "ascending powers of P as in (0, 1, 0.02) for P + 0.02 P^2"
 
 
@@ -46,7 +49,9 @@ def describe_polynomial(coefficients: Sequence[float]) -> str:
     return " + ".join(terms).replace("+ -", "- ")
 
 
-def undo_water_correction(corrected: Any, coefficients: Sequence[float]) -> np.ndarray:
+def undo_water_correction(
+    corrected: Any, coefficients: Sequence[float], dtype: DTypeLike = np.float64
+) -> np.ndarray:
     """Projection values before a water correction.
 
     Parameters
@@ -55,10 +60,12 @@ def undo_water_correction(corrected: Any, coefficients: Sequence[float]) -> np.n
         ``sum_k c_k P^k`` of every ray, of any shape; what is not finite stays as it is.
     coefficients : sequence of float
         ``c_0`` (0), ``c_1`` (above 0), ... in ascending powers of P, as ``numpy.polynomial`` has them.
+    dtype : dtype
+        Of the result; it is worked out in float64.
 
     Returns
     -------
-    array of float64
+    array
         ``P = -log(I/I0)`` in the shape of ``corrected``, exact to rounding.
 
     Raises
@@ -68,21 +75,28 @@ def undo_water_correction(corrected: Any, coefficients: Sequence[float]) -> np.n
         stand for no P, or for two.
     """
     polynomial = Polynomial(require_water_correction(coefficients))
-    values = require_array("corrected", corrected).astype(np.float64)
-    finite = np.isfinite(values)
-    wanted = values[finite]
-    if not wanted.size:
-        return values
-    low = _reach(polynomial, min(wanted.min(), 0.0))
-    high = _reach(polynomial, max(wanted.max(), 0.0))
+    values = np.ascontiguousarray(require_array("corrected", corrected))
+    flat, undone = values.reshape(-1), np.empty(values.size, dtype)
+    # By parts: a scan in float64, several times over, may not fit into memory.
+    parts = split_range(flat.size, -(-flat.size // _PART))
+    finite = [(part.min(), part.max()) for a, b in parts if (part := flat[a:b][np.isfinite(flat[a:b])]).size]
+    low = _reach(polynomial, float(min([0.0, *(lowest for lowest, _ in finite)])))
+    high = _reach(polynomial, float(max([0.0, *(highest for _, highest in finite)])))
     grid = np.linspace(low, high, _TABLE)
-    found = np.interp(wanted, np.asarray(polynomial(grid), np.float64), grid)
-    slope = polynomial.deriv()
-    for _ in range(_NEWTON_STEPS):
-        # The slope may come close to 0 at the ends, where a step must not leave the rising part.
-        found = np.clip(found - (polynomial(found) - wanted) / np.maximum(slope(found), 1e-12), low, high)
-    values[finite] = found
-    return values
+    table, slope = np.asarray(polynomial(grid), np.float64), polynomial.deriv()
+
+    def undo(begin: int, end: int) -> None:
+        wanted = flat[begin:end].astype(np.float64)
+        known = np.isfinite(wanted)
+        target = np.where(known, wanted, 0.0)
+        found = np.interp(target, table, grid)
+        for _ in range(_NEWTON_STEPS):
+            # The slope may come close to 0 at the ends, where a step must not leave the rising part.
+            found = np.clip(found - (polynomial(found) - target) / np.maximum(slope(found), 1e-12), low, high)
+        undone[begin:end] = np.where(known, found, wanted)
+
+    run_tasks(undo, parts)
+    return undone.reshape(values.shape)
 
 
 def _reach(polynomial: Polynomial, value: float) -> float:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tomo_polysplat.checks import require_shape
-from tomo_polysplat.files import replacing
+from tomo_polysplat.files import write_text
 from tomo_polysplat.report import table as tables
 from tomo_polysplat.report.figures import history_figure, png_bytes, slices_figure
 from tomo_polysplat.report.slices import display_window, planes_through
@@ -74,9 +74,7 @@ def write_report(
         *_section("Left out or limited", result.counts),
         *_section("Settings", result.settings),
     ]
-    content = page(title, body)
-    with replacing(path, overwrite=overwrite, needed_bytes=len(content)) as temporary:
-        temporary.write_text(content, encoding="utf-8")
+    write_text(path, page(title, body), overwrite=overwrite)
 
 
 def page(title: str, body: Sequence[str]) -> str:

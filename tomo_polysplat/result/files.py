@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from tomo_polysplat.checks import fail, require_choice
-from tomo_polysplat.files import existing_parent, replacing, require_room, require_writable
+from tomo_polysplat.files import existing_parent, replacing, require_room, require_writable, write_text
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.result.result import GAUSSIAN_PARTS, Result
 from tomo_polysplat.scan.geometry import VolumeGrid
@@ -54,6 +54,11 @@ def plain(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if isinstance(value, (str, int, bool, type(None))) else str(value)
+
+
+def write_json(path: str | os.PathLike, content: Any, *, overwrite: bool) -> None:
+    """Write `content` as JSON, made `plain`."""
+    write_text(path, json.dumps(plain(content), indent=2) + "\n", overwrite=overwrite)
 
 
 def save_hdf5(result: Result, path: str | os.PathLike, *, overwrite: bool = False) -> None:

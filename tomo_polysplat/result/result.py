@@ -22,7 +22,7 @@ __all__ = ["Result"]
 GAUSSIAN_PARTS = {"position": (3,), "scale": (3,), "rotation": (4,), "density": (), "u": ()}
 
 
-@dataclass
+@dataclass(eq=False)
 class Result:
     """A reconstructed object: its Gaussians, and the volumes sampled from them.
 
@@ -97,7 +97,10 @@ class Result:
     @cached_property
     def volume(self) -> np.ndarray:
         """Attenuation at :attr:`energy_kev` in 1/`unit`, float32, (z, y, x), or (y, x) after a 2D scan."""
-        return self._public(self.basis[0] if self.materials is None else self._attenuation(self.energy_kev))
+        if self.materials is None:
+            # A copy, as with a spectrum: what is done to it must not change what is saved.
+            return self._public(self.basis[0].copy())
+        return self._public(self._attenuation(self.energy_kev))
 
     def attenuation(self, kev: float) -> np.ndarray:
         """Virtual monoenergetic volume: attenuation in 1/`unit`, float32, shaped like :attr:`volume`.
@@ -123,7 +126,7 @@ class Result:
                 raise fail(
                     "kev", "the energy of a monochromatic result", f"{kev:g}", f"{known}; pass a spectrum"
                 )
-            return self.volume
+            return self.volume.copy()
         require_energies("kev", [kev])
         return self._public(self._attenuation(kev))
 

@@ -24,6 +24,10 @@ LATER: tuple[tuple[tuple[str, ...], Callable[[Measured], list[Finding]]], ...] =
 )
 
 
+# An object and air on both sides of it.
+_FEWEST_COLUMNS = 3
+
+
 def check_scan(scan: Scan) -> list[Finding]:
     """Look for the defects that scans usually have.
 
@@ -43,6 +47,10 @@ def check_scan(scan: Scan) -> list[Finding]:
     rays = probe_rays(measured, kinds)
     # The other probes look at what is left.
     measured = Measured(scan, dead_pixels=np.asarray(kinds[DEAD].any(axis=1)))
+    nothing = _nothing_to_see(measured)
+    if nothing:
+        names = ("logarithm", "order of axes", *(name for names, _ in LATER for name in names))
+        return [rays, *(Finding(name, "unknown", nothing) for name in names)]
     findings = [rays, probe_logarithm(measured), probe_axes(measured)]
     for names, probe in LATER:
         misleading = [finding.probe for finding in findings[1:] if finding.misleading]
@@ -52,3 +60,12 @@ def check_scan(scan: Scan) -> list[Finding]:
         else:
             findings += probe(measured)
     return findings
+
+
+def _nothing_to_see(measured: Measured) -> str:
+    """Why the scan as a whole tells nothing, or an empty text."""
+    if measured.scan.columns < _FEWEST_COLUMNS:
+        return f"fewer than {_FEWEST_COLUMNS} columns do not tell"
+    if not measured.valid.any():
+        return "no ray is good"
+    return "" if np.ptp(measured.filled) > 0 else "all rays have the same value"

@@ -32,7 +32,7 @@ __all__ = [
 _MOST_LINKS = 16
 _LARGEST_ATTRIBUTE = 2**16
 _ADDRESS_BYTES = 8
-# What h5py raises for files that HDF5 cannot make sense of.
+# What h5py raises for files that HDF5 cannot make sense of, at any time while they are read.
 _BROKEN = (OSError, RuntimeError, KeyError, UnicodeDecodeError)
 _OUTSIDE = "copy the data into one file: h5repack does, and so does h5py"
 
@@ -48,10 +48,20 @@ def opened(path: str | Path) -> Iterator[h5py.File]:
         with h5py.File(file, "r") as handle:
             yield handle
     except _BROKEN as error:
+        if not _of_h5py(error):
+            raise
         remedy = (
             "it is not HDF5, is truncated, or needs a compression plugin (python -m pip install hdf5plugin)"
         )
         raise fail("path", "a readable HDF5 file", f"{file} ({error})", remedy) from error
+
+
+def _of_h5py(error: BaseException) -> bool:
+    """Whether an exception was raised by h5py, and not by what is done with what it read."""
+    last = error.__traceback__
+    while last is not None and last.tb_next is not None:
+        last = last.tb_next
+    return last is not None and str(last.tb_frame.f_globals.get("__name__", "")).startswith("h5py")
 
 
 def _member(group: h5py.Group, path: str, links: int = _MOST_LINKS) -> Any:

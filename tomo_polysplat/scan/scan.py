@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tomo_polysplat.checks import fail, require_array, require_shape
+from tomo_polysplat.checks import fail, require_array, require_choice, require_shape
 from tomo_polysplat.physics.water_correction import require_water_correction
+from tomo_polysplat.units import LENGTH_UNITS
 
 if TYPE_CHECKING:
     from tomo_polysplat.physics.spectrum import Spectrum
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["Scan"]
 
 
-@dataclass
+@dataclass(eq=False)
 class Scan:
     """A measured or simulated scan.
 
@@ -71,6 +72,8 @@ class Scan:
         self.projections = np.ascontiguousarray(projections, np.float32)
         if "type" not in self.proj_geom or "GridRowCount" not in self.vol_geom:
             raise fail("proj_geom, vol_geom", "ASTRA geometries", "dicts without 'type' or 'GridRowCount'")
+        require_choice("unit", self.unit, LENGTH_UNITS)
+        self._check_shape()
         if self.valid is not None:
             self.valid = np.ascontiguousarray(self.valid, bool)
             require_shape("valid", self.valid, self.projections.shape, "(rows, views, columns)")
@@ -82,6 +85,15 @@ class Scan:
         if self.metal_mask is not None:
             self.metal_mask = np.ascontiguousarray(require_array("metal_mask", self.metal_mask, 3), bool)
             require_shape("metal_mask", self.metal_mask, self.volume_shape, "(z, y, x)")
+
+    def _check_shape(self) -> None:
+        """Refuse projections of another shape than the geometry's, as far as this tells one."""
+        geometry = self.proj_geom
+        views = geometry.get("ProjectionAngles", geometry.get("Vectors"))
+        if views is None or not {"DetectorRowCount", "DetectorColCount"} <= geometry.keys():
+            return
+        told = (int(geometry["DetectorRowCount"]), len(views), int(geometry["DetectorColCount"]))
+        require_shape("projections", self.projections, told, "(rows, views, columns)", "as proj_geom says")
 
     @property
     def rows(self) -> int:

@@ -102,4 +102,4 @@ def uncorrected(
     if spectrum is None:
         remedy = "a monochromatic model wants the values as they are: leave water_correction out"
         raise fail("water_correction", "a spectrum beside it", "none", remedy)
-    return undo_water_correction(values, water_correction).astype(np.float32)
+    return undo_water_correction(values, water_correction, np.float32)

@@ -31,7 +31,7 @@ from tomo_polysplat.simulate.phantom import Part, Phantom
 from tomo_polysplat.simulate.scanner import Scanner, transmission
 from tomo_polysplat.simulate.truth import voxelise_truth
 
-__all__ = ["SCENES", "Scene", "scan_phantom", "scene_phantom", "simulate_scan"]
+__all__ = ["SCENES", "Scene", "scan_bytes", "scan_phantom", "scene_phantom", "simulate_scan"]
 
 
 @dataclass(frozen=True)
@@ -73,6 +73,17 @@ def scene_phantom(scene: str, metal: bool | str = True) -> Phantom:
     if not isinstance(name, str):
         raise fail("metal", "True, False or the name of a metal", repr(metal), error=TypeError)
     return phantom.with_metal(name, density(name))
+
+
+def scan_bytes(size: int, views: int, geometry: str) -> int:
+    """Bytes that `simulate_scan` makes by default: projections with their marks, the truth and its metal mask."""
+    columns = _usual_pixels(size)
+    rows, slices = (1, 1) if geometry == "fan" else (columns, size)
+    return 5 * (rows * views * columns + slices * size**2)
+
+
+def _usual_pixels(size: int) -> int:
+    return -(-3 * size // 2)
 
 
 def simulate_scan(
@@ -141,8 +152,8 @@ def simulate_scan(
     """
     size = _count("size", size)
     chosen = SCENES[require_choice("scene", scene, SCENES)]
-    columns = _count("columns", -(-3 * size // 2) if columns is None else columns)
-    rows = 1 if geometry == "fan" else _count("rows", -(-3 * size // 2) if rows is None else rows)
+    columns = _count("columns", _usual_pixels(size) if columns is None else columns)
+    rows = 1 if geometry == "fan" else _count("rows", _usual_pixels(size) if rows is None else rows)
     if arc_degrees is None:
         arc_degrees = 180.0 if geometry == "parallel" else 360.0
     arc = require_number("arc_degrees", arc_degrees, above=0.0)

@@ -39,13 +39,18 @@ def initial_volume_on(
     projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid
 ) -> tuple[torch.Tensor, dict[str, Any]]:
     """As `initial_volume` for projections on a device, where the volume is, too."""
-    volume, reason = None, ""
+    volume, reason, where = None, "", projections.device.type
     if projections.is_cuda:
         fits, reason = _method(geometry, grid)
-        volume = fdk_on_gpu(projections, geometry, grid) if fits else None
+        try:
+            volume = fdk_on_gpu(projections, geometry, grid) if fits else None
+        except RuntimeError as problem:
+            # Torch's, or ASTRA's, whose memory comes on top of torch's.
+            _log.warning("The start is made on the CPU: %s", problem)
+            where = "cpu"
     if volume is None:
         device = projections.device
-        found, done = initial_volume(projections.cpu().numpy(), geometry, grid, device=device.type)
+        found, done = initial_volume(projections.cpu().numpy(), geometry, grid, device=where)
         return torch.from_numpy(np.ascontiguousarray(found)).to(device), done
     invalid = int((~torch.isfinite(projections)).sum())
     _log.info("Start from FDK: %s; %d invalid pixels.", reason, invalid)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
+from functools import reduce
 
 import numpy as np
 
@@ -25,8 +25,8 @@ _THROUGH = 0.1
 
 DEAD, ZERO = "of dead pixels", "zero in the middle of the object"
 STARVED = "without light behind dense matter"
-# Rays looked at.
-_MOST_RAYS = 8_000_000
+# Rays looked at, of so many views at least.
+_MOST_RAYS, _FEWEST_VIEWS = 8_000_000, 12
 
 
 def bad_rays(measured: Measured) -> dict[str, np.ndarray]:
@@ -49,7 +49,7 @@ def bad_rays(measured: Measured) -> dict[str, np.ndarray]:
 def _some_views(measured: Measured) -> np.ndarray:
     """Evenly spread views, as many as keep the probe within seconds."""
     scan = measured.scan
-    number = min(scan.views, max(24, _MOST_RAYS // (scan.rows * scan.columns)))
+    number = min(scan.views, max(_FEWEST_VIEWS, _MOST_RAYS // (scan.rows * scan.columns)))
     return np.linspace(0, scan.views - 1, number).round().astype(int)
 
 
@@ -60,7 +60,7 @@ def probe_rays(measured: Measured, kinds: dict[str, np.ndarray]) -> Finding:
     shares = {name: count / size for name, count in counts.items()}
     # Zeros are recognised within the object only, so they are compared with the rays through it.
     shares[ZERO] /= max(float(np.mean(measured.filled > _THROUGH * measured.level)), shares[ZERO], 1e-9)
-    listed = ", ".join(f"{100 * share:.2g} % {name}" for name, share in shares.items() if share)
+    listed = ", ".join(f"{100 * share:.3g} % {name}" for name, share in shares.items() if share)
     if sum(share for name, share in shares.items() if name != STARVED) > _TOLERATED:
         remedy = (
             "mark them in valid= (False is not used); correct flat fields, or saturation=, mend many of them"
@@ -91,16 +91,15 @@ def _dead_pixels(projections: np.ndarray, valid: np.ndarray, level: float) -> np
     if columns < 5 or views < 5:
         return np.zeros((rows, columns), bool)
     values = np.where(valid, projections, np.nan)
-    near = np.stack(_neighbours(values))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # about pixels without a single neighbour
-        highest, lowest = np.nanmax(near, axis=0), np.nanmin(near, axis=0)
+    near = _neighbours(values)
+    # One neighbour after the other: a copy of the scan for each of the eight would be too many.
+    highest, lowest = reduce(np.fmax, near), reduce(np.fmin, near)
     off = np.nan_to_num(np.fmax(values - highest, 0) - np.fmax(lowest - values, 0))
     limit = (_STANDS_OUT if rows > 2 else 3 * _STANDS_OUT) * level
     low, high = np.quantile(off, [1 - _ALMOST_ALL, _ALMOST_ALL], axis=1)
     stands_out = (low > limit) | (high < -limit)
     frozen = np.nan_to_num(np.ptp(values, axis=1), nan=1.0) == 0
-    lively = np.nan_to_num(np.ptp(near, axis=2)).min(axis=0) > 0
+    lively = np.logical_and.reduce([np.nan_to_num(np.ptp(one, axis=1)) > 0 for one in near])
     return stands_out | frozen & lively
 
 
