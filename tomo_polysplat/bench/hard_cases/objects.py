@@ -158,7 +158,7 @@ CASES = (
     Case("metal-one-voxel", f"iron in one voxel: {_METAL}", _one_voxel),
     Case("lead", "1 cm of lead, no light behind it: outside metal SIRT less the spread of seeds", _lead),
     Case("two-metals", f"iron and titanium: {_METAL}", _two),
-    Case("iodine", "on the default curves: the README's 40 %", _iodine),
+    Case("iodine", "on the default curves: 40 %", _iodine),
     Case("iodine-named", "named as a material: 10 %", _iodine_named),
     Case("barium-named", "named as a material: 10 %", _barium_named),
 )
