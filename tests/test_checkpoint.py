@@ -71,7 +71,7 @@ def test_the_start_volume_is_made_once(tmp_path, monkeypatch):
     def again(*_):
         raise AssertionError("the start volume was made again")
 
-    monkeypatch.setattr("tomo_polysplat.fit.beginning.first_volume", again)
+    monkeypatch.setattr("tomo_polysplat.fit.preparation.first_volume", again)
     assert "passes" in reconstruct(fan(), checkpoint=path, resume=True, settings=LONG).plan["stop"]
 
 

@@ -38,7 +38,7 @@ def interrupting(function, times=1):
 def test_in_the_start_stage_it_says_that_there_is_no_result(monkeypatch, tmp_path):
     path = tmp_path / "fit.npz"
     start = interrupting(lambda *_: None)
-    monkeypatch.setattr("tomo_polysplat.fit.beginning.first_volume", start)
+    monkeypatch.setattr("tomo_polysplat.fit.preparation.first_volume", start)
     with pytest.raises(KeyboardInterrupt, match="no result yet"):
         reconstruct(fan(), checkpoint=path)
     assert os.listdir(tmp_path) == [] and signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -11,10 +11,10 @@ from typing import Any
 import torch
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.fit.beginning import Begun, Wishes
 from tomo_polysplat.fit.calibration import Calibration
 from tomo_polysplat.fit.checkpoint import Checkpoint
 from tomo_polysplat.fit.optimise import FitOutcome, FitState
+from tomo_polysplat.fit.preparation import PreparedFit, RunOptions
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.soft_matter import describe_soft
 from tomo_polysplat.fit.solver import Solver
@@ -132,7 +132,7 @@ def reconstruct(
         After Ctrl-C before the fit has begun, or a second one after it.
     """
     started = time.perf_counter()
-    wishes = Wishes.of(quality, settings, time_budget, seed, device, callbacks)
+    run_options = RunOptions.of(quality, settings, time_budget, seed, device, callbacks)
     spectrum = require_spectrum("spectrum", spectrum)
     geometry, grid = from_astra(proj_geom, vol_geom)
     values, counts = usable_rays(projections, proj_geom, valid)
@@ -143,25 +143,27 @@ def reconstruct(
     wanted = Calibration.of(calibrate, soft_density, problem.spectrum)
     flipped = is_planar_geometry(proj_geom)
     asked = None if wanted is None else {"names": wanted.names, "soft_density": wanted.soft_density}
-    options = wishes.options() | {"calibration": asked or ("as the rays ask" if calibrate is None else None)}
+    options = run_options.to_dict() | {
+        "calibration": asked or ("as the rays ask" if calibrate is None else None)
+    }
     saved = _checkpoint(checkpoint, resume, problem, options)
     started -= 0.0 if saved is None else saved.seconds
-    with one_torch_thread(wishes.device), kept_threads(), progress_reports(progress) as report:
-        solver = Solver(wishes, saved, started, flipped, report)
-        problem, begun, outcome = solver.solve(problem, wanted, ask_scatter=calibrate is None)
-        begun.plan.reasons |= _undone(water_correction)
+    with one_torch_thread(run_options.device), kept_threads(), progress_reports(progress) as report:
+        solver = Solver(run_options, saved, started, flipped, report)
+        problem, prepared, outcome = solver.solve(problem, wanted, ask_scatter=calibrate is None)
+        prepared.plan.reasons |= _undone(water_correction)
         with postponed_interrupts("the volume") as interruption:
             report(1.0, "volume")
             result = _result(
                 outcome,
-                begun,
+                prepared,
                 problem,
                 grid,
                 unit=unit,
                 spectrum=problem.spectrum or spectrum,
                 flipped_2d=flipped,
                 counts=counts | outcome.counts(),
-                settings=wishes.settings.to_dict() | {"seed": seed, "quality": quality},
+                settings=run_options.settings.to_dict() | {"seed": seed, "quality": quality},
             )
     result.plan["stop"] = outcome.reason + (", then interrupted" if interruption.asked else "")
     result.seconds = time.perf_counter() - started
@@ -186,9 +188,11 @@ def _undone(water_correction: Sequence[float] | None) -> dict[str, str]:
     return {"water_correction": f"undone: {describe_polynomial(water_correction)}"}
 
 
-def _result(outcome: FitOutcome, begun: Begun, problem: Problem, grid: VolumeGrid, **about: Any) -> Result:
+def _result(
+    outcome: FitOutcome, prepared: PreparedFit, problem: Problem, grid: VolumeGrid, **about: Any
+) -> Result:
     """Volumes and Gaussians in the caller's coordinates."""
-    plan, scene, gaussians, length = begun.plan, begun.scene, outcome.gaussians, problem.length
+    plan, scene, gaussians, length = prepared.plan, prepared.scene, outcome.gaussians, problem.length
     if plan.blurred:
         fitted = about["settings"]["learning_rate_blur"] > 0
         plan.reasons["detector_blur"] = describe_blur(float(gaussians.blur), fitted=fitted)

@@ -18,7 +18,7 @@ from tomo_polysplat.bench.runs import timed_runs, warm_up, with_errors
 from tomo_polysplat.bench.scenes import cache_folder, cached_scan, fewer_views
 from tomo_polysplat.cli import main
 from tomo_polysplat.fit.optimise import FitState
-from tomo_polysplat.fit.pixel_question import FEWEST_PASSES
+from tomo_polysplat.fit.pixel_averaging import FEWEST_PASSES
 from tomo_polysplat.result.metrics import compare
 
 QUICK = {"passes": 1.0}

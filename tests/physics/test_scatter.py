@@ -5,16 +5,26 @@ import pytest
 import torch
 
 from tomo_polysplat.physics.base_materials import Materials
-from tomo_polysplat.physics.quadrature import sampled_quadrature
+from tomo_polysplat.physics.beer_lambert import projection
+from tomo_polysplat.physics.quadrature import fit_quadrature
 from tomo_polysplat.physics.ray_estimates import estimate_scatter, matching_factor
 from tomo_polysplat.physics.scatter import Scatter, add_scatter, light_around, made_level, without_scatter
 from tomo_polysplat.physics.spectral_change import with_voltage
 from tomo_polysplat.physics.spectrum import Spectrum
-from tomo_polysplat.physics.transmission import polychromatic_projection_numpy
 
 MATERIALS = Materials()
 SPECTRUM = Spectrum.from_tube(90, filters={"Al": 0.1})
-FULL = sampled_quadrature(SPECTRUM, MATERIALS)
+
+
+def every_energy(spectrum):
+    return fit_quadrature(spectrum, MATERIALS, nodes=spectrum.energies.size)
+
+
+def value_of(areal, quadrature):
+    return projection(areal, quadrature.log_weights, quadrature.attenuation)
+
+
+FULL = every_energy(SPECTRUM)
 
 
 def rays(count=3001):
@@ -28,8 +38,8 @@ def rays(count=3001):
 @pytest.mark.parametrize("scatter", [0.0, 0.02, 0.1])
 def test_scatter_adds_to_what_passes(scatter):
     areal = rays()
-    plain = polychromatic_projection_numpy(areal, FULL)
-    scattered = polychromatic_projection_numpy(areal, add_scatter(FULL, scatter))
+    plain = value_of(areal, FULL)
+    scattered = value_of(areal, add_scatter(FULL, scatter))
     np.testing.assert_allclose(np.exp(-scattered), np.exp(-plain) + scatter, rtol=1e-12)
     found = without_scatter(torch.from_numpy(scattered), scatter, 30.0)
     np.testing.assert_allclose(found, plain, rtol=1e-9, atol=1e-12)
@@ -46,7 +56,7 @@ def test_a_ray_with_less_signal_than_scatter_gets_the_largest_value():
 def test_scatter_is_found_although_the_matter_has_taken_some_of_it_up(scatter):
     areal, noise = rays(), np.random.default_rng(4)
     light = noise.uniform(0.3, 1.0, areal.shape[1])
-    total = np.exp(-polychromatic_projection_numpy(areal, FULL)) + beside(scatter, light)
+    total = np.exp(-value_of(areal, FULL)) + beside(scatter, light)
     measured = -np.log(total) + noise.normal(0.0, 0.003, light.shape)
     measured[::97] += 1.0  # rays that nothing explains
     thinner = areal * np.array([[0.97], [1.02], [0.95]])
@@ -57,7 +67,7 @@ def test_scatter_is_found_although_the_matter_has_taken_some_of_it_up(scatter):
 
 def test_rays_that_nothing_passes_tell_nothing():
     areal = np.concatenate([rays(), np.full((3, 5), 1e6)], axis=1)
-    measured = polychromatic_projection_numpy(rays(), FULL)
+    measured = value_of(rays(), FULL)
     measured = np.append(measured, np.full(5, 700.0))
     light = np.linspace(0.2, 1.0, len(measured))
     found = estimate_scatter(areal, measured, np.ones_like(measured), light, SPECTRUM, MATERIALS)
@@ -112,10 +122,7 @@ def beside(scatter, light):
 def test_a_known_density_tells_the_voltage(kvp):
     """Rays of water of density 1 at 90 kV, fitted under another voltage, look like water of another density."""
     wrong = Spectrum.from_tube(kvp, filters={"Al": 0.1})
-    one, other = (
-        polychromatic_projection_numpy(np.array([[1.0], [0], [0]]) * 3.0, sampled_quadrature(s, MATERIALS))
-        for s in (SPECTRUM, wrong)
-    )
+    one, other = (value_of(np.array([[1.0], [0], [0]]) * 3.0, every_energy(s)) for s in (SPECTRUM, wrong))
     density = float(one[0] / other[0])
     factor = matching_factor(with_voltage, wrong, "water", 6.0, 1 / density, (0.8, 1.25))
     assert factor * kvp == pytest.approx(90, abs=1.5)

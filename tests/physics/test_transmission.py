@@ -8,7 +8,7 @@ from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.physics.quadrature import fit_quadrature
 from tomo_polysplat.physics.spectrum import Spectrum
-from tomo_polysplat.physics.transmission import polychromatic_projection, polychromatic_projection_numpy
+from tomo_polysplat.physics.transmission import polychromatic_projection
 from tomo_polysplat.physics.water import areal_density, transmitted_energy, water_linearised
 
 SPECTRUM = Spectrum.from_tube(90, filters={"Al": 0.1})
@@ -31,9 +31,6 @@ def test_definition_in_any_shape(shape):
     value = polychromatic_projection(torch.from_numpy(areal), QUADRATURE)
     assert value.shape == shape
     np.testing.assert_allclose(value.numpy(), definition(areal), rtol=1e-12)
-    np.testing.assert_allclose(
-        polychromatic_projection_numpy(areal, QUADRATURE), definition(areal), rtol=1e-12
-    )
 
 
 def test_float32_is_stable_for_opaque_rays():

@@ -17,7 +17,7 @@ from tomo_polysplat.baselines.voxel_poly import voxel_poly
 from tomo_polysplat.baselines.water_bhc import water_bhc, water_corrected
 from tomo_polysplat.bench import peers
 from tomo_polysplat.fit.optimise import FitState
-from tomo_polysplat.fit.pixel_question import FEWEST_PASSES
+from tomo_polysplat.fit.pixel_averaging import FEWEST_PASSES
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.reconstruction import reconstruct
 from tomo_polysplat.result.result import Result
@@ -83,7 +83,7 @@ class Options:
 
 Outcome = tuple[np.ndarray, dict[str, Any]]
 
-# In runs of fewer passes it is not asked whether pixels average light; see `fit.pixel_question`.
+# In runs of fewer passes it is not asked whether pixels average light; see `fit.pixel_averaging`.
 WHOLE = {"passes": FEWEST_PASSES}
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from tomo_polysplat.fit.checkpoint import Checkpoint
 from tomo_polysplat.fit.fitter import Fitter, views_of_a_pass
 from tomo_polysplat.fit.learning_rates import hurried
-from tomo_polysplat.fit.pixel_question import PixelQuestion
+from tomo_polysplat.fit.pixel_averaging import PixelAveraging
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.stopping import Clock, FitState, Watch, is_true, patience_of
@@ -74,7 +74,7 @@ class _Run:
     clock: Clock
     started: float
     checkpoint: Checkpoint | None
-    question: PixelQuestion | None
+    averaging: PixelAveraging | None
     look: Callable[[Fitter, Clock], Any] | None
 
     def keep(self, *, now: bool) -> None:
@@ -126,13 +126,13 @@ class _Run:
                 return
 
     def _passes(self) -> Iterator[tuple[float, float, int]]:
-        """What each pass gave; where the question is asked, two at once, so that no checkpoint lies between them."""
+        """What each pass gave; where ``averaging`` is asked, two at once, so that no checkpoint lies between them."""
         passes = self.fitter.passes(self.clock)
         while True:
             if self.look is not None:
                 self.look(self.fitter, self.clock)
-            if self.question is not None and self.question.due(self.clock):
-                self.fitter, made = self.question.answered(self.fitter, self.clock)
+            if self.averaging is not None and self.averaging.due(self.clock):
+                self.fitter, made = self.averaging.answered(self.fitter, self.clock)
                 passes = self.fitter.passes(self.clock)
                 if made is not None:
                     yield made
@@ -162,7 +162,7 @@ def fit(
     volume: Callable[[Gaussians], np.ndarray],
     callbacks: Sequence[Callable[[FitState], Any]] = (),
     checkpoint: Checkpoint | None = None,
-    question: PixelQuestion | None = None,
+    averaging: PixelAveraging | None = None,
     look: Callable[[Fitter, Clock], Any] | None = None,
 ) -> FitOutcome:
     """Fit Gaussians to rays.
@@ -170,7 +170,7 @@ def fit(
     Stops after ``settings.passes`` over the views, at ``deadline`` (``time.perf_counter`` seconds), when the
     held-out rays have not improved for `patience_of` passes, when a callback returns True, or on
     KeyboardInterrupt; returns the Gaussians that `Watch` holds for the best. Where ``checkpoint``
-    holds a snapshot, ``gaussians`` are its own and the fit goes on from there. ``question`` is asked on the way, and
+    holds a snapshot, ``gaussians`` are its own and the fit goes on from there. ``averaging`` is asked on the way, and
     ``look`` called between passes.
 
     Raises
@@ -188,7 +188,7 @@ def fit(
     clock = Clock(steps, deadline)
     outcome = FitOutcome(gaussians)
     watch: Watch[Gaussians] = Watch(patience_of(settings, settings.passes))
-    run = _Run(fitter, outcome, watch, clock, started, checkpoint, question, look)
+    run = _Run(fitter, outcome, watch, clock, started, checkpoint, averaging, look)
     run.restore()
     try:
         if not outcome.reason:

@@ -81,7 +81,7 @@ class Plan:
     curves : int
         Material curves of the model: three, or the first alone, as for a monochromatic one.
     pixel_rays : int
-        Rays a pixel and axis over which the light is averaged; 0 until `fit.pixel_question` has told.
+        Rays a pixel and axis over which the light is averaged; 0 until `fit.pixel_averaging` has told.
     sharp : bool
         Whether seeds are thin across edges however close they are; `fit.sharpness` tells it by short fits.
     blurred : bool
@@ -147,21 +147,21 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     blurred, told = _blurred(start, first * problem.depth, settings)
     corners, texture = tv_corners(relative, matter.adapted(settings), problem.agreement, light)
     plan = Plan(
-        reference,
-        first,
-        matter.number,
-        optical_depth(relative, level, reference, problem),
-        level,
-        spacing,
-        finer,
-        smallest,
-        views,
-        passes,
-        every,
-        corners,
-        curves,
-        blurred,
-        settings.pixel_rays,
+        reference=reference,
+        first=first,
+        soft_u=matter.number,
+        depth=optical_depth(relative, level, reference, problem),
+        support_level=level,
+        spacing=spacing,
+        finer=finer,
+        smallest_scale=smallest,
+        views_per_step=views,
+        passes=passes,
+        tv_every=every,
+        tv_corners=corners,
+        curves=curves,
+        blurred=blurred,
+        pixel_rays=settings.pixel_rays,
     )
     unit = "g/cm3" if problem.polychromatic else "per unit of length"
     plan.reasons = {

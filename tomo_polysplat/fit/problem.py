@@ -236,22 +236,22 @@ class Problem:
         slope = float(quadrature.attenuation[0, 0]) if quadrature is not None and straight else 1.0
         closed, plan.reasons["window"] = self._closed(device)
         return FitScene(
-            voxel_box(self.grid),
-            None if straight else quadrature,
-            self.depth * plan.reference * slope,
-            reference_curve,
-            output_curve,
-            least_u,
-            kernel,
-            settings.cutoff,
-            settings.metal_tail,
-            plan.blurred,
-            plan.tv_corners,
-            closed,
-            plan.tv_every,
-            plan.smallest_scale,
-            max(plan.pixel_rays, 1),
-            self._solid_number(plan, settings),
+            box=voxel_box(self.grid),
+            quadrature=None if straight else quadrature,
+            areal_scale=self.depth * plan.reference * slope,
+            reference_curve=reference_curve,
+            output_curve=output_curve,
+            least_u=least_u,
+            kernel=kernel,
+            cutoff=settings.cutoff,
+            metal_tail=settings.metal_tail,
+            blurring=plan.blurred,
+            tv_corners=plan.tv_corners,
+            closed=closed,
+            tv_every=plan.tv_every,
+            smallest_scale=plan.smallest_scale,
+            pixel_rays=max(plan.pixel_rays, 1),
+            solid_number=self._solid_number(plan, settings),
         )
 
     def primary(self, device: torch.device) -> torch.Tensor:

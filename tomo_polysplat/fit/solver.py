@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.beginning import Begun, Wishes, begin, calibrate, physics, under
 from tomo_polysplat.fit.calibration import Calibration
 from tomo_polysplat.fit.checkpoint import Checkpoint
 from tomo_polysplat.fit.optimise import FitOutcome, OtherPhysics, fit
-from tomo_polysplat.fit.pixel_question import pixel_question
+from tomo_polysplat.fit.pixel_averaging import pixel_averaging
 from tomo_polysplat.fit.plan import Plan
+from tomo_polysplat.fit.preparation import PreparedFit, RunOptions, calibrate, physics, prepare, under
 from tomo_polysplat.fit.problem import Problem
-from tomo_polysplat.fit.scatter_question import ScatterQuestion, scatter_question
+from tomo_polysplat.fit.scatter_search import ScatterSearch, scatter_search
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.transfer import to_host
@@ -34,7 +34,7 @@ class Solver:
 
     Attributes
     ----------
-    wishes : Wishes
+    run_options : RunOptions
     saved : Checkpoint or None
     started : float
         When the reconstruction began, in seconds of ``time.perf_counter``.
@@ -44,7 +44,7 @@ class Solver:
         Gets the share done, and words.
     """
 
-    wishes: Wishes
+    run_options: RunOptions
     saved: Checkpoint | None
     started: float
     flipped: bool
@@ -52,7 +52,7 @@ class Solver:
 
     def solve(
         self, problem: Problem, wanted: Calibration | None, *, ask_scatter: bool
-    ) -> tuple[Problem, Begun, FitOutcome]:
+    ) -> tuple[Problem, PreparedFit, FitOutcome]:
         """The problem under the physics that were found, with what its fit began from and came to.
 
         Parameters
@@ -68,18 +68,18 @@ class Solver:
         KeyboardInterrupt
             After Ctrl-C before the fit has begun.
         """
-        problem, found = physics(problem, wanted, self.wishes, self.saved, self.report)
-        begun = self._begin(problem, found)
+        problem, found = physics(problem, wanted, self.run_options, self.saved, self.report)
+        prepared = self._begin(problem, found)
         try:
-            return problem, begun, self._fit(begun, problem, ask_scatter)
+            return problem, prepared, self._fit(prepared, problem, ask_scatter)
         except OtherPhysics as other:
             found, so_far = other.found, other.outcome
         # Outside of the handler, which would keep all of the first fit in memory.
-        return self._anew(problem, begun, found, so_far)
+        return self._anew(problem, prepared, found, so_far)
 
     def _anew(
-        self, problem: Problem, begun: Begun, found: dict[str, Any], so_far: FitOutcome
-    ) -> tuple[Problem, Begun, FitOutcome]:
+        self, problem: Problem, prepared: PreparedFit, found: dict[str, Any], so_far: FitOutcome
+    ) -> tuple[Problem, PreparedFit, FitOutcome]:
         """What `solve` gives, under other physics than those that a fit had begun with."""
         other, reasons = under(problem, found)
         try:
@@ -89,54 +89,54 @@ class Solver:
                 return other, anew, outcome
         except KeyboardInterrupt:
             logger.warning("Interrupted before the fit had begun anew; what it had come to is returned.")
-        begun.plan.reasons["scatter"] = f"not modelled: interrupted; {found['why']}"
-        return problem, begun, so_far
+        prepared.plan.reasons["scatter"] = f"not modelled: interrupted; {found['why']}"
+        return problem, prepared, so_far
 
-    def _begin(self, problem: Problem, found: dict[str, Any]) -> Begun:
-        begun = begin(problem, self.wishes, self.saved, self.report)
+    def _begin(self, problem: Problem, found: dict[str, Any]) -> PreparedFit:
+        prepared = prepare(problem, self.run_options, self.saved, self.report)
         # A plan from a checkpoint tells it already.
-        begun.plan.reasons = found | begun.plan.reasons
-        return begun
+        prepared.plan.reasons = found | prepared.plan.reasons
+        return prepared
 
-    def _fit(self, begun: Begun, problem: Problem, ask_scatter: bool) -> FitOutcome:
-        plan, scene, wishes = begun.plan, begun.scene, self.wishes
-        settings = plan.adapted(wishes.settings)
+    def _fit(self, prepared: PreparedFit, problem: Problem, ask_scatter: bool) -> FitOutcome:
+        plan, scene, run_options = prepared.plan, prepared.scene, self.run_options
+        settings = plan.adapted(run_options.settings)
         return fit(
-            begun.gaussians,
+            prepared.gaussians,
             plan.spacing * problem.voxel,
-            begun.rays,
+            prepared.rays,
             scene,
             replace(settings, passes=plan.passes),
             views_per_step=plan.views_per_step,
-            rng=np.random.default_rng(wishes.seed),
+            rng=np.random.default_rng(run_options.seed),
             started=self.started,
-            deadline=self._deadline(begun),
+            deadline=self._deadline(prepared),
             volume=_volume_of(scene, plan, problem, self.flipped),
-            callbacks=[lambda state: self.report(state.share, state.describe()), *wishes.callbacks],
+            callbacks=[lambda state: self.report(state.share, state.describe()), *run_options.callbacks],
             checkpoint=self.saved,
-            question=pixel_question(plan, begun.gaussians, settings, problem.geometry.views),
-            look=self._scatter_question(begun, problem) if ask_scatter else None,
+            averaging=pixel_averaging(plan, prepared.gaussians, settings, problem.geometry.views),
+            look=self._scatter_search(prepared, problem) if ask_scatter else None,
         )
 
-    def _deadline(self, begun: Begun) -> float | None:
+    def _deadline(self, prepared: PreparedFit) -> float | None:
         """When the fit ends at the latest, so that the volume is made in time."""
-        budget = self.wishes.time_budget
+        budget = self.run_options.time_budget
         if budget is None:
             return None
         # A volume that takes most of the budget still needs a fit: then the end is late.
         end = self.started + budget
         left = max(end - time.perf_counter(), 0.0)
-        return end - min(begun.scene.seconds_of_basis(begun.gaussians), 0.5 * left)
+        return end - min(prepared.scene.seconds_of_basis(prepared.gaussians), 0.5 * left)
 
-    def _scatter_question(self, begun: Begun, problem: Problem) -> ScatterQuestion | None:
+    def _scatter_search(self, prepared: PreparedFit, problem: Problem) -> ScatterSearch | None:
         def scatter() -> dict[str, Any]:
             self.report(0.0, "scatter")
-            found = calibrate(problem, Calibration(("scatter",), None, suspected=True), self.wishes)
+            found = calibrate(problem, Calibration(("scatter",), None, suspected=True), self.run_options)
             if not found["accepted"]["scatter"]:
                 problem.let_go_of_level()
             return found
 
-        return scatter_question(begun.plan, problem, scatter)
+        return scatter_search(prepared.plan, problem, scatter)
 
 
 def _volume_of(

@@ -23,7 +23,7 @@ from tomo_polysplat.physics.quadrature_fit import fit_nodes
 from tomo_polysplat.physics.ray_range import MaxPath, span_rays
 from tomo_polysplat.physics.spectrum import Spectrum
 
-__all__ = ["Quadrature", "fit_quadrature", "sampled_quadrature"]
+__all__ = ["Quadrature", "fit_quadrature"]
 
 MAX_FITTED_NODES = 16
 # Of a table of P along the first material.
@@ -162,15 +162,6 @@ def fit_quadrature(
         if candidate.rms_error <= tolerance and candidate.slope_error <= _SLOPE_TOLERANCE:
             return candidate
     return judge(full)
-
-
-def sampled_quadrature(
-    spectrum: Spectrum, materials: Materials | None = None, n: int | None = None, max_path: MaxPath = 8.0
-) -> Quadrature:
-    """Plain nodes at ``n`` equally spaced energies (``Spectrum.sampled``); None: at all of them."""
-    full = _nodes_of(spectrum, materials or Materials())
-    chosen = full if n is None else _nodes_of(spectrum.sampled(n), materials or Materials())
-    return _Judge(full, max_path)(chosen)
 
 
 def _nodes_of(spectrum: Spectrum, materials: Materials, curves: int = 3) -> _Nodes:

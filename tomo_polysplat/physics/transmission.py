@@ -5,14 +5,12 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Any
 
-import numpy as np
 import torch
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.physics import beer_lambert
 from tomo_polysplat.physics.quadrature import Quadrature
 
-__all__ = ["nodes_on", "polychromatic_projection", "polychromatic_projection_numpy"]
+__all__ = ["nodes_on", "polychromatic_projection"]
 
 
 def polychromatic_projection(areal: torch.Tensor, quadrature: Quadrature) -> torch.Tensor:
@@ -47,13 +45,6 @@ def polychromatic_projection(areal: torch.Tensor, quadrature: Quadrature) -> tor
         raise fail("areal", "float32 or float64", f"{areal.dtype}")
     log_weights, attenuation = nodes_on(quadrature, areal.dtype, areal.device)
     return _Projection.apply(areal, log_weights, attenuation)
-
-
-def polychromatic_projection_numpy(areal: np.ndarray, quadrature: Quadrature) -> np.ndarray:
-    """The same in NumPy and float64, from areal densities to projection values ``(...)``."""
-    areal = np.asarray(areal, dtype=np.float64)
-    _require_channels(areal.shape, quadrature)
-    return beer_lambert.projection(areal, quadrature.log_weights, quadrature.attenuation)
 
 
 def _require_channels(shape: tuple[int, ...], quadrature: Quadrature) -> None:

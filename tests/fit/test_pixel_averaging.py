@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import tomo_polysplat as tps
-from tomo_polysplat.fit.pixel_question import PixelQuestion
+from tomo_polysplat.fit.pixel_averaging import PixelAveraging
 from tomo_polysplat.fit.stopping import Clock
 
 QUICK = {"passes": 10.0, "edges": "blurred", "tv_factor": 1.0}
@@ -78,7 +78,7 @@ def test_a_budget_that_ends_amid_the_question_leaves_the_run_as_it_was(passes):
         return made
 
     fitter = SimpleNamespace(ahead=slowly, branch=lambda rays: SimpleNamespace(ahead=slowly))
-    chosen, last = PixelQuestion(plan).answered(fitter, clock)
+    chosen, last = PixelAveraging(plan).answered(fitter, clock)
     assert chosen is fitter and last == (made[0] if made else None)
     assert plan.pixel_rays == 1 and "time budget" in plan.reasons["pixel_rays"]
 

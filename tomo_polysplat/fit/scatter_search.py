@@ -24,7 +24,7 @@ from tomo_polysplat.fit.stopping import Clock
 from tomo_polysplat.physics.ray_estimates import estimate_scatter
 from tomo_polysplat.start.initial import FEW_VIEWS
 
-__all__ = ["ScatterQuestion", "scatter_question"]
+__all__ = ["ScatterSearch", "scatter_search"]
 
 logger = logging.getLogger(__name__)
 
@@ -41,7 +41,7 @@ _SHORT = 480
 
 
 @dataclass(frozen=True)
-class ScatterQuestion:
+class ScatterSearch:
     """The question of one run, whose plan gets the answer.
 
     Attributes
@@ -114,15 +114,15 @@ class ScatterQuestion:
         logger.info("Scatter: %s.", words)
 
 
-def scatter_question(
+def scatter_search(
     plan: Plan, problem: Problem, calibrate: Callable[[], dict[str, Any]]
-) -> ScatterQuestion | None:
+) -> ScatterSearch | None:
     """The question where it can be answered; else the plan gets the answer now, unless it has it."""
     if not problem.polychromatic:
         return None
     if problem.geometry.views < FEW_VIEWS:
         plan.reasons.setdefault("scatter", f"not asked: fewer than {FEW_VIEWS} views do not tell")
-    return None if "scatter" in plan.reasons else ScatterQuestion(plan, problem, calibrate)
+    return None if "scatter" in plan.reasons else ScatterSearch(plan, problem, calibrate)
 
 
 def _drift(rays: RaySample) -> float | None:

@@ -9,7 +9,7 @@ import torch
 
 import tomo_polysplat as tps
 from tomo_polysplat.fit import calibration, solver
-from tomo_polysplat.fit.beginning import begin
+from tomo_polysplat.fit.preparation import prepare
 from tomo_polysplat.physics.scatter import light_around
 
 QUICK = {"passes": 6.0, "tv_factor": 1.0, "edges": "blurred", "pixel_rays": 1}
@@ -35,7 +35,7 @@ def test_scatter_that_nobody_told_of_is_modelled():
     assert asked.plan["scatter"].startswith("modelled: ")
     assert asked.plan["calibration"]["fitted"]["scatter"] == pytest.approx(0.05, rel=0.1)
     assert asked.plan["calibration"]["fitted"] == told.plan["calibration"]["fitted"]
-    # Begun anew, the run is that of a scan whose scatter was known from the first.
+    # PreparedFit anew, the run is that of a scan whose scatter was known from the first.
     assert np.array_equal(asked.volume, told.volume)
     assert "scatter" not in without.plan
     assert error(asked, scan) < 0.6 * error(without, scan)
@@ -146,9 +146,9 @@ def test_ctrl_c_while_it_begins_anew_returns_what_it_had_come_to(monkeypatch):
         begun.append(scan)
         if len(begun) > 1:
             raise KeyboardInterrupt
-        return begin(*scan)
+        return prepare(*scan)
 
-    monkeypatch.setattr(solver, "begin", once)
+    monkeypatch.setattr(solver, "prepare", once)
     result = reconstruct(pins(0.05))
     assert result.plan["stop"] == "interrupted" and len(begun) == 2
     assert result.history and result.plan["scatter"].startswith("not modelled: interrupted")

@@ -25,7 +25,7 @@ from tomo_polysplat.render.renderer import project_gaussians
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.initial import FEW_VIEWS
 
-__all__ = ["FEWEST_PASSES", "PixelQuestion", "pixel_question"]
+__all__ = ["FEWEST_PASSES", "PixelAveraging", "pixel_averaging"]
 
 logger = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ Made = tuple[float, float, int]
 
 
 @dataclass(frozen=True)
-class PixelQuestion:
+class PixelAveraging:
     """The question of one run, whose plan gets the answer."""
 
     plan: Plan
@@ -80,7 +80,9 @@ class PixelQuestion:
         return (other if averaged else fitter), _last(made[averaged])
 
 
-def pixel_question(plan: Plan, gaussians: Gaussians, settings: Settings, views: int) -> PixelQuestion | None:
+def pixel_averaging(
+    plan: Plan, gaussians: Gaussians, settings: Settings, views: int
+) -> PixelAveraging | None:
     """The question where it can be answered; else the plan gets the answer now.
 
     Parameters
@@ -98,7 +100,7 @@ def pixel_question(plan: Plan, gaussians: Gaussians, settings: Settings, views: 
         return None
     why_not = _why_not(plan, gaussians, views)
     if not why_not:
-        return PixelQuestion(plan)
+        return PixelAveraging(plan)
     _not_asked(plan, why_not)
     return None
 

@@ -1,4 +1,4 @@
-"""What a fit begins with: a caller's wishes, the physics, the plan, and the first Gaussians."""
+"""What a fit begins with: a caller's options, the physics, the plan, and the first Gaussians."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from tomo_polysplat.kernels.select import pick_fast_device
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings, make_settings
 
-__all__ = ["Begun", "Wishes", "begin", "calibrate", "physics", "under"]
+__all__ = ["PreparedFit", "RunOptions", "prepare", "calibrate", "physics", "under"]
 
 
 @dataclass(frozen=True)
-class Wishes:
+class RunOptions:
     """How a caller wants a scan fitted, checked.
 
     Attributes
@@ -50,20 +50,20 @@ class Wishes:
     @classmethod
     def of(
         cls, quality: str, settings: Any, time_budget: Any, seed: Any, device: str, callbacks: Any
-    ) -> Wishes:
+    ) -> RunOptions:
         """Those of `reconstruct`'s arguments."""
         chosen = make_settings(quality, settings)
         if time_budget is not None:
             time_budget = require_number("time_budget", time_budget, above=0)
         return cls(chosen, time_budget, _whole(seed), pick_fast_device(device), _functions(callbacks))
 
-    def options(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """All that the result depends on, for a checkpoint."""
         return self.settings.to_dict() | {"seed": self.seed, "time_budget": self.time_budget}
 
 
 @dataclass(frozen=True)
-class Begun:
+class PreparedFit:
     """All that a fit starts from."""
 
     plan: Plan
@@ -75,7 +75,7 @@ class Begun:
 def physics(
     problem: Problem,
     wanted: Calibration | None,
-    wishes: Wishes,
+    run_options: RunOptions,
     saved: Checkpoint | None,
     report: Callable[[float, str], Any],
 ) -> tuple[Problem, dict[str, Any]]:
@@ -85,12 +85,14 @@ def physics(
     if wanted is None:
         return problem, {}
     report(0.0, "calibration")
-    return under(problem, calibrate(problem, wanted, wishes))
+    return under(problem, calibrate(problem, wanted, run_options))
 
 
-def calibrate(problem: Problem, wanted: Calibration, wishes: Wishes) -> dict[str, Any]:
+def calibrate(problem: Problem, wanted: Calibration, run_options: RunOptions) -> dict[str, Any]:
     """The record of a calibration."""
-    return calibrated(problem, wanted, wishes.settings, wishes.device, wishes.seed, wishes.time_budget)
+    return calibrated(
+        problem, wanted, run_options.settings, run_options.device, run_options.seed, run_options.time_budget
+    )
 
 
 def under(problem: Problem, found: dict[str, Any] | None) -> tuple[Problem, dict[str, Any]]:
@@ -105,9 +107,9 @@ def under(problem: Problem, found: dict[str, Any] | None) -> tuple[Problem, dict
     return with_fitted(problem, found["fitted"]), reasons
 
 
-def begin(
-    problem: Problem, wishes: Wishes, saved: Checkpoint | None, report: Callable[[float, str], Any]
-) -> Begun:
+def prepare(
+    problem: Problem, run_options: RunOptions, saved: Checkpoint | None, report: Callable[[float, str], Any]
+) -> PreparedFit:
     """Plan, seed and set up, or go on from where a checkpoint was; ``report`` gets the share done, none, and words.
 
     Raises
@@ -115,15 +117,15 @@ def begin(
     KeyboardInterrupt
         After Ctrl-C: there is no result yet.
     """
-    settings, device, options = wishes.settings, wishes.device, wishes.options()
+    settings, device, options = run_options.settings, run_options.device, run_options.to_dict()
     try:
         if saved is not None and saved.snapshot is not None and saved.plan is not None:
             plan, gaussians = saved.plan, saved.snapshot.gaussians.to(device)
-            return Begun(plan, gaussians, *_model(problem, plan, wishes))
+            return PreparedFit(plan, gaussians, *_model(problem, plan, run_options))
         report(0.0, "start volume")
         start, why = first_volume(problem, device, settings)
         plan = make_plan(start, problem, settings, device.type)
-        scene, rays = _model(problem, plan, wishes)
+        scene, rays = _model(problem, plan, run_options)
         report(0.0, "seeds")
         settings, agent = settings_for_agent(start, plan.first, problem, settings, device, options)
         plan.reasons |= {"start": why, **agent}
@@ -133,12 +135,12 @@ def begin(
         raise KeyboardInterrupt("interrupted before the fit had begun: there is no result yet") from None
     if saved is not None:
         saved.plan = plan
-    return Begun(plan, gaussians, scene, rays)
+    return PreparedFit(plan, gaussians, scene, rays)
 
 
-def _model(problem: Problem, plan: Plan, wishes: Wishes) -> tuple[FitScene, Rays]:
+def _model(problem: Problem, plan: Plan, run_options: RunOptions) -> tuple[FitScene, Rays]:
     """The forward model and what it is compared with."""
-    settings, device = wishes.settings, wishes.device
+    settings, device = run_options.settings, run_options.device
     return problem.scene(plan, settings, device), problem.rays(plan, settings, device)
 
 
