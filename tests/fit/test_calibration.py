@@ -9,7 +9,8 @@ import torch
 from small_scans import geometries, reconstruct
 
 import tomo_polysplat as tps
-from tomo_polysplat.fit.calibration import Calibration, _judge, calibrated, with_fitted
+from tomo_polysplat.fit.calibrated_physics import with_fitted
+from tomo_polysplat.fit.calibration import Calibration, _judge, calibrated
 from tomo_polysplat.fit.first_volume import first_volume
 from tomo_polysplat.fit.plan import make_plan
 from tomo_polysplat.fit.problem import Problem

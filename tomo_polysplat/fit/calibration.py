@@ -18,17 +18,23 @@ import numpy as np
 import torch
 
 from tomo_polysplat.checks import fail, require_choice, require_number
+from tomo_polysplat.fit.calibrated_physics import (
+    CHANGES,
+    LEAST_SCATTER,
+    bounds_of,
+    judge_scatter,
+    moved_scatter,
+    moved_spectrum,
+    with_fitted,
+)
 from tomo_polysplat.fit.first_volume import first_volume
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.short_fit import TOO_SHORT, ShortFit, Untold, short_fit
-from tomo_polysplat.physics.ray_estimates import estimate_scatter, matching_factor
-from tomo_polysplat.physics.scatter import Scatter
-from tomo_polysplat.physics.spectral_change import tube_voltage, with_filtration, with_voltage
+from tomo_polysplat.physics.spectral_change import tube_voltage
 from tomo_polysplat.physics.spectrum import Spectrum
-from tomo_polysplat.physics.tube_tables import voltage_range
 from tomo_polysplat.settings import Settings
 
-__all__ = ["Calibration", "calibrated", "describe_scatter", "with_fitted"]
+__all__ = ["Calibration", "calibrated"]
 
 logger = logging.getLogger(__name__)
 
@@ -37,20 +43,10 @@ _ROUNDS = 2
 _SHARE_OF_BUDGET = 0.6
 # Steps of a short fit that tells a density: it is 0.7 to 1.5 % low after 120 (teeth, pins, lung), 0.3 to 0.5 after 240.
 _STEPS_FOR_DENSITY = 240
-# Scatter below this share of the open beam, and densities closer than this, are left as they are.
-_LEAST_SCATTER, _LEAST_CHANGE = 2e-3, 0.02
-# Held-out errors of two fits of the same scan under nearly the same physics, with one seed, differ by up to 2 %.
-_MARGIN = 0.03
-# Scatter, and a brighter beam, have to explain the darkest rays by so much better than each other. Scatter of 1 and 2 %
-# in scenes with metal did by 8 to 36 %; beams 1 % brighter are taken for scatter where iron is opaque (10 and 12 %).
-_DARKER = 0.05
 # A known density is taken at its word unless the rays contradict it by as much.
 _CONTRADICTION = 0.1
 # Nothing is denser, in g/cm3.
 _DENSEST = 25.0
-# Factors of the tube voltage and of the filters that are looked at.
-_BOUNDS = {"kvp": (0.8, 1.25), "filter": (0.4, 2.5)}
-_CHANGES: dict[str, Callable[[Spectrum, float], Spectrum]] = {"kvp": with_voltage, "filter": with_filtration}
 
 Record = dict[str, Any]
 
@@ -100,11 +96,11 @@ class Calibration:
                 raise fail("calibrate", "True, False or names", repr(calibrate), error=TypeError)
             names = (calibrate,) if isinstance(calibrate, str) else tuple(calibrate)
         for name in names:
-            require_choice("calibrate", name, ("scatter", *_CHANGES))
+            require_choice("calibrate", name, ("scatter", *CHANGES))
         return cls(names, soft_density)._checked(spectrum)
 
     def _checked(self, spectrum: Spectrum) -> Calibration:
-        spectral = [name for name in self.names if name in _CHANGES]
+        spectral = [name for name in self.names if name in CHANGES]
         if len(spectral) > 1:
             raise fail("calibrate", "'kvp' or 'filter'", "both", "one known density tells one of them")
         if spectral and self.soft_density is None:
@@ -115,34 +111,6 @@ class Calibration:
         if spectral:
             tube_voltage(spectrum)
         return self
-
-
-def with_fitted(problem: Problem, fitted: Mapping[str, float]) -> Problem:
-    """The problem under other physics.
-
-    Parameters
-    ----------
-    problem : Problem
-        Polychromatic.
-    fitted : mapping
-        ``scatter`` and ``scatter_of_light`` (the attributes of `Scatter`), ``beam`` (its brightness, in those of the
-        open field), and factors ``kvp`` and ``filter`` of the spectrum, as far as they differ.
-    """
-    spectrum = problem.spectrum
-    assert spectrum is not None
-    for name, change in _CHANGES.items():
-        if fitted.get(name, 1.0) != 1.0:
-            spectrum = change(spectrum, fitted[name])
-    return problem.under(spectrum, _scatter_in(fitted), float(fitted.get("beam", 1.0)))
-
-
-def _scatter_in(fitted: Mapping[str, float]) -> Scatter:
-    return Scatter(float(fitted.get("scatter", 0.0)), float(fitted.get("scatter_of_light", 0.0)))
-
-
-def _as_fitted(scatter: Scatter) -> dict[str, float]:
-    """As `with_fitted` takes it."""
-    return {"scatter": scatter.constant} | ({"scatter_of_light": scatter.of_light} if scatter.varies else {})
 
 
 def calibrated(
@@ -253,57 +221,18 @@ def _stage(
     made: list[ShortFit] = []
     for _ in range(_ROUNDS):
         last = made[-1] if made else begin
-        moved = _scatter_moved(last, problem) if name == "scatter" else _moved(name, last, wanted, problem)
+        if name == "scatter":
+            moved = moved_scatter(last, problem)
+        else:
+            assert wanted.soft_density is not None
+            moved = moved_spectrum(name, last, wanted.soft_density, problem)
         if not moved:
             break
         made.append(trial({k: v for k, v in last.fitted.items() if not k.startswith(name)} | moved))
     beam = begin.rays.beam()
-    if wanted.suspected and beam - 1.0 > _LEAST_SCATTER:
+    if wanted.suspected and beam - 1.0 > LEAST_SCATTER:
         made.append(trial({**begin.fitted, "beam": beam}))
     return made
-
-
-def _scatter_moved(last: ShortFit, problem: Problem) -> dict[str, float]:
-    """The scatter where the last short fit says that it is; nothing where that is where it was."""
-    physics, rays = with_fitted(problem, last.fitted), last.rays
-    assert physics.spectrum is not None and physics.materials is not None
-    if not len(rays.light):
-        return {}
-    level, was = last.scatter_level, physics.scatter
-    sample = (rays.areal, rays.measured, rays.weight, rays.light)
-    found = estimate_scatter(*sample, physics.spectrum, physics.materials, level)
-    new = Scatter(was.constant + found.constant - level, was.of_light + found.of_light)
-    light = torch.as_tensor(rays.light)
-    old, now = was.at(light), new.at(light)
-    if float((now - old).abs().max()) <= max(_LEAST_SCATTER, 0.02 * float(old.max())):
-        return {}
-    return _as_fitted(new)
-
-
-def _moved(name: str, last: ShortFit, wanted: Calibration, problem: Problem) -> dict[str, float]:
-    """The factor of the spectrum under which the main matter has its density; nothing where it has it."""
-    physics, old = with_fitted(problem, last.fitted), last.fitted.get(name, 1.0)
-    assert physics.spectrum is not None and physics.materials is not None
-    assert wanted.soft_density is not None
-    ratio = wanted.soft_density / last.soft_density if last.soft_density else 1.0
-    if abs(ratio - 1.0) < _LEAST_CHANGE:
-        return {}
-    low, high = _bounds(name, problem)
-    longest, bounds = float(np.quantile(last.rays.areal[0], 0.95)), (low / old, high / old)
-    change, soft = _CHANGES[name], physics.materials.soft
-    value = old * matching_factor(change, physics.spectrum, soft, longest, ratio, bounds)
-    return {} if value == old else {name: value}
-
-
-def _bounds(name: str, problem: Problem) -> tuple[float, float]:
-    """Range of a factor of the assumed spectrum; voltages end where the tables of tubes do."""
-    low, high = _BOUNDS[name]
-    if name != "kvp":
-        return low, high
-    assert problem.spectrum is not None
-    # A hair inside: dividing and multiplying by a factor rounds.
-    first, last = (end / tube_voltage(problem.spectrum) for end in voltage_range("W"))
-    return max(low, first * (1 + 1e-9)), min(high, last * (1 - 1e-9))
 
 
 def _judge(
@@ -315,9 +244,9 @@ def _judge(
     if not stage:
         return None, "nothing to change"
     if name == "scatter":
-        return _judge_scatter(before, stage, wanted.suspected)
+        return judge_scatter(before, stage, wanted.suspected)
     after = stage[-1]
-    low, high = _bounds(name, problem)
+    low, high = bounds_of(name, problem)
     change = f"{after.fitted[name]:.4g}"
     if not 1.001 * low < after.fitted[name] < 0.999 * high:
         return None, f"times {change} is as far as is looked, and the density asks for more: not accepted"
@@ -325,37 +254,3 @@ def _judge(
     errors = f"held-out error {before.held_out:.3e} before, {after.held_out:.3e} after"
     reason = f"times {change} by the known density, {'accepted' if fits else 'not accepted'}: {errors}"
     return after if fits else None, reason
-
-
-def _judge_scatter(
-    before: ShortFit, stage: Sequence[ShortFit], suspected: bool
-) -> tuple[ShortFit | None, str]:
-    """The best of the fits with scatter, or with a brighter beam, where the rays tell that it is."""
-    kinds = [[fit for fit in stage if name in fit.fitted] for name in ("scatter", "beam")]
-    best = [min(fits, key=lambda fit: fit.held_out) for fits in kinds if fits]
-    not_taken = []
-    for fit in best:
-        better = fit.held_out < (1 - _MARGIN) * before.held_out
-        if suspected:
-            better &= fit.darkest < before.darkest * (1.0 if "scatter" in fit.fitted else 1 + _MARGIN)
-            better &= all(_as_good(fit, rival) for rival in best if rival is not fit)
-        errors = f"held-out error {before.held_out:.3e} before, {fit.held_out:.3e} after"
-        errors += f", of the darkest rays {before.darkest:.3e} and {fit.darkest:.3e}"
-        if better:
-            return fit, f"{describe_scatter(fit.fitted)}, accepted: {errors}"
-        not_taken.append(f"{describe_scatter(fit.fitted)}, not accepted: {errors}")
-    return None, "; ".join(not_taken)
-
-
-def _as_good(fit: ShortFit, rival: ShortFit) -> bool:
-    """Whether a fit explains the rays as well as another, and the darkest better."""
-    return fit.held_out < (1 + _MARGIN) * rival.held_out and fit.darkest < (1 - _DARKER) * rival.darkest
-
-
-def describe_scatter(fitted: Mapping[str, float]) -> str:
-    """In words; `with_fitted` tells what is in ``fitted``."""
-    if "beam" in fitted:
-        return f"a beam {fitted['beam']:.4g} times as bright as the open field"
-    scatter = _scatter_in(fitted)
-    words = f"{scatter.constant:.4g} of the open beam"
-    return words + (f" and {scatter.of_light:.4g} of the light around a ray" if scatter.varies else "")

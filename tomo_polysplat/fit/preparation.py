@@ -10,7 +10,8 @@ import torch
 
 from tomo_polysplat.checks import fail, require_number
 from tomo_polysplat.fit.agent import settings_for_agent
-from tomo_polysplat.fit.calibration import Calibration, calibrated, describe_scatter, with_fitted
+from tomo_polysplat.fit.calibrated_physics import describe_scatter, with_fitted
+from tomo_polysplat.fit.calibration import Calibration, calibrated
 from tomo_polysplat.fit.checkpoint import Checkpoint
 from tomo_polysplat.fit.first_volume import first_volume
 from tomo_polysplat.fit.plan import Plan, make_plan

@@ -97,7 +97,7 @@ class ShortFit:
     Attributes
     ----------
     fitted : dict
-        The physics that was assumed; see ``fit.calibration.with_fitted``.
+        The physics that was assumed; see ``fit.calibrated_physics.with_fitted``.
     held_out : float
         Misfit of the held-out rays, or of the fitted ones where there are too few.
     darkest : float
