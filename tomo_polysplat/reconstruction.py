@@ -163,7 +163,7 @@ def reconstruct(
                 spectrum=problem.spectrum or spectrum,
                 flipped_2d=flipped,
                 counts=counts | outcome.counts(),
-                settings=run_options.settings.to_dict() | {"seed": seed, "quality": quality},
+                settings=run_options.settings.to_dict() | {"seed": run_options.seed, "quality": quality},
             )
     result.plan["stop"] = outcome.reason + (", then interrupted" if interruption.asked else "")
     result.seconds = time.perf_counter() - started
@@ -211,7 +211,8 @@ def _result(
         }
     curves = problem.all_curves(own, plan, about["settings"]["bone_level"])
     if problem.polychromatic:
-        tell_impossible(curves, plan.reasons)
+        counts = about["counts"]
+        tell_impossible(curves, plan.reasons, counts["rays_not_finite"] / counts["rays"])
     return Result(
         curves,
         grid,

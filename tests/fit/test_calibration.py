@@ -248,6 +248,14 @@ def test_walls_do_not_tell_their_density():
     ("scatter", "beam", "taken"),
     [
         *((((0.5, 0.5), (0.6, 0.9), "scatter"), ((0.5, 0.9), (0.49, 0.8), "beam"))),
+        # All rays far better, and the darkest no worse.
+        *(
+            (
+                ((0.4, 0.9), (0.9, 0.91), "scatter"),
+                ((0.9, 0.9), (0.4, 0.89), "beam"),
+                ((0.4, 0.9), (0.9, 0.89), None),
+            )
+        ),
         # Not the darkest rays as well; not better than the other; neither better than before.
         *((((0.5, 1.1), None, None), ((0.5, 0.9), (0.6, 0.8), None), ((0.99, 0.9), (1.1, 0.95), None))),
     ],

@@ -32,6 +32,15 @@ def test_only_a_piece_denser_than_osmium_is_impossible(density, voxels, steel, t
     assert ("lengths" in reasons) == told == ("unit of length or the size of a pixel" in caplog.text)
 
 
+def test_rays_without_light_are_named_first(caplog):
+    with caplog.at_level(logging.WARNING):
+        tell_impossible(curves(80.0, 60), {}, lightless=0.06)
+    assert (
+        caplog.messages[0].startswith("The density of metal is not told")
+        and "6.0% of the rays" in caplog.text
+    )
+
+
 def test_it_is_said_once(caplog):
     reasons = {}
     doubt_lengths(reasons, "of one reason")

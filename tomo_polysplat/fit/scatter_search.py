@@ -36,6 +36,7 @@ _LEAST = 0.004
 # Beside the object, views that differ by more than this share of the most scatter tell of a drifting beam; and the rays
 # of a view that tell it, and the views.
 _DRIFT, _FEWEST_RAYS, _FEWEST_VIEWS = 0.3, 10, 5
+_ASKED = "calibrate=True fits it all the same"
 # Steps of the short fits that follow.
 _SHORT = 480
 
@@ -75,10 +76,10 @@ class ScatterSearch:
             self._tell(f"none: the rays show {most:.1g} of the open beam at most")
         elif drift is None:
             words = "too few rays pass beside the object to tell it from a drifting beam"
-            self._tell(f"not modelled: the rays may show {most:.2g} of the open beam, but {words}")
+            self._tell(f"not modelled: the rays may show {most:.2g} of the open beam, but {words}; {_ASKED}")
         elif drift > _DRIFT * most:
             words = "the light beside the object differs from view to view, as that of a drifting beam does"
-            self._tell(f"not modelled: {words}; calibrate=True fits it all the same")
+            self._tell(f"not modelled: {words}; {_ASKED}")
         else:
             self._ask(most)
 

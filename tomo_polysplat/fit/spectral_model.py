@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import torch
@@ -11,6 +12,7 @@ from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.material_range import LEAST_U, least_material_number
 from tomo_polysplat.physics.quadrature import Quadrature, fit_quadrature
 from tomo_polysplat.physics.scatter import add_scatter
+from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.water import transmitted_energy
 from tomo_polysplat.settings import Settings
 
@@ -24,6 +26,9 @@ __all__ = ["OPAQUE", "spectral_model"]
 OPAQUE = 15.0
 # And to this at least: a scan of nothing has no range.
 _LEAST_PROJECTION = 1e-3
+# The range is rounded up to a power of this, so that short fits and scans of one kind share their nodes, whose fit
+# takes as long as some dozen steps on a GPU.
+_RANGE_STEP = 2.0**0.125
 
 
 def spectral_model(
@@ -48,9 +53,10 @@ def spectral_model(
     primary = problem.primary(device)
     most = float(primary.nan_to_num(nan=-math.inf).max())
     # Mixtures of three curves are told apart by more than what thin rays use of them.
-    largest = min(max(most, 1.0 if plan.curves > 1 else _LEAST_PROJECTION), OPAQUE)
+    largest = max(most, 1.0 if plan.curves > 1 else _LEAST_PROJECTION)
+    rounded = _RANGE_STEP ** math.ceil(math.log(largest, _RANGE_STEP))
     nodes = settings.spectral_nodes or None
-    quadrature = fit_quadrature(spectrum, materials, largest, nodes, curves=plan.curves)
+    quadrature = _fitted_nodes(spectrum, materials, min(rounded, OPAQUE), nodes, plan.curves)
     plan.reasons["spectrum"] = quadrature.describe()
     plan.reasons["hardening"] = quadrature.describe_hardening(most)
     lit_by_scatter = add_scatter(quadrature, problem.scatter_level(device))
@@ -61,6 +67,13 @@ def spectral_model(
     plan.reasons["reference_energy"] = f"{energy:.1f} keV: the mean of what a typical ray transmits"
     output = _relative(materials, spectrum.effective_energy, device)
     return lit_by_scatter, _relative(materials, energy, device), output, least_u
+
+
+@lru_cache(maxsize=32)
+def _fitted_nodes(
+    spectrum: Spectrum, materials: Materials, largest: float, nodes: int | None, curves: int
+) -> Quadrature:
+    return fit_quadrature(spectrum, materials, largest, nodes, curves=curves)
 
 
 def _relative(materials: Materials, energy: float, device: torch.device) -> torch.Tensor:

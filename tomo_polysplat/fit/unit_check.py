@@ -15,6 +15,8 @@ logger = logging.getLogger(__name__)
 _DENSEST_SOLID, _FEWEST = 22.6, 8
 # Single voxels of steel overshoot: what is impossible must be this share of all that is metal, denser than titanium.
 _OF_METAL, _METAL = 0.2, 5.0
+# Share of rays without a value from which these explain it first.
+_LIGHTLESS = 0.005
 _WRONG_LENGTHS = "The unit of length or the size of a pixel looks wrong"
 
 
@@ -25,7 +27,7 @@ def doubt_lengths(reasons: dict[str, Any], words: str, what: str = _WRONG_LENGTH
         logger.warning("%s: %s.", what, words)
 
 
-def tell_impossible(curves: np.ndarray, reasons: dict[str, Any]) -> None:
+def tell_impossible(curves: np.ndarray, reasons: dict[str, Any], lightless: float = 0.0) -> None:
     """Doubt the lengths, or the materials, of a volume whose metal is denser than any solid.
 
     Parameters
@@ -34,6 +36,8 @@ def tell_impossible(curves: np.ndarray, reasons: dict[str, Any]) -> None:
         Densities in g/cm3 of the material curves.
     reasons : dict
         The plan's.
+    lightless : float
+        Share of the rays without a finite value: metal that no light passes is what they may have met.
     """
     if sum(float(curve.max(initial=0.0)) for curve in curves) <= _DENSEST_SOLID:
         return
@@ -48,4 +52,8 @@ def tell_impossible(curves: np.ndarray, reasons: dict[str, Any]) -> None:
         remedy = (
             "name in materials= what is heavier than their densest or has an absorption edge in the spectrum"
         )
-        doubt_lengths(reasons, f"{words}; {remedy}", f"{_WRONG_LENGTHS}, or what the metal is")
+        what = f"{_WRONG_LENGTHS}, or what the metal is"
+        if lightless > _LIGHTLESS:
+            words += f"; {lightless:.1%} of the rays have no value: where no light came through, they tell no density"
+            what = "The density of metal is not told by the rays, or the unit of length is wrong"
+        doubt_lengths(reasons, f"{words}; {remedy}", what)

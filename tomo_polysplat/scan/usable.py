@@ -14,6 +14,7 @@ from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.water_correction import undo_water_correction
 from tomo_polysplat.scan.geometry import projections_from_astra
 from tomo_polysplat.scan.line_integrals import require_line_integrals
+from tomo_polysplat.scan.stuck import stuck_pixels
 
 __all__ = ["uncorrected", "usable_rays"]
 
@@ -53,7 +54,12 @@ def usable_rays(
     parts = [(values[a:b], None if marked is None else marked[a:b]) for a, b in split_range(len(values), 64)]
     found = run_tasks(_take_out, parts)
     counts = {"rays": values.size} | {name: sum(part[name] for part in found) for name in found[0]}
-    used = counts.pop("used")
+    stuck = stuck_pixels(values)
+    counts["rays_of_stuck_pixels"] = int(np.isfinite(values[:, stuck]).sum()) if stuck.any() else 0
+    used = counts.pop("used") - counts["rays_of_stuck_pixels"]
+    if stuck.any():
+        values[:, stuck] = np.nan
+        logger.warning("Pixels that show the same value in every view are left out: %d.", stuck.sum())
     if used == 0:
         remedy = "give -log(I/I0), not intensities, and check the flat fields and the mask"
         raise fail("projections", "at least one usable ray", "none", remedy)

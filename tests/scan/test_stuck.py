@@ -1,0 +1,59 @@
+"""Pixels that never change are found; air, opaque rays, and what turns about the axis are not taken for them."""
+
+import logging
+
+import numpy as np
+import pytest
+
+import tomo_polysplat as tps
+from tomo_polysplat.scan.stuck import stuck_pixels
+
+VIEWS, ROWS, COLUMNS = 11, 3, 23
+
+
+def scan(noise=0.01, seed=0):
+    """(views, rows, columns) of a disc with a pin that turns."""
+    place = np.arange(COLUMNS) - COLUMNS // 2
+    pin = 7 * np.sin(2 * np.pi * np.arange(VIEWS) / VIEWS)[:, None]
+    line = 0.2 * np.sqrt(np.maximum(81 - place**2, 0)) + np.exp(-0.5 * (place - pin) ** 2)
+    values = np.repeat(line[:, None], ROWS, axis=1)
+    values += noise * np.random.default_rng(seed).standard_normal(values.shape)
+    return values.astype(np.float32)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+@pytest.mark.parametrize("columns", [[5], [9, 10], [3, 18]])
+def test_what_never_changes_is_found(columns, noise):
+    values = scan(noise)
+    values[:, 1, columns] = [0.35, -0.7][: len(columns)]
+    wanted = np.zeros((ROWS, COLUMNS), bool)
+    wanted[1, columns] = True
+    np.testing.assert_array_equal(stuck_pixels(values), wanted)
+
+
+def test_what_may_be_constant_is_left():
+    assert not stuck_pixels(scan(0.0)).any(), "a disc about the axis, without noise, and air"
+    assert not stuck_pixels(np.ones((VIEWS, ROWS, COLUMNS), np.float32)).any(), "all rays alike"
+    opaque, missing, filled = scan(), scan(), scan()
+    opaque[:, :, 11] = 9.0
+    assert not stuck_pixels(opaque).any(), "a wire on the axis through which no light passes"
+    missing[:, :, 11] = np.nan
+    filled[:, :, 11] = 0.0
+    assert not stuck_pixels(missing).any() and not stuck_pixels(filled).any()
+    assert not stuck_pixels(np.repeat(scan()[:1], 7, axis=0)).any(), "few views"
+
+
+def test_a_reconstruction_leaves_them_out_and_says_so(caplog):
+    made = tps.simulate_scan("pins", 24, 40, geometry="fan")
+    values = made.projections.copy()
+    values[:, :, 14] = 0.9
+    marked = np.ones(values.shape, bool)
+    marked[:, :, 14] = False
+    about = {"unit": made.unit, "spectrum": made.spectrum, "progress": False, "settings": {"passes": 2}}
+    with caplog.at_level(logging.WARNING):
+        found = tps.reconstruct(values, made.proj_geom, made.vol_geom, **about)
+    assert "same value in every view are left out: 1" in caplog.text
+    assert found.counts["rays_of_stuck_pixels"] == 40
+    told = tps.reconstruct(values, made.proj_geom, made.vol_geom, valid=marked, **about)
+    np.testing.assert_array_equal(found.volume, told.volume)
+    assert told.counts["rays_of_stuck_pixels"] == 0
