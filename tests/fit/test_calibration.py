@@ -1,5 +1,6 @@
 """What a calibration is asked for, what it finds on a small scan, and what it leaves alone."""
 
+import dataclasses
 import time
 from functools import cache
 
@@ -40,6 +41,23 @@ def of_fit(fitted, error, *, darkest=None, density=1.0, cut=False):
         fitted.get("scatter", 0.0),
         cut=cut,
     )
+
+
+def test_rays_darker_than_scatter_speak_against_it_where_noise_does_not_explain_them():
+    measured, light = np.full(50_000, 0.5), np.full(50_000, 0.8)
+    measured[:30] = -np.log(0.005)
+    rest = (np.zeros((3, 50_000)), measured, np.ones(50_000), light, np.zeros(50_000))
+    bright, dim = (RaySample(*rest, photons=photons) for photons in (1e5, 2e2))
+    assert bright.darker_than(Scatter(0.02)) == 30 and bright.darker_than(Scatter(0.005)) == 0
+    assert bright.darker_than(Scatter(0.024, -0.025)) == 0, "less behind matter"
+    assert dim.darker_than(Scatter(0.02)) == 0, "one photon where four are expected"
+    problem, wanted = problem_of(fan(0.0), SPECTRUM), Calibration(("scatter",), None, suspected=True)
+    stage = [of_fit({"scatter": 0.02}, 0.4, darkest=0.4), of_fit({"beam": 1.02}, 0.5, darkest=0.99)]
+    for rays, taken in ((bright, 1), (dim, 0)):
+        chosen, why = _judge(
+            "scatter", dataclasses.replace(of_fit({}, 1.0), rays=rays), stage, problem, wanted
+        )
+        assert chosen is stage[taken]
 
 
 def problem_of(scan, spectrum):

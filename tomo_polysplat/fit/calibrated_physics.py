@@ -27,6 +27,8 @@ _MARGIN = 0.03
 # Scatter, and a brighter beam, have to explain the darkest rays by so much better than each other. Scatter of 1 and 2 %
 # in scenes with metal did by 8 to 36 %; beams 1 % brighter are taken for scatter where iron is opaque (10 and 12 %).
 _DARKER = 0.05
+# Scatter adds to every ray. So many rays, and such a share of them, may be darker than it by some fault of theirs.
+_FEW_DARKER, _DARKER_SHARE = 7, 1.5e-4
 # With so small a share of the other's held-out error the darkest rays need not tell: they are few, and a short fit of
 # metal is rough (bronze at 220 kV, 3 % of scatter: 0.42; beams 1 % brighter, taken for scatter: 0.90).
 _FAR_BETTER = 0.7
@@ -121,6 +123,13 @@ def judge_scatter(
     kinds = [[fit for fit in stage if name in fit.fitted] for name in ("scatter", "beam")]
     best = [min(fits, key=lambda fit: fit.held_out) for fits in kinds if fits]
     not_taken = []
+    if suspected and best and "scatter" in best[0].fitted:
+        darker = before.rays.darker_than(_scatter_in(best[0].fitted))
+        if darker > max(_FEW_DARKER, _DARKER_SHARE * len(before.rays.measured)):
+            words = describe_scatter(best.pop(0).fitted)
+            not_taken.append(
+                f"{words}, not accepted: {darker} of {len(before.rays.measured)} rays have less light"
+            )
     for fit in best:
         against = _against(fit, before, [rival for rival in best if rival is not fit], suspected)
         errors = f"held-out error {before.held_out:.3e} before, {fit.held_out:.3e} after"

@@ -18,7 +18,7 @@ from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays, batches_around, views_around
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
-from tomo_polysplat.physics.scatter import light_around
+from tomo_polysplat.physics.scatter import Scatter, light_around
 from tomo_polysplat.render.renderer import project_gaussians
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.levels import mass_level
@@ -45,6 +45,8 @@ _SHARE_OF_BUDGET = 0.1
 _RAYS = 60_000
 # Rays that see no more than this share of what the densest one sees pass beside the object.
 _HAZE = 1e-3
+# A ray with so much less light than it should have, and so many deviations less, is darker.
+_LESS, _DEVIATIONS = 0.85, 3.0
 # As few rays beside the object do not tell how bright the beam is.
 _FEWEST_BESIDE = 100
 # Share of the rays that count as the darkest.
@@ -70,6 +72,8 @@ class RaySample:
         That around them; see `tomo_polysplat.physics.scatter.light_around`.
     view : (rays,) array
         Which of the views looked at they belong to.
+    photons : float
+        Of an unattenuated ray.
     """
 
     areal: np.ndarray
@@ -77,6 +81,7 @@ class RaySample:
     weight: np.ndarray
     light: np.ndarray
     view: np.ndarray
+    photons: float = math.inf
 
     @property
     def beside(self) -> np.ndarray:
@@ -88,6 +93,13 @@ class RaySample:
         """How many times as bright as the open field the rays beside the object are; 1 where there are too few."""
         values = self.measured[self.beside]
         return float(np.exp(-np.median(values))) if len(values) >= _FEWEST_BESIDE else 1.0
+
+    def darker_than(self, scatter: Scatter) -> int:
+        """How many rays have less light than their scatter alone, whatever their noise."""
+        least = scatter.at(torch.as_tensor(self.light)).numpy()
+        # Of Poisson counts the variance of -log(I/I0) is exp(P)/I0.
+        deviation = np.sqrt(np.exp(self.measured) / self.photons)
+        return int(np.count_nonzero(np.exp(_DEVIATIONS * deviation - self.measured) < _LESS * least))
 
 
 @dataclass
@@ -282,4 +294,5 @@ def sample_rays(gaussians: Gaussians, scene: FitScene, rays: Rays, seed: int, mo
         flat = [areal.reshape(len(areal), -1)[:, chosen] * scene.areal_scale]
         flat += [values.reshape(-1)[chosen] for values in (measured, weight, light)]
         parts.append([tensor.double().cpu().numpy() for tensor in (*flat, view)])
-    return RaySample(*(np.concatenate(part, axis=-1) for part in zip(*parts)))
+    whole = [np.concatenate(part, axis=-1) for part in zip(*parts)]
+    return RaySample(whole[0], whole[1], whole[2], whole[3], whole[4], rays.photons)
