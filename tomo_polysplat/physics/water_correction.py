@@ -21,7 +21,7 @@ __all__ = ["describe_polynomial", "require_water_correction", "undo_water_correc
 
 _TABLE = 4096
 _NEWTON_STEPS = 3
-_PART = 1 << 20
+_PART = 1 << 18
 _REMEDY = "ascending powers of P as in (0, 1, 0.02) for P + 0.02 P^2"
 
 
