@@ -168,6 +168,8 @@ def _line_integrals(tomo: np.ndarray, kind: str) -> tuple[np.ndarray, np.ndarray
     require_choice("options['input']", kind, ("attenuation", "transmission"))
     projections, valid, _ = attenuation(tomo, kind)
     valid &= ~dropped_rays(np.where(valid, projections, np.nan))
+    # No light is something that a ray says; a zero in a transmission as well, unless it fills in for a bad ray.
+    valid |= np.isposinf(projections)
     lost = int(valid.size - np.count_nonzero(valid))
     if lost:
         logger.warning(

@@ -29,7 +29,7 @@ from tomo_polysplat.physics.water_correction import describe_polynomial
 from tomo_polysplat.progress import progress_reports
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import VolumeGrid, from_astra, is_planar_geometry
-from tomo_polysplat.scan.usable import uncorrected, usable_rays
+from tomo_polysplat.scan.usable import usable_rays
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.transfer import to_host
 
@@ -66,8 +66,9 @@ def reconstruct(
     Parameters
     ----------
     projections : array, shape (rows, views, columns), or (views, columns) for 2D geometries
-        -log(I/I0) in ASTRA's order; in which order the views come changes nothing. Values that are not finite,
-        or that no logarithm takes, are not used, and counted; nor are the masked ones of a masked array. The log
+        -log(I/I0) in ASTRA's order; in which order the views come changes nothing. Infinite ones,
+        of rays without light, are opaque where dark rays surround them. What else is not finite, that no logarithm
+        takes, or a pixel that never changes is not used, and counted; nor are the masked ones of a masked array. The log
         says when that is more than a fifth of them. Counts, transmissions and logarithms of the other sign or of
         a wrong scale are refused where they show as such.
     proj_geom, vol_geom : dict
@@ -135,8 +136,7 @@ def reconstruct(
     run_options = RunOptions.of(quality, settings, time_budget, seed, device, callbacks)
     spectrum = require_spectrum("spectrum", spectrum)
     geometry, grid = from_astra(proj_geom, vol_geom)
-    values, counts = usable_rays(projections, proj_geom, valid)
-    values = uncorrected(values, water_correction, spectrum)
+    values, counts = usable_rays(projections, proj_geom, valid, water_correction, spectrum)
     problem = Problem.of(values, geometry, grid, unit, spectrum, materials)
     # Sorted, they may be a copy: these would stay in memory beside it.
     del values

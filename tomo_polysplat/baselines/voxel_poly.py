@@ -15,7 +15,6 @@ import torch
 
 from tomo_polysplat.baselines.voxel_model import VoxelModel, start_voxels
 from tomo_polysplat.fit.loss import misfit, total_variation
-from tomo_polysplat.fit.noise import photons_per_ray
 from tomo_polysplat.fit.plan import PASSES
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.spectral_model import OPAQUE
@@ -29,6 +28,7 @@ from tomo_polysplat.physics.transmission import polychromatic_projection
 from tomo_polysplat.physics.water import areal_density, transmitted_energy
 from tomo_polysplat.render.renderer import detector_views
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.scan.noise import photons_per_ray
 from tomo_polysplat.settings import Settings, make_settings
 from tomo_polysplat.start.agreement import halves_agree
 from tomo_polysplat.start.initial import initial_volume

@@ -112,7 +112,7 @@ def run(arguments: argparse.Namespace) -> int:
             time_budget=arguments.time_budget,
             seed=arguments.seed,
             device=arguments.device,
-            valid=scan.valid,
+            valid=scan.usable,
             calibrate=_calibrated(arguments),
             soft_density=arguments.soft_density,
             water_correction=None if spectrum is None else scan.water_correction,

@@ -18,7 +18,6 @@ import torch
 from tomo_polysplat.checks import require_choice
 from tomo_polysplat.fit.inside import matter_is_inside
 from tomo_polysplat.fit.memory import projections_stay, require_room
-from tomo_polysplat.fit.noise import photons_per_ray
 from tomo_polysplat.fit.plan import AVERAGED_RAYS, Plan
 from tomo_polysplat.fit.plan_costs import alternatives, work
 from tomo_polysplat.fit.plan_seeds import finest_spacing
@@ -34,6 +33,7 @@ from tomo_polysplat.physics.solids import number_of_solid
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.render.renderer import detector_views, voxel_box
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.scan.noise import photons_per_ray
 from tomo_polysplat.scan.snapped import snapped_geometry, snapped_grid
 from tomo_polysplat.scan.view_order import view_order
 from tomo_polysplat.settings import Settings
@@ -215,7 +215,7 @@ class Problem:
         return self._known.agreement
 
     def _photons(self, device: torch.device) -> float:
-        """Photons of an unattenuated ray, told once a scan; see ``fit.noise``."""
+        """Photons of an unattenuated ray, told once a scan; see ``scan.noise``."""
         if self._known.photons is None:
             self._known.photons = photons_per_ray(self._copied(device))
         return self._known.photons

@@ -67,7 +67,7 @@ def attenuation(
     Returns
     -------
     projections : float32 array, shape of `values`
-        ``-log((values - dark) / (flat - dark))``; 0 where it is not valid.
+        ``-log((values - dark) / (flat - dark))``; where it is not valid infinite if no light was seen, else 0.
     valid : bool array, shape of `values`
         False for rays without light, of dead pixels, saturated, or not finite. Nothing is clipped.
     counts : dict
@@ -81,7 +81,11 @@ def attenuation(
             narrow = np.where(usable, values, 0).astype(np.float32)
         usable &= np.isfinite(narrow)
         counts = {"not_finite": int(values.size - np.count_nonzero(usable))}
-        return np.where(usable, narrow, np.float32(0)), usable, counts
+        return (
+            np.where(usable | np.isposinf(values), np.where(usable, narrow, np.inf), 0).astype(np.float32),
+            usable,
+            counts,
+        )
     if kind == "counts":
         if flat is None or dark is None:
             raise fail(
@@ -96,8 +100,11 @@ def attenuation(
         )
         with np.errstate(divide="ignore", invalid="ignore"):
             values = (values - dark) / light
-    counts["no_light"] = _drop(usable, ~(values > 0))
-    return -np.log(np.where(usable, values, 1)).astype(np.float32), usable, counts
+    dim = usable & ~(values > 0)
+    counts["no_light"] = _drop(usable, dim)
+    projections = -np.log(np.where(usable, values, 1)).astype(np.float32)
+    projections[dim] = np.inf
+    return projections, usable, counts
 
 
 def _drop(usable: np.ndarray, bad: np.ndarray) -> int:

@@ -29,7 +29,8 @@ class Scan:
     Parameters
     ----------
     projections : array, shape (rows, views, columns)
-        Line integrals -log(I/I0), stored as float32. Values of rays marked invalid are not used.
+        Line integrals -log(I/I0), stored as float32. Values of rays marked invalid are not used, but that they
+        are infinite where no light was seen (:attr:`usable`).
     proj_geom, vol_geom : dict
         ASTRA geometries of three-dimensional type (``parallel3d``, ``parallel3d_vec``, ``cone``,
         ``cone_vec``), lengths in `unit`.
@@ -94,6 +95,14 @@ class Scan:
             return
         told = (int(geometry["DetectorRowCount"]), len(views), int(geometry["DetectorColCount"]))
         require_shape("projections", self.projections, told, "(rows, views, columns)", "as proj_geom says")
+
+    @property
+    def usable(self) -> np.ndarray | None:
+        """What to pass as ``valid`` of `tomo_polysplat.reconstruct`: :attr:`valid` rays, and those without light.
+
+        The latter are told from dead pixels there.
+        """
+        return None if self.valid is None else self.valid | np.isposinf(self.projections)
 
     @property
     def rows(self) -> int:

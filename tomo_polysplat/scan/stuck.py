@@ -30,14 +30,14 @@ def stuck_pixels(values: np.ndarray) -> np.ndarray:
         return stuck
     # Three views leave few pixels to look at in all of them.
     first = values[0]
-    same = (first == values[views // 2]) & (first == values[-1]) & (first != 0)
+    same = (first == values[views // 2]) & (first == values[-1]) & (first != 0) & np.isfinite(first)
     row, column = np.nonzero(same)
     if not len(row):
         return stuck
     constant = (values[:, row, column] == first[row, column]).all(axis=0)
     stuck[row[constant], column[constant]] = True
     if stuck.any():
-        stuck &= first < _OPAQUE * np.nanmax(values)
+        stuck &= first < _OPAQUE * np.max(values, where=np.isfinite(values), initial=0.0)
     for number in np.flatnonzero(stuck.any(axis=1)):
         _keep_narrow(stuck[number])
     return stuck

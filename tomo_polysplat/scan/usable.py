@@ -14,9 +14,11 @@ from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.water_correction import undo_water_correction
 from tomo_polysplat.scan.geometry import projections_from_astra
 from tomo_polysplat.scan.line_integrals import require_line_integrals
+from tomo_polysplat.scan.noise import photons_per_ray
+from tomo_polysplat.scan.opaque import fill_opaque
 from tomo_polysplat.scan.stuck import stuck_pixels
 
-__all__ = ["uncorrected", "usable_rays"]
+__all__ = ["usable_rays"]
 
 logger = logging.getLogger(__name__)
 
@@ -27,11 +29,16 @@ _MOST_LEFT_OUT = 0.2
 
 
 def usable_rays(
-    projections: Any, proj_geom: Mapping[str, Any], valid: Any
+    projections: Any,
+    proj_geom: Mapping[str, Any],
+    valid: Any,
+    water_correction: Sequence[float] | None = None,
+    spectrum: Spectrum | None = None,
 ) -> tuple[np.ndarray, dict[str, int]]:
     """Projections (views, rows, columns) with NaN for every ray that is not to be used, and their counts.
 
-    Parameters and errors are those of :func:`tomo_polysplat.reconstruct`.
+    A water correction is undone, and opaque rays have a value (`scan.opaque`). Parameters and errors are those of
+    :func:`tomo_polysplat.reconstruct`.
     """
     projections, valid = _on_host(projections), _on_host(valid)
     if isinstance(projections, np.ma.MaskedArray):
@@ -65,6 +72,13 @@ def usable_rays(
         raise fail("projections", "at least one usable ray", "none", remedy)
     if used < (1 - _MOST_LEFT_OUT) * values.size:
         _tell_left_out(counts, used)
+    values = _uncorrected(values, water_correction, spectrum)
+    lightless = np.isposinf(values).any() if counts["rays_not_finite"] else False
+    counts["rays_opaque"] = fill_opaque(values, photons_per_ray(values)) if lightless else 0
+    if counts["rays_opaque"]:
+        logger.info(
+            "Rays that no light came through, opaque by what is around them: %d.", counts["rays_opaque"]
+        )
     return values, counts
 
 
@@ -91,18 +105,22 @@ def _take_out(values: np.ndarray, marked: np.ndarray | None) -> dict[str, int]:
     if marked is not None:
         counts["rays_marked_invalid"] = int(np.count_nonzero(marked))
         bad |= marked
-    values[bad] = np.nan
-    impossible = np.abs(values) > _LARGEST_LOGARITHM
+    lightless = np.isposinf(values)
+    if marked is not None:
+        lightless &= ~marked
+    # Those are looked at once the rest is as it was measured.
+    values[bad & ~lightless] = np.nan
+    impossible = (np.abs(values) > _LARGEST_LOGARITHM) & ~lightless
     counts["rays_out_of_range"] = int(np.count_nonzero(impossible))
     values[impossible] = np.nan
     bad |= impossible
     return counts | {"used": bad.size - int(np.count_nonzero(bad))}
 
 
-def uncorrected(
+def _uncorrected(
     values: np.ndarray, water_correction: Sequence[float] | None, spectrum: Spectrum | None
 ) -> np.ndarray:
-    """The projections before the scanner's water correction; see :func:`tomo_polysplat.reconstruct`."""
+    """The projections before the scanner's water correction."""
     if water_correction is None:
         return values
     if spectrum is None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from small_scans import fan, reconstruct
 
-from tomo_polysplat.fit.noise import photons_per_ray
+from tomo_polysplat.scan.noise import photons_per_ray
 
 
 def disc(peak, views=40, rows=9, columns=97):
@@ -66,9 +66,9 @@ def test_nothing_usable_says_nothing():
 def test_of_many_rays_every_so_many_rows_tell_as_well(monkeypatch):
     scan = poisson(disc(1.0, rows=41), 1e4)
     whole, some = photons_per_ray(scan), photons_per_ray(scan[:, ::8])
-    monkeypatch.setattr("tomo_polysplat.fit.noise._MOST", scan.size)
+    monkeypatch.setattr("tomo_polysplat.scan.noise._MOST", scan.size)
     assert photons_per_ray(scan) == whole
-    monkeypatch.setattr("tomo_polysplat.fit.noise._MOST", scan.size // 8 + 1)
+    monkeypatch.setattr("tomo_polysplat.scan.noise._MOST", scan.size // 8 + 1)
     assert photons_per_ray(scan) == some == pytest.approx(1e4, rel=0.15)
 
 
