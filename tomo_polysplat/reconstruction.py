@@ -66,11 +66,11 @@ def reconstruct(
     Parameters
     ----------
     projections : array, shape (rows, views, columns), or (views, columns) for 2D geometries
-        -log(I/I0) in ASTRA's order; in which order the views come changes nothing. Infinite ones,
-        of rays without light, are opaque where dark rays surround them. What else is not finite, that no logarithm
-        takes, or a pixel that never changes is not used, and counted; nor are the masked ones of a masked array. The log
-        says when that is more than a fifth of them. Counts, transmissions and logarithms of the other sign or of
-        a wrong scale are refused where they show as such.
+        -log(I/I0) in ASTRA's order; in which order the views come changes nothing. Infinite ones, of rays without
+        light, are opaque where dark rays surround them. What else is not finite, what no logarithm takes, pixels
+        that never change, and the masked ones of a masked array are not used, and counted. The log says when that
+        is more than a fifth of them. Counts, transmissions and logarithms of the other sign or of a wrong scale are
+        refused where they show as such.
     proj_geom, vol_geom : dict
         ASTRA geometries, lengths in ``unit``; vol_geom's window must be in the same unit.
     spectrum : Spectrum, optional
