@@ -35,8 +35,8 @@ def polysplat(
     Parameters
     ----------
     tomo : float32 array, shape (slices, views, columns)
-        Sinograms, -log(I/I0). Not modified. Values that are not finite, and zeros in the middle of the
-        object, are left out and counted in ``Result.counts``.
+        Sinograms, -log(I/I0). Not modified. NaN, and zeros in the middle of the object, are left out,
+        and infinite rays opaque where dark ones surround them; ``Result.counts`` has both.
     center : float32 array, shape (slices,)
         Rotation axis in columns from the detector's edge; neighbours that share it are solved together.
     recon : float32 array, shape (slices, num_gridx, num_gridy)

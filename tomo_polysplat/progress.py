@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
+
 from tomo_polysplat.checks import fail
 
 __all__ = ["progress_reports"]
@@ -26,7 +28,7 @@ def progress_reports(
     if callable(wanted):
         yield wanted
         return
-    if not (wanted is None or isinstance(wanted, bool)):
+    if not (wanted is None or isinstance(wanted, (bool, int, np.bool_))):
         raise fail("progress", "True, False, None or a function", repr(wanted), error=TypeError)
     from tqdm import tqdm
 

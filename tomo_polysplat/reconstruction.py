@@ -212,7 +212,8 @@ def _result(
     curves = problem.all_curves(own, plan, about["settings"]["bone_level"])
     if problem.polychromatic:
         counts = about["counts"]
-        tell_impossible(curves, plan.reasons, counts["rays_not_finite"] / counts["rays"])
+        lightless = (counts["rays_not_finite"] + counts["rays_opaque"]) / counts["rays"]
+        tell_impossible(curves, plan.reasons, lightless)
     return Result(
         curves,
         grid,

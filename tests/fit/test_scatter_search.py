@@ -35,7 +35,7 @@ def test_scatter_that_nobody_told_of_is_modelled():
     assert asked.plan["scatter"].startswith("modelled: ")
     assert asked.plan["calibration"]["fitted"]["scatter"] == pytest.approx(0.05, rel=0.1)
     assert asked.plan["calibration"]["fitted"] == told.plan["calibration"]["fitted"]
-    # PreparedFit anew, the run is that of a scan whose scatter was known from the first.
+    # Begun anew, the run is that of a scan whose scatter was known from the first.
     assert np.array_equal(asked.volume, told.volume)
     assert "scatter" not in without.plan
     assert error(asked, scan) < 0.6 * error(without, scan)

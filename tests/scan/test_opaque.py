@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 import tomo_polysplat as tps
-from tomo_polysplat.scan.opaque import fill_opaque
+from tomo_polysplat.scan.opaque import _surrounded, fill_opaque
 
 PHOTONS = 1e4
 
@@ -32,11 +33,26 @@ def test_what_dark_rays_surround_gets_a_value_and_the_rest_is_left_out():
     )
 
 
-def test_no_ray_is_less_opaque_than_one_that_was_measured():
-    values = views()
-    values[:, 0, 9] = 13.0
-    fill_opaque(values, PHOTONS)
-    assert (values[:3, :, 12] == 13.0).all()
+def test_one_wrong_pixel_changes_nothing_elsewhere():
+    values, plain = views(), views()
+    values[:, 0, 2] = 700.0
+    assert fill_opaque(values, PHOTONS) == fill_opaque(plain, PHOTONS)
+    np.testing.assert_array_equal(values[:, 1:], plain[:, 1:])
+
+
+def test_pieces_are_judged_as_one_by_one():
+    """Against a loop over the pieces, on scattered ones that touch, lie at corners, and hold NaN."""
+    random = np.random.default_rng(3)
+    view = random.uniform(0, 9, (31, 43)).astype(np.float32)
+    view[random.random(view.shape) < 0.25], view[random.random(view.shape) < 0.02] = np.inf, np.nan
+    lightless, wanted = np.isposinf(view), np.zeros(view.shape, bool)
+    labels, number = ndimage.label(lightless, np.ones((3, 3)))
+    for label in range(1, number + 1):
+        around = view[ndimage.binary_dilation(labels == label, np.ones((3, 3))) & np.isfinite(view)]
+        if len(around) and np.quantile(around, 0.75, method="higher") >= 5:
+            wanted |= labels == label
+    np.testing.assert_array_equal(lightless & _surrounded(view, lightless, 5.0), wanted)
+    assert 0 < wanted.sum() < lightless.sum()
 
 
 @pytest.mark.parametrize("photons", [np.inf, 1.0])
@@ -48,16 +64,16 @@ def test_without_known_noise_nothing_is_known_of_them(photons):
     assert fill_opaque(alone, PHOTONS) == 0 and np.isnan(alone).all(), "no ray with light in view"
 
 
-def rod(photons=2e3):
+def rod(beside, photons=2e3):
     """A slice of a rod of lead in water, through whose middle no light passes, and its truth at one energy."""
     n, views, cell = 32, 120, 0.125
     place = (np.arange(n) - 0.5 * (n - 1)) * cell
     x, y = np.meshgrid(place, place)
-    truth = np.where(np.hypot(x, y) < 1.6, 0.2, 0.0) + np.where(np.hypot(x - 0.5, y) < 0.55, 12.0, 0.0)
+    truth = np.where(np.hypot(x, y) < 1.6, 0.2, 0.0) + np.where(np.hypot(x - beside, y) < 0.55, 12.0, 0.0)
     angles = np.pi * np.arange(views) / views
     offset = (np.arange(48) - 23.5) * 0.1
     chord = lambda s, r: 2 * np.sqrt(np.maximum(r**2 - s**2, 0))  # noqa: E731
-    centre = 0.5 * np.cos(angles)[:, None]
+    centre = beside * np.cos(angles)[:, None]
     value = 0.2 * chord(offset[None], 1.6) + 12.0 * chord(offset[None] - centre, 0.55)
     counts = np.random.default_rng(0).poisson(photons * np.exp(-value))
     with np.errstate(divide="ignore"):
@@ -68,19 +84,18 @@ def rod(photons=2e3):
     return projections, geometry, {"GridRowCount": n, "GridColCount": n, "option": window}, truth
 
 
-def test_opaque_metal_keeps_more_of_its_mass():
-    projections, geometry, volume, truth = rod()
+@pytest.mark.parametrize("beside", [0.0, 0.5])
+def test_opaque_metal_keeps_more_of_its_mass(beside):
+    """On the axis some pixels see it in every view, as they would if they were dead."""
+    projections, geometry, volume, truth = rod(beside)
     lightless = np.isinf(projections)
     assert lightless.mean() > 0.05
     about = {"progress": False, "settings": {"passes": 10}}
     told = tps.reconstruct(projections, geometry, volume, **about)
     left = tps.reconstruct(projections, geometry, volume, valid=~lightless, **about)
-    assert (
-        0.85 * lightless.sum()
-        < told.counts["rays_opaque"]
-        <= lightless.sum()
-        == told.counts["rays_not_finite"]
-    )
+    # Beside a sharp rim the next ray may be bright.
+    assert 0.6 * lightless.sum() < told.counts["rays_opaque"] <= lightless.sum()
+    assert told.counts["rays_opaque"] + told.counts["rays_not_finite"] == lightless.sum()
     assert left.counts["rays_opaque"] == 0 and left.counts["rays_marked_invalid"] == lightless.sum()
     mass = [
         abs(float(result.volume[truth > 5].sum() / truth[truth > 5].sum()) - 1) for result in (told, left)

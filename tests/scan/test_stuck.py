@@ -43,6 +43,23 @@ def test_what_may_be_constant_is_left():
     assert not stuck_pixels(np.repeat(scan()[:1], 7, axis=0)).any(), "few views"
 
 
+def test_what_lies_between_air_and_where_things_change_is_left():
+    """Without noise the rim of a disc is constant, beside air that is 0, until something turns in its shadow."""
+    values = scan(0.0)
+    values[:, :, :4] = values[:, :, -4:] = 0.0
+    values[:, :, [4, 5, 17, 18]] = [0.5, 0.6, 0.6, 0.5]
+    assert not stuck_pixels(values).any()
+
+
+def test_counts_of_few_values_are_left():
+    """Air of 200 counts and next to no noise: most pixels show 200 in every view."""
+    random = np.random.default_rng(1)
+    counts = np.round(200 + 0.12 * random.standard_normal((12, 40, 90)))
+    values = (-np.log(counts / 201)).astype(np.float32)
+    values[:, :, 40:50] += 2 + random.random((12, 40, 10)).astype(np.float32)
+    assert not stuck_pixels(values).any()
+
+
 def test_a_reconstruction_leaves_them_out_and_says_so(caplog):
     made = tps.simulate_scan("pins", 24, 40, geometry="fan")
     values = made.projections.copy()

@@ -37,7 +37,7 @@ def tell_impossible(curves: np.ndarray, reasons: dict[str, Any], lightless: floa
     reasons : dict
         The plan's.
     lightless : float
-        Share of the rays without a finite value: metal that no light passes is what they may have met.
+        Share of the rays that are opaque or have no value: metal that no light passes is what they may have met.
     """
     if sum(float(curve.max(initial=0.0)) for curve in curves) <= _DENSEST_SOLID:
         return
@@ -54,6 +54,6 @@ def tell_impossible(curves: np.ndarray, reasons: dict[str, Any], lightless: floa
         )
         what = f"{_WRONG_LENGTHS}, or what the metal is"
         if lightless > _LIGHTLESS:
-            words += f"; {lightless:.1%} of the rays have no value: where no light came through, they tell no density"
+            words += f"; {lightless:.1%} of the rays are opaque or have no value, and tell no density"
             what = "The density of metal is not told by the rays, or the unit of length is wrong"
         doubt_lengths(reasons, f"{words}; {remedy}", what)

@@ -100,7 +100,7 @@ class Scan:
     def usable(self) -> np.ndarray | None:
         """What to pass as ``valid`` of `tomo_polysplat.reconstruct`: :attr:`valid` rays, and those without light.
 
-        The latter are told from dead pixels there.
+        The latter are told from dead pixels there. A mask of your own goes on top: ``scan.usable & mask``.
         """
         return None if self.valid is None else self.valid | np.isposinf(self.projections)
 

@@ -11,18 +11,21 @@ __all__ = ["stuck_pixels"]
 _FEWEST_VIEWS, _SIDE_BY_SIDE = 8, 4
 # A value as large, as a share of the largest, is that of rays without light.
 _OPAQUE = 0.98
+# On either side of a stuck pixel values change by so much of the largest, and on one of them by more; real ones of few
+# different counts may be constant where hardly anything changes.
+_CHANGES, _CHANGES_MUCH = 0.02, 0.1
 
 
 def stuck_pixels(values: np.ndarray) -> np.ndarray:
-    """Which pixels are stuck, (rows, columns): constant, between pixels of their row that are not.
+    """Which pixels are stuck, (rows, columns): constant, between pixels of their row that change.
 
-    Air without noise is constant as well, and so are rays without light: values of 0, and as large as any, are not
-    told of.
+    Values of 0 and those as large as any are not told of: air without noise is constant as well, and so are rays
+    without light.
 
     Parameters
     ----------
     values : (views, rows, columns) array
-        -log(I/I0); NaN is no value.
+        -log(I/I0); what is not finite is no value.
     """
     views, rows, columns = values.shape
     stuck = np.zeros((rows, columns), bool)
@@ -30,22 +33,31 @@ def stuck_pixels(values: np.ndarray) -> np.ndarray:
         return stuck
     # Three views leave few pixels to look at in all of them.
     first = values[0]
-    same = (first == values[views // 2]) & (first == values[-1]) & (first != 0) & np.isfinite(first)
-    row, column = np.nonzero(same)
-    if not len(row):
+    same = (first == values[views // 2]) & (first == values[-1])
+    told = same & (first != 0) & np.isfinite(first)
+    if not told.any():
         return stuck
-    constant = (values[:, row, column] == first[row, column]).all(axis=0)
-    stuck[row[constant], column[constant]] = True
-    if stuck.any():
-        stuck &= first < _OPAQUE * np.max(values, where=np.isfinite(values), initial=0.0)
-    for number in np.flatnonzero(stuck.any(axis=1)):
-        _keep_narrow(stuck[number])
+    largest = float(np.max(values, where=np.isfinite(values), initial=0.0))
+    told &= first < _OPAQUE * largest
+    for row in np.flatnonzero(told.any(axis=1)):
+        some = np.flatnonzero(same[row])
+        constant = np.zeros(columns, bool)
+        constant[some] = (values[:, row, some] == first[row, some]).all(axis=0)
+        for begin, end in _runs(constant):
+            if begin == 0 or end == columns or end - begin > _SIDE_BY_SIDE or not told[row, begin:end].all():
+                continue
+            beside = values[:, row, [begin - 1, end]]
+            changes = _range(np.where(np.isfinite(beside), beside, np.nan)) / largest
+            stuck[row, begin:end] = (changes > _CHANGES).all() and (changes > _CHANGES_MUCH).any()
     return stuck
 
 
-def _keep_narrow(line: np.ndarray) -> None:
-    """Forget those of a row that reach its end, or are too many side by side."""
+def _runs(line: np.ndarray) -> list[tuple[int, int]]:
+    """Beginnings and ends of what is True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(np.int8), [0]])))
-    for begin, end in zip(edges[::2], edges[1::2]):
-        if begin == 0 or end == len(line) or end - begin > _SIDE_BY_SIDE:
-            line[begin:end] = False
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist()))
+
+
+def _range(values: np.ndarray) -> np.ndarray:
+    """Largest less least of each column, NaN not counted."""
+    return np.fmax.reduce(values, axis=0) - np.fmin.reduce(values, axis=0)

@@ -70,11 +70,16 @@ def usable_rays(
     if used == 0:
         remedy = "give -log(I/I0), not intensities, and check the flat fields and the mask"
         raise fail("projections", "at least one usable ray", "none", remedy)
-    if used < (1 - _MOST_LEFT_OUT) * values.size:
-        _tell_left_out(counts, used)
     values = _uncorrected(values, water_correction, spectrum)
+    if proj_geom.get("type") == "cyl_cone_vec":
+        # Resampled, a ray is infinite that takes anything of one without light.
+        values[np.isposinf(values)] = np.nan
     lightless = np.isposinf(values).any() if counts["rays_not_finite"] else False
     counts["rays_opaque"] = fill_opaque(values, photons_per_ray(values)) if lightless else 0
+    counts["rays_not_finite"] -= counts["rays_opaque"]
+    used += counts["rays_opaque"]
+    if used < (1 - _MOST_LEFT_OUT) * values.size:
+        _tell_left_out({name: n for name, n in counts.items() if name != "rays_opaque"}, used)
     if counts["rays_opaque"]:
         logger.info(
             "Rays that no light came through, opaque by what is around them: %d.", counts["rays_opaque"]
