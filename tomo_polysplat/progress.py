@@ -28,7 +28,7 @@ def progress_reports(
     if callable(wanted):
         yield wanted
         return
-    if not (wanted is None or isinstance(wanted, (bool, int, np.bool_))):
+    if not (wanted is None or isinstance(wanted, (int, np.bool_))):
         raise fail("progress", "True, False, None or a function", repr(wanted), error=TypeError)
     from tqdm import tqdm
 

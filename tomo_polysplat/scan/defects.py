@@ -81,11 +81,9 @@ def attenuation(
             narrow = np.where(usable, values, 0).astype(np.float32)
         usable &= np.isfinite(narrow)
         counts = {"not_finite": int(values.size - np.count_nonzero(usable))}
-        return (
-            np.where(usable | np.isposinf(values), np.where(usable, narrow, np.inf), 0).astype(np.float32),
-            usable,
-            counts,
-        )
+        narrow[~usable] = 0.0
+        narrow[np.isposinf(values)] = np.inf
+        return narrow, usable, counts
     if kind == "counts":
         if flat is None or dark is None:
             raise fail(
