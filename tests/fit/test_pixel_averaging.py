@@ -77,7 +77,8 @@ def test_a_budget_that_ends_amid_the_question_leaves_the_run_as_it_was(passes):
         clock.deadline = time.perf_counter() - 1
         return made
 
-    fitter = SimpleNamespace(ahead=slowly, branch=lambda rays: SimpleNamespace(ahead=slowly))
+    other = SimpleNamespace(ahead=slowly)
+    fitter = SimpleNamespace(ahead=slowly, branch=lambda rays: other, steps_of_a_pass=30)
     chosen, last = PixelAveraging(plan).answered(fitter, clock)
     assert chosen is fitter and last == (made[0] if made else None)
     assert plan.pixel_rays == 1 and "time budget" in plan.reasons["pixel_rays"]

@@ -287,29 +287,37 @@ def test_views_of_a_step_leave_enough_steps(passes):
     made = plan(of, ball(of, WATER), passes=passes)
     views, steps = made.views_per_step, passes * of.geometry.views / made.views_per_step
     assert (
-        views == {1.0: 1, 10_000.0: 8}.get(passes, views)
+        views == {1.0: 1, 10_000.0: 12}.get(passes, views)
         and f"{views} of 20" in made.reasons["views_per_step"]
     )
-    assert 200 < steps < 600 or views in (1, 8)
+    assert 240 < steps < 720 or views in (1, 12)
 
 
 @pytest.mark.parametrize(
-    ("size", "views", "planar", "longer"),
+    ("size", "views", "planar", "passes", "together"),
     [
-        (12, 50, False, 1.5),
-        (12, 20, False, 1.0),
-        (45, 50, False, 1.0),
-        (30, 50, True, 2.0),
-        (400, 50, True, 1.0),
+        (12, 150, False, 15.0, 4),
+        (45, 150, False, 15.0, 6),
+        (45, 30, False, 10.0, 1),
+        (30, 150, True, 20.0, 5),
+        (400, 150, True, 10.0, 5),
+        (30, 30, True, 10.0, 1),
     ],
 )
-def test_a_run_is_longer_for_a_small_cloud_of_many_views(size, views, planar, longer):
-    """In passes and in steps alike, so that a step keeps its views; not where somebody has said how long."""
+def test_a_run_is_longer_for_a_small_cloud_of_many_views(size, views, planar, passes, together):
+    """In steps, and in slices in passes alike, so that a step keeps its views."""
     of = problem(size, views=views, planar=planar)
-    made, fixed = plan(of, ball(of, WATER)), plan(of, ball(of, WATER), passes=10.0)
-    assert made.passes == longer * fixed.passes == longer * 10.0
-    assert made.views_per_step == fixed.views_per_step == max(1, round(views / 30))
+    made = plan(of, ball(of, WATER))
+    assert (made.passes, made.views_per_step) == (passes, together)
     assert f"{made.passes:g} over the views" in made.reasons["passes"]
+
+
+@pytest.mark.parametrize("planar", [True, False])
+def test_a_run_of_a_length_that_was_asked_for_is_no_longer_for_a_small_cloud(planar):
+    of = problem(30 if planar else 12, views=150, planar=planar)
+    made = plan(of, ball(of, WATER), passes=10.0)
+    assert made.passes == 10.0
+    assert made.views_per_step == (5 if planar else 4)
 
 
 @pytest.mark.parametrize(("density", "curves"), [(1.0, 1), (2.0, 1), (2.5, 3)])

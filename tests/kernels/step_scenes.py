@@ -6,7 +6,7 @@ from splat_scenes import cone_views, gaussians, parallel_views, planar_views
 
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.fit.step import EagerStep
+from tomo_polysplat.fit.step import EagerStep, step_rates
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.quadrature import Quadrature
@@ -77,14 +77,20 @@ def _gaussians(count, planar, device):
 
 
 def compare_steps(make, device, truth, kind="cone", polychromatic=True, **changes):
-    """Both forms, from the same start with the same views, must read and change the same."""
-    outcomes = []
+    """Both forms, from the same start with the same views, must read and change the same.
+
+    With ``faster`` by so many times in the last step.
+    """
+    outcomes, faster = [], changes.pop("faster", 1.0)
     for form, where, kernel in ((make, device, "triton"), (EagerStep, *truth)):
         problem = fit_problem(kind, polychromatic, where, kernel, **changes)
         gaussians = problem[0]
         before = gaussians.copy()
         step = form(*problem) if form is EagerStep else form(*problem, BATCH)
         for k in range(STEPS):
+            if k == STEPS - 1 and faster != 1:
+                rates = step_rates(problem[4], problem[1])
+                step.set_rates({name: faster * rate for name, rate in rates.items()})
             step(np.array([k, 4 - k]), k / STEPS)
         read = step.read()
         after = {k: t.detach().cpu() for k, t in gaussians.parameters().items()}

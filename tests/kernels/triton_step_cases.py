@@ -53,6 +53,13 @@ def every_other_step_smooths_twice_as_much(device):
 
 
 @case
+def a_step_at_other_rates_than_the_one_before(device):
+    slow, fast = (compare_steps(_fused, device, ("cpu", "numba"), faster=times) for times in (1.0, 3.0))
+    for name in ("position", "attenuation", "blur"):
+        assert float(fast[name].norm()) > 1.3 * float(slow[name].norm()), name
+
+
+@case
 def pixels_that_average_the_light_of_several_rays(device):
     """With metal's edges in them, under a spectrum and without, blurred and not, along both axes and along one."""
     for kind, polychromatic, changes in (

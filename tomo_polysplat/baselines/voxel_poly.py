@@ -15,7 +15,6 @@ import torch
 
 from tomo_polysplat.baselines.voxel_model import VoxelModel, start_voxels
 from tomo_polysplat.fit.loss import misfit, total_variation
-from tomo_polysplat.fit.plan import PASSES
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.spectral_model import OPAQUE
 from tomo_polysplat.fit.step import held_out_mean
@@ -37,6 +36,8 @@ from tomo_polysplat.units import cm_per
 
 __all__ = ["voxel_poly"]
 
+# Of a run that nobody has given a length.
+_PASSES = 10.0
 VIEWS_PER_STEP = 4
 RATE_ATTENUATION, RATE_MATERIAL = 3e-2, 3e-3  # per step of Adam, falling like those of the Gaussians
 
@@ -156,7 +157,7 @@ class _Fit:
         """The model that the stopping rule keeps; see ``fit.stopping.Watch``."""
         begun, step = time.perf_counter(), 0
         groups = _interleaved(len(self.rays.views))
-        passes = self.settings.passes or PASSES
+        passes = self.settings.passes or _PASSES
         steps = math.ceil(passes * len(groups))
         watch: Watch[VoxelModel] = Watch(patience_of(self.settings, passes))
 

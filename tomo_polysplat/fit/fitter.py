@@ -13,10 +13,12 @@ import torch
 
 from tomo_polysplat.fit.checkpoint import Snapshot
 from tomo_polysplat.fit.choose_step import make_step
+from tomo_polysplat.fit.learning_rates import hurried
 from tomo_polysplat.fit.metal_numbers import number_metals
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.soft_matter import flatten
+from tomo_polysplat.fit.step import step_rates
 from tomo_polysplat.fit.stopping import Clock
 from tomo_polysplat.kernels.spatial_order import spatial_order
 from tomo_polysplat.model.density_control import relocate
@@ -30,7 +32,22 @@ _FEWEST_VIEWS = 10
 
 
 class Fitter:
-    """One run: its steps, the order of the views, and the moves of Gaussians between passes."""
+    """One run: its steps, the order of the views, and the moves of Gaussians between passes.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        Changed in place.
+    spacing : float
+        Of the seeds.
+    rays : Rays
+    scene : FitScene
+    settings : Settings
+    batch, steps : int
+        Views of a step, and steps of the run, by which learning rates go.
+    rng : numpy.random.Generator
+        Of the order of the views.
+    """
 
     def __init__(
         self,
@@ -40,11 +57,14 @@ class Fitter:
         scene: FitScene,
         settings: Settings,
         batch: int,
+        steps: int,
         rng: np.random.Generator,
     ) -> None:
         self.gaussians, self.rays, self.scene, self.settings, self.rng = gaussians, rays, scene, settings, rng
-        self.step = make_step(gaussians, spacing, rays, scene, settings, batch=batch)
+        self.step = make_step(gaussians, spacing, rays, scene, hurried(settings, steps), batch=batch)
         self.spacing, self.batch, self.order = spacing, batch, np.empty(0, int)
+        self.steps = steps
+        self.steps_of_a_pass = max(1, round(views_of_a_pass(rays) / batch))
         self.relocated = 0
         self.relocation_due = False
 
@@ -53,7 +73,7 @@ class Fitter:
 
         That is the mean misfit of the fitted rays and of those held out, and the pairs skipped.
         """
-        steps, made = max(1, round(views_of_a_pass(self.rays) / self.batch)), 0
+        made = 0
         while (share := clock.share()) < 1:
             if self.relocation_due:
                 self._relocate()
@@ -61,8 +81,9 @@ class Fitter:
             self.step(views, share)
             clock.done += 1
             made += 1
-            if made == steps:
+            if made == self.steps_of_a_pass:
                 self.relocation_due = share < self.settings.relocate_until
+                self._keep_pace(clock)
                 yield self._end_pass(share)
                 made = 0
         if made:
@@ -75,9 +96,16 @@ class Fitter:
     def branch(self, pixel_rays: int) -> Fitter:
         """The same run from here on, with so many rays a pixel and axis, on Gaussians of its own."""
         scene, rng = replace(self.scene, pixel_rays=pixel_rays), copy.deepcopy(self.rng)
-        other = Fitter(self.gaussians.copy(), self.spacing, self.rays, scene, self.settings, self.batch, rng)
+        gaussians, counts = self.gaussians.copy(), (self.batch, self.steps)
+        other = Fitter(gaussians, self.spacing, self.rays, scene, self.settings, *counts, rng)
         other.restore(self.snapshot(None, {}))
         return other
+
+    def _keep_pace(self, clock: Clock) -> None:
+        """Take the learning rates of as many steps as there is time for."""
+        if (expected := clock.expected_steps()) != self.steps:
+            self.steps = expected
+            self.step.set_rates(step_rates(hurried(self.settings, expected), self.spacing))
 
     @torch.no_grad()
     def _end_pass(self, share: float) -> tuple[float, float, int]:

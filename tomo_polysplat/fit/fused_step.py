@@ -7,6 +7,7 @@ tensor, so that the same launches do for every step (`graph_step.py` records the
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -135,6 +136,11 @@ class FusedStep:
         self._control.copy_(torch.from_numpy(values))
         self._enqueue(smooth)
         self.feed.used()
+
+    def set_rates(self, rates: Mapping[str, float]) -> None:
+        """Go on with these; see `Step`."""
+        values = [rates[name] for name in self.gaussians.parameters()]
+        self._rates.copy_(torch.tensor(values, dtype=torch.float32))
 
     def read(self) -> tuple[float, float, int]:
         """Means since the last call; see `Step`."""

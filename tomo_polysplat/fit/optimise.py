@@ -13,7 +13,6 @@ import numpy as np
 
 from tomo_polysplat.fit.checkpoint import Checkpoint
 from tomo_polysplat.fit.fitter import Fitter, views_of_a_pass
-from tomo_polysplat.fit.learning_rates import hurried
 from tomo_polysplat.fit.pixel_averaging import PixelAveraging
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
@@ -183,7 +182,7 @@ def fit(
         return FitOutcome(gaussians, reason="nothing to fit: the start volume is empty")
     batch = min(views_per_step, len(rays.views))
     steps = max(1, math.ceil(settings.passes * views_of_a_pass(rays) / batch))
-    fitter = Fitter(gaussians, spacing, rays, scene, hurried(settings, steps), batch, rng)
+    fitter = Fitter(gaussians, spacing, rays, scene, settings, batch, steps, rng)
     # From now on: what compiling or recording the step took is no part of the run that the learning rates follow.
     clock = Clock(steps, deadline)
     outcome = FitOutcome(gaussians)

@@ -2,13 +2,14 @@
 
 Real pixels do, and simulators that send several rays through each; others send one. Who is wrong about it puts up to
 a third too little metal there, or a quarter too much. At first a fit is too rough to tell: later the run is
-made both ways for two passes over the views, and goes on as it explains the rays at metal.
+made both ways for two or three passes over the views, and goes on as it explains the rays at metal.
 """
 
 from __future__ import annotations
 
 import copy
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -29,8 +30,9 @@ __all__ = ["FEWEST_PASSES", "PixelAveraging", "pixel_averaging"]
 
 logger = logging.getLogger(__name__)
 
-# Share of the run after which it is asked, and the passes of each way: the first is spent on getting used to it.
-_FROM, _PASSES = 0.4, 2
+# Share of the run after which it is asked, and the passes of each way at least, and their steps: the first ones are
+# spent on getting used to it.
+_FROM, _PASSES, _STEPS = 0.4, 2, 60
 # A run of fewer passes is in a hurry.
 FEWEST_PASSES = 10.0
 # So many times as long a step of averaged light may take, with two rays a pixel and axis.
@@ -62,9 +64,10 @@ class PixelAveraging:
         return False
 
     def answered(self, fitter: Fitter, clock: Clock) -> tuple[Fitter, Made | None]:
-        """The fitter to go on with, two passes later, and what the last of them gave, if time was left for any."""
+        """The fitter to go on with, some passes later, and what the last of them gave, if time was left for any."""
         other, its_clock = fitter.branch(AVERAGED_RAYS), copy.copy(clock)
-        made = [fitter.ahead(clock, _PASSES), other.ahead(its_clock, _PASSES)]
+        passes = max(_PASSES, math.ceil(_STEPS / fitter.steps_of_a_pass))
+        made = [fitter.ahead(clock, passes), other.ahead(its_clock, passes)]
         if its_clock.late:
             _not_asked(self.plan, "the time budget was used before the rays could tell")
             return fitter, _last(made[0])

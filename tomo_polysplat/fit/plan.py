@@ -21,24 +21,28 @@ from tomo_polysplat.settings import Settings
 if TYPE_CHECKING:
     from tomo_polysplat.fit.problem import Problem
 
-__all__ = ["AVERAGED_RAYS", "PASSES", "Plan", "make_plan"]
+__all__ = ["AVERAGED_RAYS", "Plan", "make_plan"]
 
 # Fewer steps than this leave edges blurred; more of one view each are noisier than fewer of several. A GPU, whose
-# steps cost little, makes more of them (256^3: 40.1 dB with 4 views a step, 39.0 with 8, for 1.6 times the time).
-# The few rays of a planar view do with fewer steps (five fan-beam slices: 38.0 dB with 4 views a step, 38.3 with 8).
-_STEPS, _MOST_VIEWS, _MOST_VIEWS_PLANAR = 300, {"cpu": 8, "cuda": 4}, 8
+# steps cost little, makes more of them. The few rays of a planar view do with fewer steps (five fan-beam slices: 38.0
+# dB with 4 views a step, 38.3 with 8).
+_STEPS, _STEPS_PLANAR = 360, 300
+_MOST_VIEWS, _MOST_VIEWS_PLANAR = {"cpu": 12, "cuda": 6}, 8
 # An object whose main matter is lighter than so many soft references, foam or down, has its level of nothing lowered.
 _LIGHT = 0.15
 # Rays a pixel and axis where the light is averaged: with three pins of 36^3 are no better than with two (45.4 and 48.4
 # dB everywhere).
 AVERAGED_RAYS = 2
-# Passes of a run that nobody has given a length.
-PASSES = 10.0
-# Steps of a small cloud cost little: with fewer seeds in matter than the second number a run is longer, in steps and
-# passes, by up to the first. 32^3, 60 views, 300 steps of two views, 600 of one in as many passes, 450 of two (dB
-# without metal): pins 28.5, 28.4, 29.1; pancreas 35.2, 35.3, 35.5. Those of one are noisier. Slices gain more, and
-# larger ones too (128^2, twice the passes: steel wires 26.4 to 28.3, soft tissue 44.2 to 45.4), but not the fan-beam
-# slices (22 000 seeds, 1.5 times the passes: 39.6 to 39.6, 37.7 to 37.5): theirs go with the root.
+# Passes of a run that nobody has given a length, and of slices, and of scans of fewer views than the last number. Steps
+# of half as many views again instead of more steps: six scenes of 48^3 gain 0.4 dB without metal in the mean and 0.1
+# everywhere by 15 passes instead of 10 in as many steps, and take a tenth more time, those of 128^3 on an H200 0.4 and
+# 0.2 in a sixth more; with 20 passes 0.1 dB more in a sixth more time yet.
+_PASSES, _PASSES_PLANAR, _MANY_VIEWS = 15.0, 10.0, 45
+# Steps of a small cloud cost little: with fewer seeds in matter than the second number a run makes more of them, by up
+# to the first. 32^3, 60 views, 300 steps of two views, 600 of one in as many passes, 450 of two (dB without metal):
+# pins 28.5, 28.4, 29.1; pancreas 35.2, 35.3, 35.5. Those of one are noisier. Slices, of which larger ones gain, too,
+# are made longer in passes as well (128^2, twice the passes: steel wires 26.4 to 28.3, soft tissue 44.2 to 45.4), but
+# not the fan-beam slices (22 000 seeds, 1.5 times the passes: 39.6 to 39.6, 37.7 to 37.5): theirs go with the root.
 _LONGER, _LONGER_PLANAR = (1.5, 9000), (2.0, 36_000)
 # Voxels take 40 % of a step. Smoothed at every other step, twice as much, volumes are the same in 10 to 30 % less time
 # (twelve scans of 32^3 to 64^3 on a CPU: -0.03 dB without metal and 0.0 everywhere in the mean, -0.17 at most; seven
@@ -139,9 +143,8 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     support = int((start > least).sum())
     spacing, finer, because = seed_spacing(start, least, support, problem, settings, device)
     smallest, thin = smallest_scale(spacing, problem, settings)
-    most = _MOST_VIEWS_PLANAR if problem.planar else _MOST_VIEWS[device]
     longer = _longer(cells(support, problem) / spacing**problem.dimensions, problem.planar)
-    passes, views, reason = _length(problem.geometry.views, settings, most, longer)
+    passes, views, reason = _length(problem, settings, device, longer)
     every = settings.tv_every or _tv_every(math.prod(start.shape), problem.planar, device)
     curves, needed = _curves(start, first * problem.depth, problem.polychromatic, settings)
     blurred, told = _blurred(start, first * problem.depth, settings)
@@ -237,14 +240,18 @@ def _longer(seeds: float, planar: bool) -> float:
     return round(min(most, max(1.0, math.sqrt(ratio) if planar else ratio)), 2)
 
 
-def _length(views: int, settings: Settings, most: int, longer: float) -> tuple[float, int, str]:
+def _length(problem: Problem, settings: Settings, device: str, longer: float) -> tuple[float, int, str]:
     """Passes, views of a step, and why so many of these: as many as leave enough steps."""
-    passes = settings.passes or PASSES
-    together = max(1, min(views, most, round(passes * views / _STEPS)))
+    of_scan, planar = problem.geometry.views, problem.planar
+    most = _MOST_VIEWS_PLANAR if planar else _MOST_VIEWS[device]
     # Not where views are so few that a step has one of them.
-    if settings.passes or together == 1:
-        longer = 1.0
-    passes *= longer
+    many = of_scan >= _MANY_VIEWS
+    passes = settings.passes or (_PASSES if many and not planar else _PASSES_PLANAR)
+    steps = float(_STEPS_PLANAR if planar else _STEPS)
+    if many and not settings.passes:
+        steps *= longer
+        passes *= longer if planar else 1.0
     if settings.views_per_step:
-        return passes, min(views, settings.views_per_step), "asked for"
-    return passes, together, f"for about {longer * _STEPS:.0f} steps, and at most {most} views in each"
+        return passes, min(of_scan, settings.views_per_step), "asked for"
+    together = max(1, min(of_scan, most, round(passes * of_scan / steps)))
+    return passes, together, f"for about {steps:.0f} steps, and at most {most} views in each"

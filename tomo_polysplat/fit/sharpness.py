@@ -21,7 +21,7 @@ from tomo_polysplat.fit.plan_seeds import finest_spacing
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays, batches_around
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.fit.short_fit import TOO_SHORT, cut_short, fitted_shortly
+from tomo_polysplat.fit.short_fit import TOO_SHORT, cut_short, fitted_shortly, views_of_short_steps
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.initial import FEW_VIEWS
@@ -92,7 +92,7 @@ def seeds_for_edges(
     if why_not or not len(plain[1]):
         return _because(*plain, why_not or "there are no seeds: the start volume is empty")
     views = problem.geometry.views
-    passes = max(_FEWEST_VIEWS, min(views, _STEPS * plan.views_per_step)) / views
+    passes = max(_FEWEST_VIEWS, min(views, _STEPS * views_of_short_steps(plan, problem))) / views
     short = replace(settings, passes=passes, soft_gain=0.0, tv_weight=0.0)
     kinds, misfits = (plain, of_kind(True)), []
     for own, seeds in kinds:

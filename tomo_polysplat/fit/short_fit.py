@@ -33,6 +33,7 @@ __all__ = [
     "main_density",
     "sample_rays",
     "short_fit",
+    "views_of_short_steps",
 ]
 
 # Why a short fit that the time budget ended tells nothing.
@@ -176,7 +177,7 @@ def short_fit(
     """
     # What is calibrated is judged by the areal densities of all three curves.
     plan = make_plan(start, problem, replace(settings, curves=3), device.type)
-    passes = max(_PASSES, fewest_steps * plan.views_per_step / problem.geometry.views)
+    passes = max(_PASSES, fewest_steps * views_of_short_steps(plan, problem) / problem.geometry.views)
     # The soft matter stays what it was said to be: calibration asks what else could explain the rays.
     short = replace(settings, passes=min(passes, plan.passes), soft_gain=0.0)
     scene, rays = problem.scene(plan, short, device), problem.rays(plan, short, device)
@@ -193,6 +194,11 @@ def short_fit(
     errors = [entry["held_out"] or entry["loss"] for entry in outcome.history] or [np.inf]
     level = problem.scatter_level(device)
     return ShortFit(fitted, float(min(errors)), darkest, main, sample, level, cut=cut_short(outcome))
+
+
+def views_of_short_steps(plan: Plan, problem: Problem) -> int:
+    """Views of a step where passes are few: fewer than in the run, but in slices, whose steps are few as it is."""
+    return plan.views_per_step if problem.planar else -(-2 * plan.views_per_step // 3)
 
 
 def fitted_shortly(
@@ -219,7 +225,7 @@ def fitted_shortly(
         rays,
         scene,
         settings,
-        views_per_step=plan.views_per_step,
+        views_per_step=views_of_short_steps(plan, problem),
         rng=np.random.default_rng(seed),
         started=started,
         deadline=None if time_budget is None else started + _SHARE_OF_BUDGET * time_budget,

@@ -27,7 +27,7 @@ from tomo_polysplat.fit.plan import Plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays, batches_around
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.fit.short_fit import TOO_SHORT, Untold, cut_short, fitted_shortly
+from tomo_polysplat.fit.short_fit import TOO_SHORT, Untold, cut_short, fitted_shortly, views_of_short_steps
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.initial import FEW_VIEWS
@@ -104,7 +104,7 @@ def choose_smoothing(
         own = replace(plan, tv_factor=factor)
         passes = _PASSES
         if not problem.planar:
-            passes = min(passes, _STEPS * plan.views_per_step / problem.geometry.views)
+            passes = min(passes, _STEPS * views_of_short_steps(plan, problem) / problem.geometry.views)
         short = replace(own.adapted(settings), passes=passes, soft_gain=0.0)
         outcome = fitted_shortly(
             seeds.copy(), own, problem, scene, asking, short, options["seed"], options["time_budget"]

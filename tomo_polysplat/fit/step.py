@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Protocol
 
 import numpy as np
@@ -60,6 +61,9 @@ class Step(Protocol):
 
     def __call__(self, views: np.ndarray, share: float) -> None:
         """Step towards the rays of these views and a smooth volume; ``share`` of the run is done, 0 to 1."""
+
+    def set_rates(self, rates: Mapping[str, float]) -> None:
+        """Go on with these learning rates, as of the start of a run, by parameter."""
 
     def read(self) -> tuple[float, float, int]:
         """Since the last call: mean misfit of the fitted rays and of those held out, and pairs skipped.
@@ -124,7 +128,10 @@ class EagerStep:
         self.pull = torch.zeros_like(gaussians.attenuation)
         parameters = gaussians.parameters()
         rates = step_rates(settings, spacing)
-        groups = [{"params": [parameters[k].requires_grad_()], "lr": v, "rate": v} for k, v in rates.items()]
+        groups = [
+            {"name": name, "params": [parameters[name].requires_grad_()], "lr": rate, "rate": rate}
+            for name, rate in rates.items()
+        ]
         self.optimiser = torch.optim.Adam(groups, eps=EPSILON, fused=True)
         self._turns = self.optimiser.param_groups[list(rates).index("rotation")]
         self.moments = new_moments(parameters)
@@ -178,6 +185,11 @@ class EagerStep:
         self.gaussians.shared_material.clamp_(self.scene.least_u, 1.0)
         self.gaussians.blur.clamp_(0.0, LARGEST_BLUR)
         self.gaussians.log_scale.clamp_(*self.bounds)
+
+    def set_rates(self, rates: Mapping[str, float]) -> None:
+        """Go on with these; see `Step`."""
+        for group in self.optimiser.param_groups:
+            group["rate"] = rates[group["name"]]
 
     def read(self) -> tuple[float, float, int]:
         """Means since the last call; see `Step`."""
