@@ -13,6 +13,7 @@ __all__ = ["PRESETS", "Settings", "make_settings"]
 # Of those that are not any number from 0 on. Material numbers reach a little below the first curve.
 _RANGES: dict[str, dict[str, Any]] = {
     **dict.fromkeys(("soft_u", "bone_u", "metal_u"), {"at_least": -0.1, "at_most": 1.0}),
+    "light_u": {"at_least": -0.1, "at_most": 0.1},
     **dict.fromkeys(("seed_width", "largest_scale", "cutoff"), {"above": 0.0}),
     **dict.fromkeys(("model_error", "huber_corner", "final_rate"), {"above": 0.0}),
     "blur": {"at_least": 0.0, "at_most": 0.6},
@@ -65,6 +66,9 @@ class Settings:
     """Material number of soft matter that the fit starts from; near dense matter it is free."""
     soft_gain: float = 1.0
     """Once a pass the soft matter's number moves by so much times the cupping, where it is one matter; 0 holds it."""
+    light_u: float = 0.0
+    """Material number, less that of soft matter, of what has 0.65 to 0.95 soft references: fat, which hardens the beam
+    less than water, has -0.056. The rays do not tell it from water that is less dense, so nothing is assumed."""
     bone_u: float = 0.3
     """Material number that matter of four soft references starts from, that of bone (``model/bone_numbers.py``)."""
     metal_u: float = 0.8
@@ -152,6 +156,8 @@ class Settings:
             raise fail("settings['curves']", "1, 3, or 0 for the plan to decide", repr(self.curves))
         if self.curves == 1 and self.soft_u:
             raise fail("settings['curves']", "3 with a soft_u other than 0", "1", "name the soft material")
+        if self.curves == 1 and self.light_u:
+            raise fail("settings['curves']", "3 with a light_u other than 0", "1", "one curve has one number")
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values by name."""

@@ -201,6 +201,8 @@ def _curves(
         return settings.curves, "asked for"
     if settings.soft_u:
         return 3, "soft matter has a material number other than 0"
+    if settings.light_u:
+        return 3, "light matter has a material number of its own"
     dense = int((start > settings.bone_level * soft).sum())
     if dense:
         return 3, f"{dense} voxels of the start are denser than {settings.bone_level:g} soft references"

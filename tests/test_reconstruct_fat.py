@@ -1,0 +1,43 @@
+"""Fat beside water, which hardens the beam less: told, it comes out as it is."""
+
+import numpy as np
+import pytest
+from small_scans import disc
+
+import tomo_polysplat as tps
+from tomo_polysplat.physics.materials import density, mass_attenuation
+from tomo_polysplat.settings import Settings
+
+SPECTRUM = tps.Spectrum.from_tube(90, filters={"Al": 0.1})
+
+
+def core_error(core, **settings):
+    """Relative error of the mean inside a disc of some matter in one of water, 6 cm wide."""
+    projections, proj_geom, vol_geom = disc(core, SPECTRUM, half=3.0)
+    result = tps.reconstruct(
+        projections, proj_geom, vol_geom, spectrum=SPECTRUM, unit="cm", settings={"passes": 10.0} | settings
+    )
+    y, x = np.mgrid[:45, :45] - 22
+    true = density(core) * mass_attenuation(core, [result.energy_kev])[0]
+    return float(result.volume[np.hypot(x, y) < 4].mean()) / true - 1
+
+
+@pytest.mark.parametrize(("matter", "number"), [("adipose", -0.056), ("polyethylene", -0.1)])
+def test_fat_is_too_light_by_waters_number_and_right_by_its_own(matter, number):
+    assert core_error(matter) < -0.009
+    assert abs(core_error(matter, light_u=number)) < 0.007
+
+
+def test_what_is_no_lighter_than_water_keeps_its_number():
+    assert core_error("muscle", light_u=-0.056) == pytest.approx(core_error("muscle", curves=3), abs=2e-3)
+
+
+@pytest.mark.parametrize("value", [0.3, -0.2])
+def test_the_number_is_one_that_curves_reach(value):
+    with pytest.raises(ValueError, match=r"light_u.*>= -0.1 and <= 0.1"):
+        Settings(light_u=value)
+
+
+def test_one_curve_has_no_other_number():
+    with pytest.raises(ValueError, match="light_u"):
+        Settings(curves=1, light_u=-0.05)
