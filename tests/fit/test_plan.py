@@ -296,7 +296,7 @@ def test_views_of_a_step_leave_enough_steps(passes):
 @pytest.mark.parametrize(
     ("size", "views", "planar", "passes", "together"),
     [
-        (12, 150, False, 15.0, 4),
+        (12, 150, False, 20.0, 4),
         (45, 150, False, 15.0, 6),
         (45, 30, False, 10.0, 1),
         (30, 150, True, 20.0, 5),
@@ -305,7 +305,7 @@ def test_views_of_a_step_leave_enough_steps(passes):
     ],
 )
 def test_a_run_is_longer_for_a_small_cloud_of_many_views(size, views, planar, passes, together):
-    """In steps, and in slices in passes alike, so that a step keeps its views."""
+    """In steps and in passes, of which volumes gain fewer."""
     of = problem(size, views=views, planar=planar)
     made = plan(of, ball(of, WATER))
     assert (made.passes, made.views_per_step) == (passes, together)

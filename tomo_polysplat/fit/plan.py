@@ -39,11 +39,12 @@ AVERAGED_RAYS = 2
 # 0.2 in a sixth more; with 20 passes 0.1 dB more in a sixth more time yet.
 _PASSES, _PASSES_PLANAR, _MANY_VIEWS = 15.0, 10.0, 45
 # Steps of a small cloud cost little: with fewer seeds in matter than the second number a run makes more of them, by up
-# to the first. 32^3, 60 views, 300 steps of two views, 600 of one in as many passes, 450 of two (dB without metal):
-# pins 28.5, 28.4, 29.1; pancreas 35.2, 35.3, 35.5. Those of one are noisier. Slices, of which larger ones gain, too,
-# are made longer in passes as well (128^2, twice the passes: steel wires 26.4 to 28.3, soft tissue 44.2 to 45.4), but
-# not the fan-beam slices (22 000 seeds, 1.5 times the passes: 39.6 to 39.6, 37.7 to 37.5): theirs go with the root.
-_LONGER, _LONGER_PLANAR = (1.5, 9000), (2.0, 36_000)
+# to the first, and a third as many more passes. Ten volumes of 26^3 to 34^3, steps of two views: 33.3 / 39.4 dB in 15
+# passes, 33.5 / 39.8 in 20, for a fifth more time; steps of one view in 15 passes 33.4 / 39.7, for a third more. Slices,
+# of which larger ones gain, too, are made longer in passes as much (128^2, twice the passes: steel wires 26.4 to 28.3,
+# soft tissue 44.2 to 45.4), but not the fan-beam slices (22 000 seeds, 1.5 times the passes: 39.6 to 39.6, 37.7 to
+# 37.5): theirs go with the root.
+_LONGER, _LONGER_PLANAR = (2.0, 12_000), (2.0, 36_000)
 # Voxels take 40 % of a step. Smoothed at every other step, twice as much, volumes are the same in 10 to 30 % less time
 # (twelve scans of 32^3 to 64^3 on a CPU: -0.03 dB without metal and 0.0 everywhere in the mean, -0.17 at most; seven
 # of 64^3 and 128^3 on an H200: 0.0), and larger ones, which would take most of it, less often yet. Too seldom, in a
@@ -252,7 +253,7 @@ def _length(problem: Problem, settings: Settings, device: str, longer: float) ->
     steps = float(_STEPS_PLANAR if planar else _STEPS)
     if many and not settings.passes:
         steps *= longer
-        passes *= longer if planar else 1.0
+        passes *= longer if planar else (2 + longer) / 3
     if settings.views_per_step:
         return passes, min(of_scan, settings.views_per_step), "asked for"
     together = max(1, min(of_scan, most, round(passes * of_scan / steps)))
