@@ -37,7 +37,7 @@ AVERAGED_RAYS = 2
 # of half as many views again instead of more steps: six scenes of 48^3 gain 0.4 dB without metal in the mean and 0.1
 # everywhere by 15 passes instead of 10 in as many steps, and take a tenth more time, those of 128^3 on an H200 0.4 and
 # 0.2 in a sixth more; with 20 passes 0.1 dB more in a sixth more time yet.
-_PASSES, _PASSES_PLANAR, _MANY_VIEWS = 15.0, 10.0, 45
+_PASSES, _FEWER_PASSES, _MANY_VIEWS = 15.0, 10.0, 45
 # Steps of a small cloud cost little: with fewer seeds in matter than the second number a run makes more of them, by up
 # to the first, and a third as many more passes. Ten volumes of 26^3 to 34^3, steps of two views: 33.3 / 39.4 dB in 15
 # passes, 33.5 / 39.8 in 20, for a fifth more time; steps of one view in 15 passes 33.4 / 39.7, for a third more. Slices,
@@ -249,8 +249,9 @@ def _length(problem: Problem, settings: Settings, device: str, longer: float) ->
     most = _MOST_VIEWS_PLANAR if planar else _MOST_VIEWS[device]
     # Not where views are so few that a step has one of them.
     many = of_scan >= _MANY_VIEWS
-    passes = settings.passes or (_PASSES if many and not planar else _PASSES_PLANAR)
-    steps = float(_STEPS_PLANAR if planar else _STEPS)
+    passes = settings.passes or (_PASSES if many and not planar else _FEWER_PASSES)
+    # A run of another length than usual makes more steps and larger ones.
+    steps = _STEPS_PLANAR if planar else _STEPS * math.sqrt(passes / _PASSES)
     if many and not settings.passes:
         steps *= longer
         passes *= longer if planar else (2 + longer) / 3
