@@ -156,6 +156,8 @@ class Settings:
             raise fail("settings['curves']", "1, 3, or 0 for the plan to decide", repr(self.curves))
         if self.curves == 1 and self.soft_u:
             raise fail("settings['curves']", "3 with a soft_u other than 0", "1", "name the soft material")
+        if self.soft_u + self.light_u < -0.1:
+            raise fail("settings['light_u']", "-0.1 at least, together with soft_u", repr(self.light_u))
         if self.curves == 1 and self.light_u:
             raise fail("settings['curves']", "3 with a light_u other than 0", "1", "one curve has one number")
 

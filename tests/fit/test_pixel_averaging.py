@@ -70,7 +70,10 @@ def test_a_budget_with_time_to_spare_does_not_hinder_it():
 @pytest.mark.parametrize("passes", [0, 1])
 def test_a_budget_that_ends_amid_the_question_leaves_the_run_as_it_was(passes):
     """However few passes it was able to make."""
-    clock, plan = Clock(10, time.perf_counter() + 3600), SimpleNamespace(pixel_rays=0, reasons={})
+    clock, plan = (
+        Clock(10, time.perf_counter() + 3600),
+        SimpleNamespace(pixel_rays=0, reasons={}, passes=15.0),
+    )
     made = [(0.2, 0.3, 1)] * passes
 
     def slowly(clock, passes):
@@ -82,6 +85,21 @@ def test_a_budget_that_ends_amid_the_question_leaves_the_run_as_it_was(passes):
     chosen, last = PixelAveraging(plan).answered(fitter, clock)
     assert chosen is fitter and last == (made[0] if made else None)
     assert plan.pixel_rays == 1 and "time budget" in plan.reasons["pixel_rays"]
+
+
+@pytest.mark.parametrize(("steps", "passes"), [(90, 2), (30, 2), (24, 3), (1, 3)])
+def test_each_way_has_steps_enough_to_get_used_to_it_but_no_more_than_a_fifth_of_the_run(steps, passes):
+    asked, plan = [], SimpleNamespace(pixel_rays=0, reasons={}, passes=15.0)
+
+    def ahead(clock, some):
+        asked.append(some)
+        clock.deadline = time.perf_counter() - 1
+        return []
+
+    other = SimpleNamespace(ahead=ahead)
+    fitter = SimpleNamespace(ahead=ahead, branch=lambda rays: other, steps_of_a_pass=steps)
+    PixelAveraging(plan).answered(fitter, Clock(10, None))
+    assert asked == [passes, passes]
 
 
 def test_a_run_resumed_around_the_question_is_the_uninterrupted_one(tmp_path, monkeypatch):

@@ -103,6 +103,7 @@ def test_gaussians_turn_from_the_second_step_on():
         ("cone", True, {"tv_weight": 0.0, "held_out": 0.0}),
         ("cone", True, {"every": 2}),
         ("cone", True, {"pixel_rays": 2}),
+        ("cone", True, {"faster": 3.0}),
     ],
 )
 def test_a_graph_steps_like_autograd(kind, polychromatic, changes):

@@ -32,7 +32,7 @@ __all__ = ["Checkpoint", "Snapshot"]
 
 logger = logging.getLogger(__name__)
 
-FORMAT = 14
+FORMAT = 15
 # Writing takes at most this share of the time.
 _LARGEST_SHARE = 0.05
 _PARTS = tuple(field.name for field in fields(Gaussians))
@@ -253,7 +253,7 @@ def _snapshot(arrays: dict[str, np.ndarray], numbers: dict[str, Any], views: int
 
 
 def _require_numbers(numbers: dict[str, Any]) -> None:
-    counts = ("steps", "steps_made", "skipped_pairs", "relocated")
+    counts = ("steps", "steps_made", "pace", "skipped_pairs", "relocated")
     if any(not isinstance(numbers[name], int) or numbers[name] < 0 for name in counts):
         raise TypeError(f"whole numbers for {', '.join(counts)}")
     if any(not math.isfinite(numbers[name]) for name in ("seconds", "begun")):

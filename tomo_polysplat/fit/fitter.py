@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -73,7 +74,7 @@ class Fitter:
 
         That is the mean misfit of the fitted rays and of those held out, and the pairs skipped.
         """
-        made = 0
+        made, begun = 0, 0.0
         while (share := clock.share()) < 1:
             if self.relocation_due:
                 self._relocate()
@@ -81,9 +82,13 @@ class Fitter:
             self.step(views, share)
             clock.done += 1
             made += 1
+            if made == 1:
+                # The first step of a pass may wait for what lies between passes, and the first of all compiles.
+                begun = time.perf_counter()
             if made == self.steps_of_a_pass:
                 self.relocation_due = share < self.settings.relocate_until
-                self._keep_pace(clock)
+                if made > 1:
+                    self._learn_as_in(clock.expected_steps((time.perf_counter() - begun) / (made - 1)))
                 yield self._end_pass(share)
                 made = 0
         if made:
@@ -101,11 +106,11 @@ class Fitter:
         other.restore(self.snapshot(None, {}))
         return other
 
-    def _keep_pace(self, clock: Clock) -> None:
-        """Take the learning rates of as many steps as there is time for."""
-        if (expected := clock.expected_steps()) != self.steps:
-            self.steps = expected
-            self.step.set_rates(step_rates(hurried(self.settings, expected), self.spacing))
+    def _learn_as_in(self, steps: int) -> None:
+        """Take the learning rates of a run of so many steps."""
+        if steps != self.steps:
+            self.steps = steps
+            self.step.set_rates(step_rates(hurried(self.settings, steps), self.spacing))
 
     @torch.no_grad()
     def _end_pass(self, share: float) -> tuple[float, float, int]:
@@ -121,6 +126,7 @@ class Fitter:
         """Where the fit stands between two passes; ``numbers`` of the run are kept with it."""
         own = {
             "steps_made": self.step.done,
+            "pace": self.steps,
             "largest": self.step.largest,
             "relocated": self.relocated,
             "relocation_due": self.relocation_due,
@@ -138,6 +144,7 @@ class Fitter:
         self.step.pull.copy_(kept.pull)
         self.order = kept.order
         self.step.done = int(kept.numbers["steps_made"])
+        self._learn_as_in(int(kept.numbers["pace"]))
         self.step.largest = kept.numbers["largest"]
         self.relocated = int(kept.numbers["relocated"])
         self.relocation_due = bool(kept.numbers["relocation_due"])

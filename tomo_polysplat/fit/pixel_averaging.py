@@ -2,7 +2,7 @@
 
 Real pixels do, and simulators that send several rays through each; others send one. Who is wrong about it puts up to
 a third too little metal there, or a quarter too much. At first a fit is too rough to tell: later the run is
-made both ways for two or three passes over the views, and goes on as it explains the rays at metal.
+made both ways for a few passes over the views, and goes on as it explains the rays at metal.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ __all__ = ["FEWEST_PASSES", "PixelAveraging", "pixel_averaging"]
 
 logger = logging.getLogger(__name__)
 
-# Share of the run after which it is asked, and the passes of each way at least, and their steps: the first ones are
-# spent on getting used to it.
-_FROM, _PASSES, _STEPS = 0.4, 2, 60
+# Share of the run after which it is asked, the passes of each way at least, and their steps, but for more than this
+# share of the run: the first ones are spent on getting used to it.
+_FROM, _PASSES, _STEPS, _MOST = 0.4, 2, 60, 0.2
 # A run of fewer passes is in a hurry.
 FEWEST_PASSES = 10.0
 # So many times as long a step of averaged light may take, with two rays a pixel and axis.
@@ -66,7 +66,7 @@ class PixelAveraging:
     def answered(self, fitter: Fitter, clock: Clock) -> tuple[Fitter, Made | None]:
         """The fitter to go on with, some passes later, and what the last of them gave, if time was left for any."""
         other, its_clock = fitter.branch(AVERAGED_RAYS), copy.copy(clock)
-        passes = max(_PASSES, math.ceil(_STEPS / fitter.steps_of_a_pass))
+        passes = max(_PASSES, min(math.ceil(_STEPS / fitter.steps_of_a_pass), round(_MOST * self.plan.passes)))
         made = [fitter.ahead(clock, passes), other.ahead(its_clock, passes)]
         if its_clock.late:
             _not_asked(self.plan, "the time budget was used before the rays could tell")
@@ -123,7 +123,7 @@ def _why_not(plan: Plan, gaussians: Gaussians, views: int) -> str:
     if not bool((gaussians.group > 0).any()):
         return "without metal it matters little"
     if plan.passes < FEWEST_PASSES:
-        return "in so few passes two more would take too long a part"
+        return "in so few passes more of them would take too long a part"
     if views < FEW_VIEWS:
         return f"fewer than {FEW_VIEWS} views do not tell"
     return ""

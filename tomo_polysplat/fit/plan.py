@@ -33,10 +33,10 @@ _LIGHT = 0.15
 # Rays a pixel and axis where the light is averaged: with three pins of 36^3 are no better than with two (45.4 and 48.4
 # dB everywhere).
 AVERAGED_RAYS = 2
-# Passes of a run that nobody has given a length, and of slices, and of scans of fewer views than the last number. Steps
-# of half as many views again instead of more steps: six scenes of 48^3 gain 0.4 dB without metal in the mean and 0.1
-# everywhere by 15 passes instead of 10 in as many steps, and take a tenth more time, those of 128^3 on an H200 0.4 and
-# 0.2 in a sixth more; with 20 passes 0.1 dB more in a sixth more time yet.
+# Passes of a run that nobody has given a length, and of slices, and of scans of fewer views than the last number, whose
+# steps have one view as it is. By 15 passes instead of 10 six scenes of 48^3 gain 0.6 dB without metal in the mean and
+# 0.2 everywhere, and take a fifth more time, those of 128^3 on an H200 0.4 and 0.2 in a sixth more; with 20 passes 0.1
+# dB more in a sixth more time yet.
 _PASSES, _FEWER_PASSES, _MANY_VIEWS = 15.0, 10.0, 45
 # Steps of a small cloud cost little: with fewer seeds in matter than the second number a run makes more of them, by up
 # to the first, and a third as many more passes. Ten volumes of 26^3 to 34^3, steps of two views: 33.3 / 39.4 dB in 15
@@ -247,10 +247,9 @@ def _length(problem: Problem, settings: Settings, device: str, longer: float) ->
     """Passes, views of a step, and why so many of these: as many as leave enough steps."""
     of_scan, planar = problem.geometry.views, problem.planar
     most = _MOST_VIEWS_PLANAR if planar else _MOST_VIEWS[device]
-    # Not where views are so few that a step has one of them.
     many = of_scan >= _MANY_VIEWS
     passes = settings.passes or (_PASSES if many and not planar else _FEWER_PASSES)
-    # A run of another length than usual makes more steps and larger ones.
+    # A longer run makes more steps and larger ones, by the root of its passes; a shorter one fewer and smaller ones.
     steps = _STEPS_PLANAR if planar else _STEPS * math.sqrt(passes / _PASSES)
     if many and not settings.passes:
         steps *= longer

@@ -83,12 +83,12 @@ class Clock:
             return 1.0
         return max(self.done / self.steps, (time.perf_counter() - self.begun) / (self.deadline - self.begun))
 
-    def expected_steps(self) -> int:
-        """How many steps the run comes to, as fast as they were so far."""
-        if self.deadline is None or not self.done:
+    def expected_steps(self, seconds: float) -> int:
+        """How many steps the run comes to where each of those left takes so many seconds."""
+        if self.deadline is None:
             return self.steps
-        so_far = time.perf_counter() - self.begun
-        return min(self.steps, max(1, round(self.done * (self.deadline - self.begun) / max(so_far, 1e-9))))
+        left = max(self.deadline - time.perf_counter(), 0.0)
+        return min(self.steps, self.done + math.ceil(left / max(seconds, 1e-9)))
 
     def allows(self, slower: float) -> bool:
         """Whether the steps left, so many times slower than those so far, would end before the deadline."""
