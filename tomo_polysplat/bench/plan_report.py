@@ -77,6 +77,7 @@ def _stopping_table(entries: Sequence[Mapping[str, Any]]) -> str:
 def write_figure(path: Path, record: Mapping[str, Any]) -> None:
     """Error of the held-out rays and of the volume, pass by pass, a panel a scan, as a PNG."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     entries = record["stopping"]
     figure = Figure(figsize=(3.1 * max(1, len(entries)), 3.3), layout="constrained")
@@ -94,6 +95,7 @@ def write_figure(path: Path, record: Mapping[str, Any]) -> None:
             axis.axvline(entry["rule"]["keeps"], color=INK, linewidth=0.8, label="kept by the rule")
             axis.set_title(f"{entry['scan']}: {entry['rule']['missed_db']:.2f} dB missed", fontsize=9)
         axis.set(xlabel="pass over the views")
+        axis.xaxis.set_major_locator(MaxNLocator(5, integer=True))
         plain_log(axis.yaxis)
         axis.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("error over its smallest")
