@@ -66,7 +66,8 @@ class PixelAveraging:
     def answered(self, fitter: Fitter, clock: Clock) -> tuple[Fitter, Made | None]:
         """The fitter to go on with, some passes later, and what the last of them gave, if time was left for any."""
         other, its_clock = fitter.branch(AVERAGED_RAYS), copy.copy(clock)
-        passes = max(_PASSES, min(math.ceil(_STEPS / fitter.steps_of_a_pass), round(_MOST * self.plan.passes)))
+        enough = math.ceil(_STEPS / fitter.steps_of_a_pass)
+        passes = max(_PASSES, min(enough, round(_MOST * self.plan.passes)))
         made = [fitter.ahead(clock, passes), other.ahead(its_clock, passes)]
         if its_clock.late:
             _not_asked(self.plan, "the time budget was used before the rays could tell")
