@@ -48,7 +48,7 @@ def alternatives(plan: Plan, problem: Problem, settings: Settings, gaussians: in
     told = {
         "seed_spacing": f"{half:.2g}: {2**dims} times the Gaussians, twice the pairs",
         "support_level": f"0: up to {everywhere:.3g} Gaussians for {gaussians}, the empty space with them",
-        "passes": f"{2 * plan.passes:g} for {plan.passes:g}: twice the pairs, in steps of more views",
+        "passes": f"{2 * plan.passes:g} for {plan.passes:g}: twice the pairs",
         "patience": f"{patience_of(settings, plan.passes)} passes without improvement end it sooner",
         "edges": "sharp or blurred: without two short fits, of about a pass over the views each, that tell which",
         "tv_factor": "1: without the short fits that tell how strongly thin objects and slices are smoothed",
