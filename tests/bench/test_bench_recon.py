@@ -163,6 +163,19 @@ def test_a_budget_that_was_not_used_up_is_not_enlarged(task, monkeypatch):
     assert entries[0]["rmse"] == 0
 
 
+def test_a_budget_that_ended_a_run_is_enlarged_however_early_that_was(task, monkeypatch):
+    """What a run says counts for more than how long it took."""
+    words = {1: "the time budget was used", 3: "15 passes over the views were made"}
+
+    def run(method, task, options):
+        budget = options.time_budget
+        return measure_module.Run(task.scan.truth, 0.8 * budget, 1, {"stop": words[budget]})
+
+    monkeypatch.setattr(runs_module, "measure", run)
+    runs = timed_runs({"polysplat": METHODS["polysplat"]}, task, (1, 3, 9), {}, lambda words: None)
+    assert [named["budget"] for named, _ in runs] == [1, 3]
+
+
 def test_unknown_names_are_refused():
     for wrong, words in (
         ({"methods": ["fkd"]}, "methods"),

@@ -9,6 +9,7 @@ from tomo_polysplat.bench.measure import Run, error_history, measure
 from tomo_polysplat.bench.methods import Method, Options, Task
 from tomo_polysplat.bench.scenes import fewer_views
 from tomo_polysplat.files import available_memory
+from tomo_polysplat.fit.optimise import BUDGET_USED
 from tomo_polysplat.parallel import run_tasks
 from tomo_polysplat.result.metrics import compare
 from tomo_polysplat.scan.scan import Scan
@@ -25,7 +26,7 @@ Errors = Callable[[Any, Scan], dict[str, Any]]
 # A warm-up uses few views of a scan of full size, so that all that depends on a size gets compiled; but enough for
 # their halves to be compared (`start.agreement`), which loads code as well.
 _WARM_UP_VIEWS, _WARM_UP_BUDGET = 90, 1.0
-# A run that ended by itself before this share of its budget would not use a larger one.
+# A run that ended before this share of its budget, and does not tell why, would not use a larger one.
 _USED_UP = 0.9
 # Bytes a voxel that finding the errors of one volume takes.
 _BYTES_OF_ERRORS = 160
@@ -64,9 +65,17 @@ def timed_runs(
             progress(f"{task.scan.name}: {name}{within}")
             run = measure(method, task, Options(budget, dict(settings)))
             runs.append(({"method": name, "budget": budget}, run))
-            if budget is None or run.seconds is None or run.seconds < _USED_UP * budget:
+            if budget is None or run.seconds is None or not _cut(run, budget):
                 break
     return runs
+
+
+def _cut(run: Run, budget: float) -> bool:
+    """Whether the budget ended a run, which one that keeps time for its volume may be well before."""
+    assert run.seconds is not None
+    if "stop" in run.about:
+        return str(run.about["stop"]).startswith(BUDGET_USED)
+    return run.seconds >= _USED_UP * budget
 
 
 def plain_errors(volume: Any, scan: Scan) -> dict[str, Any]:

@@ -15,6 +15,7 @@ logger = logging.getLogger(__name__)
 
 # Views, and rows and columns of each, that are looked at.
 _VIEWS, _LINES = 24, 64
+_RAYS_AT_ONCE = 1 << 17
 # Fewer rays beside the volume than this share of all say nothing.
 _FEWEST = 0.01
 # Rays beside the volume see nothing when all but this share of them stay below this part of a typical ray.
@@ -75,7 +76,8 @@ def _typical(values: np.ndarray) -> float:
 
 def _missed(geometry: Geometry, grid: VolumeGrid) -> bool:
     """Whether no ray meets the volume, which those that were looked at may have missed alone."""
-    return not _crosses(geometry, grid, np.arange(geometry.rows), np.arange(geometry.columns)).any()
+    rows, columns = np.arange(geometry.rows), np.arange(geometry.columns)
+    return not _crosses(geometry, grid, rows, columns).any()
 
 
 def _truncated(projections: torch.Tensor, views: np.ndarray, rows: np.ndarray, typical: float) -> bool:
@@ -102,14 +104,20 @@ def _cut(values: np.ndarray, beside: np.ndarray, typical: float) -> bool:
 
 def _crosses(geometry: Geometry, grid: VolumeGrid, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """(views, rows, columns) bool: rays that meet the window (its slabs: Kay and Kajiya 1986, SIGGRAPH)."""
-    row, column = rows[:, None, None], columns[None, :, None]
+    arrays = (geometry.corner, geometry.u, geometry.v, geometry.origin, grid.lower, grid.upper, rows, columns)
+    corner, u, v, origin, lower, upper, row, column = (
+        torch.tensor(array, dtype=torch.float64) for array in arrays
+    )
     crossed = np.empty((geometry.views, len(rows), len(columns)), bool)
-    for view in range(geometry.views):
-        pixel = geometry.corner[view] + row * geometry.v[view] + column * geometry.u[view]
-        ray = geometry.origin[view] if geometry.beam == "parallel" else pixel - geometry.origin[view]
+    many = max(1, _RAYS_AT_ONCE // max(1, len(rows) * len(columns)))
+    for first in range(0, geometry.views, many):
+        some = slice(first, first + many)
+        corners, us, vs, origins = (array[some, None, None] for array in (corner, u, v, origin))
+        pixel = corners + row[:, None, None] * vs + column[:, None] * us
+        ray = origins if geometry.beam == "parallel" else pixel - origins
         # A direction of 0 along an axis never reaches that slab's faces; a tiny one does, far away.
-        ray = np.where(np.abs(ray) < 1e-30, 1e-30, ray)
-        first, last = (grid.lower - pixel) / ray, (grid.upper - pixel) / ray
-        enters, leaves = np.minimum(first, last).max(axis=-1), np.maximum(first, last).min(axis=-1)
-        crossed[view] = enters < leaves
+        ray = torch.where(ray.abs() < 1e-30, 1e-30, ray)
+        ends = (lower - pixel) / ray, (upper - pixel) / ray
+        enters, leaves = torch.minimum(*ends).amax(dim=-1), torch.maximum(*ends).amin(dim=-1)
+        crossed[some] = (enters < leaves).numpy()
     return crossed

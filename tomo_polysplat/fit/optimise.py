@@ -20,9 +20,11 @@ from tomo_polysplat.fit.stopping import Clock, FitState, Watch, is_true, patienc
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 
-__all__ = ["FitOutcome", "FitState", "OtherPhysics", "fit"]
+__all__ = ["BUDGET_USED", "FitOutcome", "FitState", "OtherPhysics", "fit"]
 
 logger = logging.getLogger(__name__)
+
+BUDGET_USED = "the time budget was used"
 
 
 @dataclass
@@ -209,6 +211,6 @@ def _used_up(clock: Clock, settings: Settings) -> str:
     if not clock.late:
         return f"{settings.passes:g} passes over the views were made"
     if clock.done:
-        return "the time budget was used"
+        return BUDGET_USED
     logger.warning("The time budget ended before the first step: the result is no better than its start.")
-    return "the time budget was used before the first step"
+    return f"{BUDGET_USED} before the first step"

@@ -68,8 +68,7 @@ class Rays:
         The variance of -log(I/I0) is exp(P)/I0 for Poisson counts, to which that of the model is added; the
         weight is the inverse deviation, 1 for a ray without noise.
         """
-        # Stacked view by view: an index tensor would have to travel to a GPU, which waits for it.
-        values = torch.stack([self.projections[view] for view in chosen.tolist()]).to(self.target)
+        values = _chosen(self.projections, chosen).to(self.target)
         usable = torch.isfinite(values)
         values = torch.where(usable, values, torch.zeros_like(values))
         weight = usable.to(values.dtype)
@@ -100,9 +99,17 @@ class Rays:
             return torch.zeros((len(chosen), *shape), dtype=torch.bool, device=device)
         pixel = torch.arange(shape.numel(), device=device, dtype=torch.int64).reshape(shape) * 2654435761
         # One round of a multiplicative hash (Knuth) over the pair, to 16 even bits.
-        mixed = torch.stack([(pixel + (view * 40503 + 12345)) & 0xFFFFFFFF for view in chosen.tolist()])
+        view = _chosen(torch.arange(int(chosen.max(initial=-1)) + 1, device=device), chosen)[:, None, None]
+        mixed = (pixel + (view * 40503 + 12345)) & 0xFFFFFFFF
         mixed = ((mixed ^ (mixed >> 15)) * 2246822519) & 0xFFFFFFFF
         return (mixed >> 16) < self.threshold
+
+
+def _chosen(tensor: torch.Tensor, chosen: np.ndarray) -> torch.Tensor:
+    """Those along the first axis. An index tensor would have to travel to a GPU, which waits for it."""
+    if len(chosen) and (np.diff(chosen) == 1).all():
+        return tensor[chosen[0] : chosen[-1] + 1]
+    return torch.stack([tensor[k] for k in chosen.tolist()])
 
 
 def views_around(rays: Rays, most: int = _VIEWS) -> int:

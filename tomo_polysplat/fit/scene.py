@@ -121,22 +121,27 @@ class FitScene:
     def seconds_of_basis(self, gaussians: Gaussians) -> float:
         """How long `basis`, and attenuation from it, will take on the host at most, told by some slices in the middle.
 
-        Some are made first, as that may compile kernels; then as many, and twice as many, for what takes the same
-        time however few there are.
+        So many, and twice as many, for what takes the same time however few there are; so many again where that took
+        longer, as it compiled kernels.
         """
         nz, ny, nx = self.box.shape
         depth = -(-nz // _SLICES_TIMED)
-        depths, seconds = (depth, depth, min(2 * depth, nz)), []
-        for some in depths:
+
+        def seconds(some: int) -> float:
             part = replace(self, box=self.box.part(((nz - some) // 2, 0, 0), (some, ny, nx)))
             begun = time.perf_counter()
             host = to_host(part.basis(gaussians))
             # As the result does: it looks for what no matter is as dense as, and mixes the curves at one energy.
             host.max(initial=0.0)
             np.tensordot(np.ones(len(host), np.float32), host, axes=1)
-            seconds.append(time.perf_counter() - begun)
-        a_slice = max(seconds[2] - seconds[1], 0.0) / max(depths[2] - depths[1], 1)
-        return _SLACK * (seconds[2] + a_slice * (nz - depths[2]))
+            return time.perf_counter() - begun
+
+        twice = min(2 * depth, nz)
+        few, more = seconds(depth), seconds(twice)
+        if few > more:
+            few = seconds(depth)
+        a_slice = max(more - few, 0.0) / max(twice - depth, 1)
+        return _SLACK * (more + a_slice * (nz - twice))
 
     def _means(self, gaussians: Gaussians, weights: torch.Tensor) -> torch.Tensor:
         """Means over the voxels, with the tails of metal put back inside it."""

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
+import operator
+
 import torch
 
 __all__ = ["spatial_order"]
@@ -28,26 +32,46 @@ def spatial_order(position: torch.Tensor) -> torch.Tensor:
 
 
 def _along_curve(cell: torch.Tensor) -> torch.Tensor:
-    """Where cells (n, axes) lie on the Hilbert curve; by J. Skilling, AIP Conf. Proc. 707 (2004) 381.
+    """Where cells (n, axes) lie on the Hilbert curve, part of the cube in part of the cube.
 
-    From the coarsest bit to the finest each part of the cube is turned and mirrored into the one that the
-    curve passes first, the first axis taking the others' places. The Gray code of what is left counts the parts.
+    On each level a table tells which of its parts comes when, and how the curve lies in it.
     """
-    axes = list(cell.unbind(1))
-    for bit in range(_BITS - 1, 0, -1):
-        finer = (1 << bit) - 1
-        for k in range(len(axes)):
-            far = (axes[k] >> bit & 1).bool()
-            exchanged = torch.where(far, 0, (axes[0] ^ axes[k]) & finer)
-            axes[k] = axes[k] ^ exchanged
-            axes[0] = axes[0] ^ torch.where(far, finer, exchanged if k else 0)
-    for k in range(1, len(axes)):
-        axes[k] = axes[k] ^ axes[k - 1]
-    flips = torch.zeros_like(axes[0])
-    for bit in range(_BITS - 1, 0, -1):
-        flips ^= torch.where((axes[-1] >> bit & 1).bool(), (1 << bit) - 1, 0)
-    place = torch.zeros_like(flips)
-    for bit in range(_BITS - 1, -1, -1):
-        for axis in axes:
-            place = place << 1 | ((axis ^ flips) >> bit & 1)
+    axes = cell.shape[1]
+    order, following = (torch.tensor(table, device=cell.device) for table in _parts(axes))
+    levels = torch.arange(_BITS - 1, -1, -1, device=cell.device)[:, None]
+    part = torch.zeros((_BITS, len(cell)), dtype=torch.int64, device=cell.device)
+    for axis in cell.unbind(1):
+        part = part << 1 | (axis >> levels & 1)
+    place, way = torch.zeros_like(part[0]), torch.zeros_like(part[0])
+    for each in part:
+        entry = way << axes | each
+        place, way = place << axes | order[entry], following[entry]
     return place
+
+
+@functools.cache
+def _parts(axes: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """For each way the curve can lie in a cube, and each of its parts: when that comes, and how the curve lies in it.
+
+    By J. Skilling, AIP Conf. Proc. 707 (2004) 381: from the coarsest bit to the finest each part is turned and mirrored
+    into the one that the curve passes first, the first axis taking the others' places. The Gray code of what is
+    left counts the parts, backwards after an odd number of levels that end on the far side of the last axis.
+    """
+    first = (tuple(range(axes)), (0,) * axes, 0)
+    ways, order, following = [first], [], []
+    for taken, mirrored, turned in ways:  # which grows on the way
+        for part in itertools.product((0, 1), repeat=axes):
+            bits = [part[axis] ^ flip for axis, flip in zip(taken, mirrored)]
+            inner, flips = list(taken), list(mirrored)
+            for k, far in enumerate(bits):
+                if far:
+                    flips[0] ^= 1
+                else:
+                    inner[0], inner[k], flips[0], flips[k] = inner[k], inner[0], flips[k], flips[0]
+            gray = list(itertools.accumulate(bits, operator.xor))
+            way = (tuple(inner), tuple(flips), turned ^ gray[-1])
+            if way not in ways:
+                ways.append(way)
+            order.append(sum((bit ^ turned) << (axes - 1 - k) for k, bit in enumerate(gray)))
+            following.append(ways.index(way))
+    return tuple(order), tuple(following)

@@ -7,7 +7,6 @@ as fine at metal.
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import numpy as np
@@ -201,11 +200,7 @@ def _sample(
     cells = np.ones(3, int)
     cells[3 - len(cell) :] = np.maximum(np.round(cell / grid.voxel_size[: len(cell)]).astype(int), 1)[::-1]
     mean, index = box_mean(start, cells), voxel_of(points, grid)
-    around = mean[index]
-    for offset in itertools.product((-1, 0, 1), repeat=3):
-        beside = tuple((i + d).clamp_(0, n - 1) for i, d, n in zip(index, offset, mean.shape))
-        around = torch.maximum(around, mean[beside])
-    return mean[index].double(), around
+    return mean[index].double(), _largest_around(mean, [1, 1, 1])[index]
 
 
 def _split(points: torch.Tensor, step: np.ndarray, times: int) -> torch.Tensor:

@@ -103,7 +103,8 @@ def _pixel_moments_kernel(
                 else:
                     g0, g1, g2, g3 = load_four(pixel)
                 t = r11 * x + shift
-                q = t * t + uu
+                tt = t * t
+                q = tt + uu
                 inside = tl.abs(x) <= half
                 if CONE:
                     # Far from a needle's footprint rounding can make l negative: no root is used there.
@@ -127,16 +128,14 @@ def _pixel_moments_kernel(
                 h *= value
                 if CONE:
                     h *= inverse
-                along = h * t
                 h0 += h
-                h1 += along
-                htt += along * t
+                h1 += h * t
+                htt += h * tt
                 by_q = h * q
                 k0 += by_q
                 if CONE:
-                    along = by_q * t
-                    k1 += along
-                    ktt += along * t
+                    k1 += by_q * t
+                    ktt += by_q * tt
                 x += BLOCK_W
                 pixel += BLOCK_W * BLOCK_H * SPREAD
             ht += h1
