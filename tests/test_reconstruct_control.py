@@ -188,14 +188,15 @@ def test_a_volume_that_takes_the_budget_leaves_half_of_it_to_the_fit(monkeypatch
     assert result.history and 0.5 < result.history[-1]["seconds"] < 1.9
 
 
-def test_what_a_volume_takes_is_told_by_some_of_its_slices():
+@pytest.mark.parametrize("compiling", [0.0, 40.0])
+def test_what_a_volume_takes_is_told_by_some_of_its_slices(compiling):
     """With a clock that a volume moves by five seconds and each of its slices by one more."""
-    box, now = VoxelBox(np.zeros(3), np.ones(3), (17, 4, 5)), [0.0]
+    box, now, first = VoxelBox(np.zeros(3), np.ones(3), (17, 4, 5)), [0.0], [compiling]
     smooth = (8, (0.1, 0.1))
     scene = FitScene(box, None, 1.0, None, None, 0.0, "reference", 3.0, 0.1, False, *smooth, False, 1, 0.2)
 
     def basis(self, gaussians):
-        now[0] += 5 + self.box.shape[0]
+        now[0] += 5 + self.box.shape[0] + (first.pop() if first else 0.0)
         return torch.zeros(1, *self.box.shape)
 
     with pytest.MonkeyPatch.context() as patch:
