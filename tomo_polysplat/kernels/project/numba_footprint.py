@@ -1,7 +1,8 @@
 """Where a Gaussian falls on the detector, and the way back from there to its gradients, in float64.
 
-Both run once a Gaussian and view. Vectors are tuples, which the compiler keeps in registers. README.md derives
-the formulas.
+Both are long chains of operations that wait for each other, once a Gaussian and view, and so they run for a group of
+Gaussians at once (``numba_group``). Vectors are tuples, which the compiler keeps in registers. README.md derives the
+formulas.
 """
 
 from __future__ import annotations
@@ -11,12 +12,14 @@ import math
 import numpy as np
 from numba import njit
 
-from tomo_polysplat.kernels.gaussian_maths import whitening
+from tomo_polysplat.kernels.project.numba_group import GROUP, SIZE, matrix_of, put, put_group, three
 
-__all__ = ["MOMENTS", "RECORD", "pull_back", "ray_frame", "set_up"]
+__all__ = ["MOMENTS", "RECORD", "pull_back", "ray_frame", "rows_of", "set_up"]
 
-RECORD = 12  # numbers of a footprint, in the order written by _describe
+RECORD = 12  # numbers of a footprint, in the order of _described
 MOMENTS = 11  # sums over a footprint, in the order read by pull_back
+
+_OUT = RECORD + 6  # what _footprints tells of a Gaussian, by threes
 
 _step = njit(error_model="numpy", inline="always")
 
@@ -38,30 +41,36 @@ def _mix(a, x, b, y):
 
 @_step
 def _apply(matrix, x):
-    return (
-        matrix[0, 0] * x[0] + matrix[0, 1] * x[1] + matrix[0, 2] * x[2],
-        matrix[1, 0] * x[0] + matrix[1, 1] * x[1] + matrix[1, 2] * x[2],
-        matrix[2, 0] * x[0] + matrix[2, 1] * x[1] + matrix[2, 2] * x[2],
-    )
+    return _dot(matrix[0], x), _dot(matrix[1], x), _dot(matrix[2], x)
 
 
 @_step
 def _column(matrix, k):
-    return matrix[0, k], matrix[1, k], matrix[2, k]
+    return matrix[0][k], matrix[1][k], matrix[2][k]
 
 
 @_step
-def ray_frame(position, cone, origin, inverse, matrix, white, n, v):
+def rows_of(matrix):
+    """The rows of a (3, 3) array, as tuples."""
+    return (
+        (matrix[0, 0], matrix[0, 1], matrix[0, 2]),
+        (matrix[1, 0], matrix[1, 1], matrix[1, 2]),
+        (matrix[2, 0], matrix[2, 1], matrix[2, 2]),
+    )
+
+
+@_step
+def ray_frame(point, cone, origin, inverse, matrix, white):
     """Column, row and kappa (0 if behind the source) of the centre, the ray r there, W r, W U and W V."""
-    r = position[n, 0] - origin[v, 0], position[n, 1] - origin[v, 1], position[n, 2] - origin[v, 2]
-    a, b, c = _apply(inverse[v], r)
+    r = point[0] - origin[0], point[1] - origin[1], point[2] - origin[2]
+    a, b, c = _apply(inverse, r)
     kappa = 1.0
     if cone:
         kappa = 1.0 / c if c > 0.0 else 0.0
     else:
-        r = _column(matrix[v], 2)
-    u, v_ = _column(matrix[v], 0), _column(matrix[v], 1)
-    return (a * kappa, b * kappa, kappa), r, _apply(white, r), _apply(white, u), _apply(white, v_)
+        r = _column(matrix, 2)
+    u, v = _column(matrix, 0), _column(matrix, 1)
+    return (a * kappa, b * kappa, kappa), r, _apply(white, r), _apply(white, u), _apply(white, v)
 
 
 @_step
@@ -78,11 +87,11 @@ def _triangle(nu, nv):
 
 
 @_step
-def _describe(cone, planar, cutoff, rows, columns, centre, w, wu, wv, rec, span):
-    """Fill ``rec``, and ``span`` with the half-open ranges of rows and columns (all 0 if there are none).
+def _described(cone, planar, cutoff, rows, columns, centre, w, wu, wv):
+    """The numbers of a footprint by threes, and its half-open ranges of rows and columns (all 0 if there are none).
 
-    rec: column0, row0, r11, r12, r22 (the whitened distance is |(r11 x + r12 y, r22 y)| / |e|), the
-    coefficients of |e|^2 = rec[5] + 2 (rec[6] x + rec[7] y) + rec[8] x^2 + 2 rec[9] x y + rec[10] y^2, r12 / r11.
+    Column0, row0, r11, r12, r22 (the whitened distance is |(r11 x + r12 y, r22 y)| / |e|), the coefficients of
+    |e|^2 = n[5] + 2 (n[6] x + n[7] y) + n[8] x^2 + 2 n[9] x y + n[10] y^2, r12 / r11.
     """
     _, _, r11, r12, r22 = _triangle(_cross(w, wu), _cross(w, wv))
     kappa = centre[2]
@@ -92,42 +101,58 @@ def _describe(cone, planar, cutoff, rows, columns, centre, w, wu, wv, rec, span)
         eu, ev = kappa * _dot(w, wu), kappa * _dot(w, wv)
         uu, uv, vv = _dot(wu, wu), _dot(wu, wv), _dot(wv, wv)
     row0 = 0.0 if planar else centre[1]
-    rec[0], rec[1], rec[2], rec[3], rec[4] = centre[0], row0, r11, r12, r22
-    rec[5], rec[6], rec[7], rec[8], rec[9], rec[10], rec[11] = ee, eu, ev, uu, uv, vv, r12 / r11
     # (distance^2 - cutoff^2) |e|^2 = a x^2 + 2 b x y + c y^2 + 2 d x + 2 f y + g, not positive within the cut.
     cut = cutoff * cutoff
     a, b, c = r11 * r11 - cut * uu, r11 * r12 - cut * uv, r12 * r12 + r22 * r22 - cut * vv
     d, f, g = -cut * eu, -cut * ev, -cut * ee
     if planar:
-        span[0], span[1] = 0, 1
-        span[2], span[3] = _range(a, d, g, centre[0], columns)
+        i0, i1 = 0.0, 1.0
+        j0, j1 = _range(a, d, g, centre[0], columns)
     else:
-        span[0], span[1] = _range(c - b * b / a, f - b * d / a, g - d * d / a, row0, rows)
-        span[2], span[3] = _range(a - b * b / c, d - b * f / c, g - f * f / c, centre[0], columns)
-    if span[1] == 0 or span[3] == 0:
-        span[0] = span[1] = span[2] = span[3] = 0
+        i0, i1 = _range(c - b * b / a, f - b * d / a, g - d * d / a, row0, rows)
+        j0, j1 = _range(a - b * b / c, d - b * f / c, g - f * f / c, centre[0], columns)
+    numbers = (centre[0], row0, r11), (r12, r22, ee), (eu, ev, uu), (uv, vv, r12 / r11)
+    some = i1 > 0.0 and j1 > 0.0
+    return numbers, (i0 if some else 0.0, i1 if some else 0.0, j0 if some else 0.0, j1 if some else 0.0)
 
 
 @_step
 def _range(square, half, rest, centre, length):
-    """Half-open range of the indices i with ``square x^2 + 2 half x + rest <= 0``, x = i - centre."""
+    """Half-open range of the indices i with ``square x^2 + 2 half x + rest <= 0``, x = i - centre; 0, 0 if none."""
     inside = half * half - square * rest
-    if not (square > 0.0 and inside >= 0.0):
-        return 0, 0
     spread, middle = math.sqrt(inside) / square, centre - half / square
     low, high = max(0.0, np.ceil(middle - spread)), min(length - 1.0, np.floor(middle + spread))
-    return (int(low), int(high) + 1) if low <= high else (0, 0)
+    some = square > 0.0 and inside >= 0.0 and low <= high
+    return low if some else 0.0, high + 1.0 if some else 0.0
 
 
 @_step
-def _reach(white, scale, n, toward):
+def _reach(white, scale, toward):
     """Standard deviation along the axis ``toward``; axes of infinite scale lie across it and do not count."""
-    total = 0.0
-    for a in range(3):
-        turned = white[a, 0] * toward[0] + white[a, 1] * toward[1] + white[a, 2] * toward[2]
-        if turned != 0.0:
-            total += (turned * scale[n, a] * scale[n, a]) ** 2
-    return math.sqrt(total)
+    a, b, c = _apply(white, toward)
+    a = a * scale[0] * scale[0] if a != 0.0 else 0.0
+    b = b * scale[1] * scale[1] if b != 0.0 else 0.0
+    c = c * scale[2] * scale[2] if c != 0.0 else 0.0
+    return math.sqrt(a * a + b * b + c * c)
+
+
+@_step
+def _footprints(cone, planar, cutoff, rows, columns, origin, inverse, matrix, group, out):
+    """Fill ``out`` with numbers (12) and ranges (4) of a group in a view, and 1 for what lies ahead of the source."""
+    for k in range(GROUP):
+        white = matrix_of(group, 6, k)
+        centre, _, w, wu, wv = ray_frame(three(group, 0, k), cone, origin, inverse, matrix, white)
+        ahead = 1.0
+        if cone:
+            depth = 1.0 / centre[2] if centre[2] > 0.0 else 0.0
+            ahead = 1.0 if depth > 1.001 * cutoff * _reach(white, three(group, 3, k), inverse[2]) else 0.0
+        numbers, span = _described(cone, planar, cutoff, rows, columns, centre, w, wu, wv)
+        put(out, 0, k, numbers[0])
+        put(out, 3, k, numbers[1])
+        put(out, 6, k, numbers[2])
+        put(out, 9, k, numbers[3])
+        put(out, 12, k, (span[0], span[1], span[2]))
+        put(out, 15, k, (span[3], ahead, 0.0))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -135,63 +160,69 @@ def set_up(
     start, stop, position, scale, rotation, cone, planar, origin, inverse, matrix, cutoff, rows, columns, record, span
 ):  # fmt: skip
     """Footprints of the Gaussians start..stop in every view; returns how many reach a source plane."""
-    white = np.empty((3, 3))
+    white, group, out = np.empty((3, 3)), np.zeros(SIZE * GROUP), np.empty(_OUT * GROUP)
     skipped = 0
-    for n in range(start, stop):
-        whitening(scale, rotation, n, white)
+    for first in range(start, stop, GROUP):
+        some = min(GROUP, stop - first)
+        put_group(first, some, position, scale, rotation, white, group)
         for v in range(len(origin)):
-            centre, _, w, wu, wv = ray_frame(position, cone, origin, inverse, matrix, white, n, v)
-            toward = inverse[v, 2, 0], inverse[v, 2, 1], inverse[v, 2, 2]
-            depth = 1.0 / centre[2] if centre[2] > 0.0 else 0.0
-            if cone and not depth > 1.001 * cutoff * _reach(white, scale, n, toward):
-                skipped += 1
-                for k in range(4):
-                    span[v, n, k] = 0
-            else:
-                _describe(cone, planar, cutoff, rows, columns, centre, w, wu, wv, record[v, n], span[v, n])
+            place = origin[v, 0], origin[v, 1], origin[v, 2]
+            frame = rows_of(inverse[v]), rows_of(matrix[v])
+            _footprints(cone, planar, cutoff, rows, columns, place, frame[0], frame[1], group, out)
+            for k in range(some):
+                ahead = out[(RECORD + 4) * GROUP + k] > 0.0
+                skipped += not ahead
+                for i in range(RECORD):
+                    record[v, first + k, i] = out[i * GROUP + k]
+                for i in range(4):
+                    span[v, first + k, i] = int(out[(RECORD + i) * GROUP + k]) if ahead else 0
     return skipped
 
 
 @_step
-def pull_back(cone, planar, frame, inverse, matrix, white, m, grad_point, grad_white):
-    """Add dL/dposition and dL/dW of one view, from the moments ``m`` of its footprint.
+def pull_back(cone, planar, frame, inverse, matrix, white, m):
+    """dL/dposition (3) and dL/dW (9, row by row) of one view, from the moments ``m`` of its footprint.
 
     With t = r11 x + r12 y and u = r22 y, m holds the sums of h (t, u, t^2, t u, u^2) and of
     s (1, t, u, t^2, t u, u^2), where h = dL/d(distance^2 |e|^2) and s = dL/d|e|^2.
     """
     (column0, row0, kappa), r, w, wu, wv = frame
+    (m0, m1, m2), (m3, m4, m5), (m6, m7, m8), (m9, m10, _) = m
     q1, q2, r11, r12, r22 = _triangle(_cross(w, wu), _cross(w, wv))
     # x = by_t t - back u, y = by_u u.
     by_t, by_u = 1.0 / r11, 1.0 / r22 if r22 > 0.0 else 0.0
     back = by_t * r12 * by_u
-    sum_t, sum_u = _mix(m[2], q1, m[3], q2), _mix(m[3], q1, m[4], q2)
+    sum_t, sum_u = _mix(m2, q1, m3, q2), _mix(m3, q1, m4, q2)
     g_nu, g_nv = _mix(2 * by_t, sum_t, -2 * back, sum_u), _mix(2 * by_u, sum_u, 0.0, sum_u)
-    g_column, g_row = -2 * r11 * m[0], -2 * (r12 * m[0] + r22 * m[1])
+    g_column, g_row = -2 * r11 * m0, -2 * (r12 * m0 + r22 * m1)
     # nu = w x WU and nv = w x WV.
     g_wu, g_wv = _cross(g_nu, w), _cross(g_nv, w)
     g_w = _mix(1.0, _cross(wu, g_nu), 1.0, _cross(wv, g_nv))
     if cone:
         # e = e0 + t et + u eu.
         e0, et, eu = _mix(kappa, w, 0.0, w), _mix(by_t, wu, 0.0, wu), _mix(by_u, wv, -back, wu)
-        g_e = _mix(2.0, _mix(m[5], e0, m[6], et), 2 * m[7], eu)
-        sum_t = _mix(1.0, _mix(m[6], e0, m[8], et), m[9], eu)
-        sum_u = _mix(1.0, _mix(m[7], e0, m[9], et), m[10], eu)
+        g_e = _mix(2.0, _mix(m5, e0, m6, et), 2 * m7, eu)
+        sum_t = _mix(1.0, _mix(m6, e0, m8, et), m9, eu)
+        sum_u = _mix(1.0, _mix(m7, e0, m9, et), m10, eu)
         g_wu = _mix(1.0, g_wu, 1.0, _mix(2 * by_t, sum_t, -2 * back, sum_u))
         g_wv = _mix(1.0, g_wv, 2 * by_u, sum_u)
         g_w = _mix(1.0, g_w, kappa, g_e)
         g_column -= _dot(g_e, wu)
         g_row = 0.0 if planar else g_row - _dot(g_e, wv)
         g_depth = -kappa * (g_column * column0 + g_row * row0 + kappa * _dot(g_e, w))
-        for b in range(3):
-            grad_point[b] += white[0, b] * g_w[0] + white[1, b] * g_w[1] + white[2, b] * g_w[2]
-            grad_point[b] += (
-                kappa * (g_column * inverse[0, b] + g_row * inverse[1, b]) + g_depth * inverse[2, b]
-            )
+        point = _mix(g_w[0], white[0], g_w[1], white[1])
+        point = _mix(1.0, point, g_w[2], white[2])
+        point = _mix(1.0, point, kappa * g_column, inverse[0])
+        point = _mix(1.0, point, kappa * g_row, inverse[1])
+        point = _mix(1.0, point, g_depth, inverse[2])
     else:
         g_row = 0.0 if planar else g_row
-        g_w = _mix(1.0, g_w, 2 * m[5], w)
-        for b in range(3):
-            grad_point[b] += g_column * inverse[0, b] + g_row * inverse[1, b]
-    for a in range(3):
-        for b in range(3):
-            grad_white[a, b] += g_w[a] * r[b] + g_wu[a] * matrix[b, 0] + g_wv[a] * matrix[b, 1]
+        g_w = _mix(1.0, g_w, 2 * m5, w)
+        point = _mix(g_column, inverse[0], g_row, inverse[1])
+    u, v = _column(matrix, 0), _column(matrix, 1)
+    rows = (
+        _mix(1.0, _mix(g_w[0], r, g_wu[0], u), g_wv[0], v),
+        _mix(1.0, _mix(g_w[1], r, g_wu[1], u), g_wv[1], v),
+        _mix(1.0, _mix(g_w[2], r, g_wu[2], u), g_wv[2], v),
+    )
+    return point, rows

@@ -11,9 +11,17 @@ import math
 import numpy as np
 from numba import njit
 
-from tomo_polysplat.kernels.gaussian_maths import FAST, gaussian, whitening, whitening_adjoint
+from tomo_polysplat.kernels.gaussian_maths import FAST, gaussian, whitening_adjoint
 from tomo_polysplat.kernels.numba_lanes import LANES, add_product, add_scaled, lane_sum
-from tomo_polysplat.kernels.project.numba_footprint import MOMENTS, RECORD, pull_back, ray_frame, set_up
+from tomo_polysplat.kernels.project.numba_footprint import (
+    MOMENTS,
+    RECORD,
+    pull_back,
+    ray_frame,
+    rows_of,
+    set_up,
+)
+from tomo_polysplat.kernels.project.numba_group import GROUP, SIZE, add_where, matrix_of, put_group, three
 from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.parallel import cpu_threads, run_tasks, split_range
 
@@ -149,31 +157,60 @@ def _gather(
         grad_weight[c, n] += lane_sum(sums, c * LANES)
 
 
+@njit(inline="always")
+def _take_back(cone, planar, origin, inverse, matrix, group, moments, grads):
+    """Add dL/dposition (3) and dL/dW (9) of a view to those of a group."""
+    for k in range(GROUP):
+        white = matrix_of(group, 6, k)
+        m = three(moments, 0, k), three(moments, 3, k), three(moments, 6, k), three(moments, 9, k)
+        frame = ray_frame(three(group, 0, k), cone, origin, inverse, matrix, white)
+        point, rows = pull_back(cone, planar, frame, inverse, matrix, white, m)
+        # A Gaussian that is not seen may have no frame.
+        seen = m[3][2] > 0.0
+        add_where(seen, grads, 0, k, point)
+        add_where(seen, grads, 3, k, rows[0])
+        add_where(seen, grads, 6, k, rows[1])
+        add_where(seen, grads, 9, k, rows[2])
+
+
 @njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def _gather_range(
     start, stop, position, scale, rotation, weight, cone, planar, origin, inverse, matrix, cutoff, columns,
     record, span, grad_image, grad_position, grad_scale, grad_rotation, grad_weight,
 ):  # fmt: skip
     """The gradients of the Gaussians start..stop, summed over the views."""
-    white, moments = np.empty((3, 3)), np.empty(MOMENTS)
-    grad_white, grad_point = np.empty((3, 3)), np.empty(3)
+    white, grad_white, moments = np.empty((3, 3)), np.empty((3, 3)), np.empty(MOMENTS)
     value, total = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
     sums, acc = np.empty(len(weight) * LANES, np.float32), np.empty(MOMENTS * LANES, np.float32)
-    for n in range(start, stop):
-        whitening(scale, rotation, n, white)
-        grad_white[:] = 0.0
-        grad_point[:] = 0.0
+    group, grads = np.zeros(SIZE * GROUP), np.empty(12 * GROUP)
+    # The last number says whether there is a footprint.
+    of_group = np.empty((MOMENTS + 1) * GROUP)
+    for first in range(start, stop, GROUP):
+        some = min(GROUP, stop - first)
+        put_group(first, some, position, scale, rotation, white, group)
+        grads[:] = 0.0
         for v in range(len(origin)):
-            if span[v, n, 0] < span[v, n, 1]:
-                _gather(
-                    v, n, record, span, weight, cutoff, columns, grad_image, value, total, sums, acc,
-                    moments, grad_weight,
-                )  # fmt: skip
-                frame = ray_frame(position, cone, origin, inverse, matrix, white, n, v)
-                pull_back(cone, planar, frame, inverse[v], matrix[v], white, moments, grad_point, grad_white)
-        for a in range(3):
-            grad_position[n, a] = grad_point[a]
-        whitening_adjoint(scale, rotation, n, white, grad_white, grad_scale, grad_rotation)
+            of_group[:] = 0.0
+            for k in range(some):
+                n = first + k
+                if span[v, n, 0] < span[v, n, 1]:
+                    _gather(
+                        v, n, record, span, weight, cutoff, columns, grad_image, value, total, sums, acc,
+                        moments, grad_weight,
+                    )  # fmt: skip
+                    for m in range(MOMENTS):
+                        of_group[m * GROUP + k] = moments[m]
+                    of_group[MOMENTS * GROUP + k] = 1.0
+            place = origin[v, 0], origin[v, 1], origin[v, 2]
+            _take_back(cone, planar, place, rows_of(inverse[v]), rows_of(matrix[v]), group, of_group, grads)
+        for k in range(some):
+            n = first + k
+            for a in range(3):
+                grad_position[n, a] = grads[a * GROUP + k]
+                for b in range(3):
+                    white[a, b] = group[(6 + 3 * a + b) * GROUP + k]
+                    grad_white[a, b] = grads[(3 + 3 * a + b) * GROUP + k]
+            whitening_adjoint(scale, rotation, n, white, grad_white, grad_scale, grad_rotation)
 
 
 def forward(position, scale, rotation, weight, views: DetectorViews, cutoff: float):
