@@ -8,16 +8,16 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
 
-__all__ = ["LANES", "add_product", "add_scaled", "lane_sum"]
+__all__ = ["LANES", "add_product", "add_scaled", "lane_sums"]
 
 LANES = 16
 
 _VECTOR = ir.VectorType(ir.FloatType(), LANES)
+_INDICES = ir.VectorType(ir.IntType(32), LANES)
 _FLAGS = ("contract",)
 
 # Its type hints count the typing context among the arguments of a call.
@@ -41,7 +41,7 @@ def add_scaled(typing, target, target_start, factor, source, source_start):
     def generate(context, builder, signature, values):
         t, s = (_pointer(context, builder, signature.args[k], values[k], values[k + 1]) for k in (0, 3))
         one = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), values[2], ir.IntType(32)(0))
-        everywhere = builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(ir.IntType(32), LANES), None))
+        everywhere = builder.shuffle_vector(one, one, ir.Constant(_INDICES, None))
         _accumulate(builder, t, everywhere, builder.load(s, align=4))
         return context.get_dummy_value()
 
@@ -60,10 +60,29 @@ def add_product(typing, target, target_start, a, a_start, b, b_start):
     return types.void(target, types.intp, a, types.intp, b, types.intp), generate
 
 
-@njit(inline="always")
-def lane_sum(source, start):
-    """Sum of ``source[start : start + LANES]``."""
-    total = np.float32(0)
-    for k in range(LANES):
-        total += source[start + k]
-    return total
+@_intrinsic
+def lane_sums(typing, target, target_start, source, source_start):
+    """Sums of ``LANES`` blocks: ``target[t + k] = sum(source[s + k LANES : s + (k + 1) LANES])``, likewise.
+
+    Two vectors at a time become one that holds sums of half as many lanes of either: 15 steps, where to add up the
+    lanes of one vector after the other takes 64.
+    """
+
+    def generate(context, builder, signature, values):
+        t, s = (_pointer(context, builder, signature.args[k], values[k], values[k + 1]) for k in (0, 2))
+        vectors = [
+            builder.load(builder.gep(s, [ir.Constant(ir.IntType(32), k)]), align=4) for k in range(LANES)
+        ]
+        half = LANES // 2
+        while half:
+            lower = [k for k in range(2 * LANES) if k // half % 2 == 0]
+            parts = [ir.Constant(_INDICES, [k + shift for k in lower]) for shift in (0, half)]
+            vectors = [
+                builder.fadd(*(builder.shuffle_vector(*pair, part) for part in parts))
+                for pair in zip(vectors[::2], vectors[1::2])
+            ]
+            half //= 2
+        builder.store(vectors[0], t, align=4)
+        return context.get_dummy_value()
+
+    return types.void(target, types.intp, source, types.intp), generate

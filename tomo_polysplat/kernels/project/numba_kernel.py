@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from tomo_polysplat.kernels.gaussian_maths import FAST, gaussian, whitening_adjoint
-from tomo_polysplat.kernels.numba_lanes import LANES, add_product, add_scaled, lane_sum
+from tomo_polysplat.kernels.numba_lanes import LANES, add_product, add_scaled, lane_sums
 from tomo_polysplat.kernels.project.numba_footprint import (
     MOMENTS,
     RECORD,
@@ -125,15 +125,14 @@ def _add_moments(x0, r11, across, u, e0, e1, e2, value, total, acc):
 
 @njit(inline="always")
 def _gather(
-    v, n, record, span, weight, cutoff, columns, grad_image, value, total, sums, acc, moments, grad_weight
+    v, n, record, span, weight, cutoff, columns, grad_image, value, total, acc, sums, grad_weight
 ):  # fmt: skip
-    """Sums over the footprint of Gaussian ``n`` in view ``v``: the gradient of its weight in every channel, and
-    the ``moments`` that ``pull_back`` takes."""
+    """Fill ``sums`` over the footprint of Gaussian ``n`` in view ``v``: the moments that ``pull_back`` takes, then the
+    gradient of its weight in every channel, which is added to ``grad_weight``, too."""
     cut = np.float32(cutoff * cutoff)
     rec = record[v, n]
     x0, r11, exx = rec[0], rec[2], rec[8]
     rows, channels, stride = grad_image.shape[1:]
-    sums[:] = np.float32(0)
     acc[:] = np.float32(0)
     j0, j1 = span[v, n, 2], span[v, n, 3]
     wide = j1 - j0 > LANES
@@ -148,13 +147,13 @@ def _gather(
                 total[k] = np.float32(0)
             for c in range(channels):
                 at = ((v * rows + i) * channels + c) * stride + j
-                add_product(sums, c * LANES, grad_image, at, value, 0)
+                add_product(acc, (MOMENTS + c) * LANES, grad_image, at, value, 0)
                 add_scaled(total, 0, weight[c, n], grad_image, at)
             _add_moments(np.float32(j) - x0, r11, across, rec[4] * y, e0, e1, exx, value, total, acc)
-    for m in range(MOMENTS):
-        moments[m] = lane_sum(acc, m * LANES)
+    for some in range(0, len(sums), LANES):
+        lane_sums(sums, some, acc, some * LANES)
     for c in range(channels):
-        grad_weight[c, n] += lane_sum(sums, c * LANES)
+        grad_weight[c, n] += sums[MOMENTS + c]
 
 
 @njit(inline="always")
@@ -179,9 +178,11 @@ def _gather_range(
     record, span, grad_image, grad_position, grad_scale, grad_rotation, grad_weight,
 ):  # fmt: skip
     """The gradients of the Gaussians start..stop, summed over the views."""
-    white, grad_white, moments = np.empty((3, 3)), np.empty((3, 3)), np.empty(MOMENTS)
+    white, grad_white = np.empty((3, 3)), np.empty((3, 3))
     value, total = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
-    sums, acc = np.empty(len(weight) * LANES, np.float32), np.empty(MOMENTS * LANES, np.float32)
+    # As many sums as `lane_sums` makes at once.
+    sums = np.empty(-(-(MOMENTS + len(weight)) // LANES) * LANES, np.float32)
+    acc = np.empty(len(sums) * LANES, np.float32)
     group, grads = np.zeros(SIZE * GROUP), np.empty(12 * GROUP)
     # The last number says whether there is a footprint.
     of_group = np.empty((MOMENTS + 1) * GROUP)
@@ -195,11 +196,11 @@ def _gather_range(
                 n = first + k
                 if span[v, n, 0] < span[v, n, 1]:
                     _gather(
-                        v, n, record, span, weight, cutoff, columns, grad_image, value, total, sums, acc,
-                        moments, grad_weight,
+                        v, n, record, span, weight, cutoff, columns, grad_image, value, total, acc, sums,
+                        grad_weight,
                     )  # fmt: skip
                     for m in range(MOMENTS):
-                        of_group[m * GROUP + k] = moments[m]
+                        of_group[m * GROUP + k] = sums[m]
                     of_group[MOMENTS * GROUP + k] = 1.0
             place = origin[v, 0], origin[v, 1], origin[v, 2]
             _take_back(cone, planar, place, rows_of(inverse[v]), rows_of(matrix[v]), group, of_group, grads)

@@ -11,11 +11,13 @@ import numpy as np
 from numba import njit
 
 from tomo_polysplat.kernels.gaussian_maths import FAST, gaussian, whitening, whitening_adjoint
-from tomo_polysplat.kernels.numba_lanes import LANES, add_product, add_scaled, lane_sum
+from tomo_polysplat.kernels.numba_lanes import LANES, add_product, add_scaled, lane_sums
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.parallel import cpu_threads, run_tasks, split_range
 
 __all__ = ["backward", "forward"]
+
+_MOMENTS = 9  # sums over the voxels of a Gaussian, in the order read by _pull_back
 
 
 @njit(inline="always")
@@ -105,9 +107,9 @@ def _fill(first, last, record, weight, cutoff, ny, nx, volume):
 
 
 @njit(inline="always")
-def _gather(n, rec, weight, cutoff, nx, grad_volume, value, total, sums, acc):
-    """Lane sums over the voxels of one Gaussian: ``sums`` of dL/df f by channel, ``acc`` of h times
-    (t, u, w, tt, tu, tw, uu, uw, ww), with h = dL/d(distance^2) = dL/d(t^2 + u^2 + w^2)."""
+def _gather(n, rec, weight, cutoff, nx, grad_volume, value, total, acc):
+    """Lane sums over the voxels of one Gaussian: of h times (t, u, w, tt, tu, tw, uu, uw, ww), with
+    h = dL/d(distance^2) = dL/d(t^2 + u^2 + w^2), and of dL/df f by channel."""
     cut = np.float32(cutoff * cutoff)
     half = np.float32(-0.5)
     xc, yc, zc, r11, r12, r13, r22, r23, r33 = rec
@@ -130,7 +132,7 @@ def _gather(n, rec, weight, cutoff, nx, grad_volume, value, total, sums, acc):
                     total[k] = np.float32(0)
                 for c in range(channels):
                     at = ((iz * ny + iy) * channels + c) * stride + j
-                    add_product(sums, c * LANES, grad_volume, at, value, 0)
+                    add_product(acc, (_MOMENTS + c) * LANES, grad_volume, at, value, 0)
                     add_scaled(total, 0, weight[c, n], grad_volume, at)
                 for k in range(LANES):
                     t = r11 * (np.float32(k) + x0) + across
@@ -170,20 +172,23 @@ def _gather_range(
 ):  # fmt: skip
     """The gradients of the Gaussians start..stop."""
     white, q, rec, grad_white = np.empty((3, 3)), np.empty((3, 3)), np.empty(9), np.empty((3, 3))
-    single, m = np.empty(9, np.float32), np.empty(9)
+    single, m = np.empty(9, np.float32), np.empty(_MOMENTS)
     value, total = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
-    sums, acc = np.empty(len(weight) * LANES, np.float32), np.empty(9 * LANES, np.float32)
+    # As many sums as `lane_sums` makes at once.
+    sums = np.empty(-(-(_MOMENTS + len(weight)) // LANES) * LANES, np.float32)
+    acc = np.empty(len(sums) * LANES, np.float32)
     for n in range(start, stop):
         _triangle(position, scale, rotation, n, first, spacing, white, q, rec)
         for k in range(9):
             single[k] = rec[k]
-        sums[:] = np.float32(0)
         acc[:] = np.float32(0)
-        _gather(n, single, weight, cutoff, nx, grad_volume, value, total, sums, acc)
-        for k in range(9):
-            m[k] = lane_sum(acc, k * LANES)
+        _gather(n, single, weight, cutoff, nx, grad_volume, value, total, acc)
+        for some in range(0, len(sums), LANES):
+            lane_sums(sums, some, acc, some * LANES)
+        for k in range(_MOMENTS):
+            m[k] = sums[k]
         for c in range(len(weight)):
-            grad_weight[c, n] = lane_sum(sums, c * LANES)
+            grad_weight[c, n] = sums[_MOMENTS + c]
         _pull_back(n, white, q, rec, spacing, m, grad_position, grad_white)
         whitening_adjoint(scale, rotation, n, white, grad_white, grad_scale, grad_rotation)
 
