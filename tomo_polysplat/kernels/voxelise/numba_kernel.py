@@ -63,6 +63,20 @@ def _slices(rec, cutoff, length):
     return _interval(rec[2], 0.0, cutoff, rec[8], length)
 
 
+@njit(inline="always")
+def _columns(rec, cutoff, length):
+    """The columns a Gaussian reaches in any row, and whether they are more than one block."""
+    r11, r12, r13, r22, r23, r33 = rec[3:]
+    # The first row of the inverse of r: its length is the deviation along a row of voxels.
+    by_r11, by_r22 = np.float32(1) / r11, np.float32(1) / r22
+    second, third = r12 * by_r22, np.float32(0)
+    if r33 > np.float32(0):
+        third = (second * r23 - r13) / r33
+    spread = cutoff * by_r11 * math.sqrt(np.float32(1) + second * second + third * third)
+    j0, j1 = _interval(rec[0], np.float32(0), spread, np.float32(1), length)
+    return j0, j1, j1 - j0 > LANES
+
+
 @njit(nogil=True, cache=True, error_model="numpy")
 def _set_up(start, stop, position, scale, rotation, first, spacing, record):
     white, q, rec = np.empty((3, 3)), np.empty((3, 3)), np.empty(9)
@@ -90,6 +104,8 @@ def _fill(first, last, record, weight, cutoff, ny, nx, volume):
         rec = record[n]
         xc, yc, zc, r11, r12, r13, r22, r23, r33 = rec
         low, high = _slices(rec, cutoff, nz)
+        # A Gaussian of at most one block a row needs no range of columns for every row.
+        j0, j1, wide = _columns(rec, cutoff, nx)
         for iz in range(max(low, first), min(high, last)):
             z = np.float32(iz) - zc
             z2 = (r33 * z) * (r33 * z)
@@ -98,7 +114,8 @@ def _fill(first, last, record, weight, cutoff, ny, nx, volume):
                 y = np.float32(iy) - yc
                 up = r22 * y + r23 * z
                 rest, across = z2 + up * up, r12 * y + r13 * z
-                j0, j1 = _interval(xc, across, math.sqrt(max(np.float32(0), cut - rest)), r11, nx)
+                if wide:
+                    j0, j1 = _interval(xc, across, math.sqrt(max(np.float32(0), cut - rest)), r11, nx)
                 for j in range(j0, j1, LANES):
                     _block(np.float32(j) - xc, r11, across, rest, cut, value)
                     for c in range(channels):
@@ -115,6 +132,7 @@ def _gather(n, rec, weight, cutoff, nx, grad_volume, value, total, acc):
     xc, yc, zc, r11, r12, r13, r22, r23, r33 = rec
     nz, ny, channels, stride = grad_volume.shape
     low, high = _slices(rec, cutoff, nz)
+    j0, j1, wide = _columns(rec, cutoff, nx)
     for iz in range(low, high):
         z = np.float32(iz) - zc
         deep = r33 * z
@@ -124,7 +142,8 @@ def _gather(n, rec, weight, cutoff, nx, grad_volume, value, total, acc):
             y = np.float32(iy) - yc
             up = r22 * y + r23 * z
             rest, across = z2 + up * up, r12 * y + r13 * z
-            j0, j1 = _interval(xc, across, math.sqrt(max(np.float32(0), cut - rest)), r11, nx)
+            if wide:
+                j0, j1 = _interval(xc, across, math.sqrt(max(np.float32(0), cut - rest)), r11, nx)
             for j in range(j0, j1, LANES):
                 x0 = np.float32(j) - xc
                 _block(x0, r11, across, rest, cut, value)
