@@ -11,11 +11,12 @@ from tomo_polysplat.settings import Settings
 SPECTRUM = tps.Spectrum.from_tube(90, filters={"Al": 0.1})
 
 
-def core_error(core, **settings):
+def core_error(core, seed=0, **settings):
     """Relative error of the mean inside a disc of some matter in one of water, 6 cm wide."""
     projections, proj_geom, vol_geom = disc(core, SPECTRUM, half=3.0)
+    settings = {"passes": 10.0} | settings
     result = tps.reconstruct(
-        projections, proj_geom, vol_geom, spectrum=SPECTRUM, unit="cm", settings={"passes": 10.0} | settings
+        projections, proj_geom, vol_geom, spectrum=SPECTRUM, unit="cm", settings=settings, seed=seed
     )
     y, x = np.mgrid[:45, :45] - 22
     true = density(core) * mass_attenuation(core, [result.energy_kev])[0]
@@ -29,7 +30,13 @@ def test_fat_is_too_light_by_waters_number_and_right_by_its_own(matter, number):
 
 
 def test_what_is_no_lighter_than_water_keeps_its_number():
-    assert core_error("muscle", light_u=-0.056) == pytest.approx(core_error("muscle", curves=3), abs=2e-3)
+    """Over three seeds, of which one moves a mean by up to 0.003; with what the rays decide on the way held."""
+    held = {"tv_factor": 1.0, "soft_gain": 0.0}
+    told, untold = (
+        np.mean([core_error("muscle", seed, **held, **choice) for seed in range(3)])
+        for choice in ({"light_u": -0.056}, {"curves": 3})
+    )
+    assert told == pytest.approx(untold, abs=2e-3)
 
 
 @pytest.mark.parametrize("value", [0.3, -0.2])
