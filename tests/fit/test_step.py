@@ -169,7 +169,7 @@ def test_a_graph_that_cannot_be_recorded_is_said_and_replaced(monkeypatch, caplo
     def refuse(*_, **__):
         raise RuntimeError("no graphs here")
 
-    monkeypatch.setattr(torch.cuda, "graph", refuse)
+    monkeypatch.setattr(torch.cuda.CUDAGraph, "capture_begin", refuse)
     with caplog.at_level(logging.WARNING):
         step = make_step(*problem, batch=BATCH)
     assert isinstance(step, EagerStep) and "no graphs here" in caplog.text
