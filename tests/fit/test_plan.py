@@ -297,14 +297,15 @@ def test_views_of_a_step_leave_enough_steps(passes):
     [
         (12, 150, False, 20.0, 4),
         (45, 150, False, 15.0, 6),
-        (45, 30, False, 10.0, 1),
+        (45, 30, False, 22.5, 2),
+        (45, 8, False, 45.0, 1),
         (30, 150, True, 20.0, 5),
         (400, 150, True, 10.0, 5),
-        (30, 30, True, 10.0, 1),
+        (30, 30, True, 30.0, 3),
     ],
 )
-def test_a_run_is_longer_for_a_small_cloud_of_many_views(size, views, planar, passes, together):
-    """In steps and in passes, of which volumes gain fewer."""
+def test_a_run_is_longer_for_a_small_cloud_and_for_few_views(size, views, planar, passes, together):
+    """For a small cloud in steps and in passes, of which volumes gain fewer; of few views in passes, thrice at most."""
     of = problem(size, views=views, planar=planar)
     made = plan(of, ball(of, WATER))
     assert (made.passes, made.views_per_step) == (passes, together)

@@ -11,15 +11,15 @@ FLAT = ((0.0, 0.0, 0.85, 0.5), (0.3, 0.2, 0.2, 0.1), (-0.35, 0.1, 0.15, -0.2), (
 RINGS = tuple((0.0, 0.0, radius, 0.5 * (-1) ** k) for k, radius in enumerate(np.arange(0.85, 0.1, -0.0625)))
 
 
-def slice_of(discs, noise, denser=1.0):
+def slice_of(discs, noise, denser=1.0, views=VIEWS):
     """Exact line integrals of discs (x, y, radius, attenuation) in a parallel beam, their geometries, and the truth."""
     discs = [(x, y, radius, denser * mu) for x, y, radius, mu in discs]
-    angles = np.linspace(0, np.pi, VIEWS, endpoint=False)
+    angles = np.linspace(0, np.pi, views, endpoint=False)
     pixel, columns = 2 / SIZE, round(1.3 * SIZE)
     s = pixel * (np.arange(columns) - (columns - 1) / 2)
     # Nine points across a voxel and either way tell its mean well enough.
     fine = (np.arange(9 * SIZE) + 0.5) / (9 * SIZE) * 2 - 1
-    projections, truth = np.zeros((VIEWS, columns)), np.zeros((9 * SIZE,) * 2)
+    projections, truth = np.zeros((views, columns)), np.zeros((9 * SIZE,) * 2)
     for x, y, radius, mu in discs:
         off = s - (x * np.cos(angles) + y * np.sin(angles))[:, None]
         projections += 2 * mu * np.sqrt(np.maximum(radius**2 - off**2, 0))
@@ -95,6 +95,15 @@ def test_where_smooth_things_are_thin_held_out_rays_keep_the_usual_weight():
 )
 def test_when_nothing_is_asked(changed, because):
     assert because in fitted(slice_of(FLAT, 0.05), **changed).plan["smoothing"]
+
+
+@pytest.mark.parametrize(("discs", "noise", "more"), [(FLAT, 0.05, True), (RINGS, 0.005, False)])
+def test_a_slice_of_few_views_is_asked_as_well(discs, noise, more):
+    scan = slice_of(discs, noise, views=30)
+    found, thrice = fitted(scan), fitted(scan, tv_factor=3 if more else 1)
+    assert "misfit of the held-out rays" in found.plan["smoothing"]
+    assert found.plan["smoothing"].startswith("3 times") == more
+    assert relative_error(found.volume, scan[3]) < 1.05 * relative_error(thrice.volume, scan[3])
 
 
 def test_many_rays_a_voxel_need_no_more_smoothing():

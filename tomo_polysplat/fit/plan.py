@@ -33,11 +33,14 @@ _LIGHT = 0.15
 # Rays a pixel and axis where the light is averaged: with three pins of 36^3 are no better than with two (45.4 and 48.4
 # dB everywhere).
 AVERAGED_RAYS = 2
-# Passes of a run that nobody has given a length, and of slices, and of scans of fewer views than the last number, whose
-# steps have one view as it is. By 15 passes instead of 10 six scenes of 48^3 gain 0.6 dB without metal in the mean and
-# 0.2 everywhere, and take a fifth more time, those of 128^3 on an H200 0.4 and 0.2 in a sixth more; with 20 passes 0.1
-# dB more in a sixth more time yet.
-_PASSES, _FEWER_PASSES, _MANY_VIEWS = 15.0, 10.0, 45
+# Passes of a run that nobody has given a length, and of slices. By 15 passes instead of 10 six scenes of 48^3 gain 0.6
+# dB without metal in the mean and 0.2 everywhere, and take a fifth more time, those of 128^3 on an H200 0.4 and 0.2 in
+# a sixth more; with 20 passes 0.1 dB more in a sixth more time yet.
+_PASSES, _PASSES_PLANAR = 15.0, 10.0
+# Of fewer views than these a run makes more passes, as many views in all up to so many times: 12 to 36 views, six
+# volumes of 36^3, came to 32.0 / 44.0 dB in 3.7 s by 10 passes, and to 32.9 / 44.5 in 6.5 s so (33.2 / 44.6 in 8.2 s
+# by 40).
+_MANY_VIEWS, _MOST_TIMES = 45, 3.0
 # Steps of a small cloud cost little: with fewer seeds in matter than the second number a run makes more of them, by up
 # to the first, and a third as many more passes. Ten volumes of 26^3 to 34^3, steps of two views: 33.3 / 39.4 dB in 15
 # passes, 33.5 / 39.8 in 20, for a fifth more time; steps of one view in 15 passes 33.4 / 39.7, for a third more.
@@ -247,12 +250,12 @@ def _length(problem: Problem, settings: Settings, device: str, longer: float) ->
     """Passes, views of a step, and why so many of these: as many as leave enough steps."""
     of_scan, planar = problem.geometry.views, problem.planar
     most = _MOST_VIEWS_PLANAR if planar else _MOST_VIEWS[device]
-    many = of_scan >= _MANY_VIEWS
-    passes = settings.passes or (_PASSES if many and not planar else _FEWER_PASSES)
+    times = min(max(1.0, _MANY_VIEWS / of_scan), _MOST_TIMES)
+    passes = settings.passes or round(times * (_PASSES_PLANAR if planar else _PASSES), 1)
     # A longer run makes more steps and larger ones, by the root of its passes; a shorter one fewer and smaller ones.
     steps = _STEPS_PLANAR if planar else _STEPS * math.sqrt(passes / _PASSES)
-    if many and not settings.passes:
-        steps *= longer
+    if not settings.passes:
+        steps *= longer if times == 1 else 1
         passes *= longer if planar else (2 + longer) / 3
     if settings.views_per_step:
         return passes, min(of_scan, settings.views_per_step), "asked for"
