@@ -43,8 +43,8 @@ _CLEARLY = 0.97
 # (docs/limits.md). Of 24 to 36 views 18 slices gain, by 0.1 to 4.7 dB, and come to 0.67 to 0.98.
 _TIMES = 3.0
 # Of a short fit: the longer it is, the less it shows of what smoothing holds back. In a volume fewer of many views do.
-# Of a slice it sees so many views at least, in three times the passes at most: 30 views of nickel and steel came to 1.03 in 3
-# passes and to 0.92 in 6, and gain 2.5 dB.
+# Of a slice it sees so many views at least, in three times the passes at most: 30 views of nickel and steel came to
+# 1.03 in 3 passes and to 0.92 in 6, and gain 2.5 dB.
 _PASSES, _STEPS, _VIEWS_SEEN = 3.0, 100, 180
 # With more rays a voxel a slice's short fits are too early to tell: slices of 3.9, which lose 1.3 dB, would have it.
 _MOST_RAYS = 3.0
