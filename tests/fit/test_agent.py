@@ -76,6 +76,17 @@ def test_short_fits_that_the_time_budget_ends_tell_no_agent():
     assert best is settings and "too short" in told["agent"]
 
 
+def test_an_agent_too_weak_to_be_seen_is_told_of(caplog):
+    scan, device = fan(), torch.device("cpu")
+    named = ("water", "bone", "I")
+    problem = Problem.of(scan.projections.swapaxes(0, 1), *geometries(scan), "cm", scan.spectrum, named)
+    settings, options = make_settings(), {"seed": 0, "time_budget": None}
+    start, _ = first_volume(problem, device, settings)
+    weak = start.clamp(max=1.5 * problem.depth)
+    best, told = settings_for_agent(weak, 1.0, problem, settings, device, options)
+    assert best is settings and "not looked for" in told["agent"] and "bone_level" in caplog.text
+
+
 def test_metal_that_was_named_starts_as_itself():
     scan, device, options = fan(), torch.device("cpu"), {"seed": 0, "time_budget": None}
 

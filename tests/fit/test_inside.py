@@ -119,4 +119,4 @@ def test_an_object_that_reaches_beyond_both_ends_of_the_detector_is_told(ends, t
     values = torch.ones(geometry.shape)
     values[:, :, 0], values[:, :, -1] = ends
     closed, why = matter_is_inside(values, geometry, wide)
-    assert not closed and ("beyond the detector" in why) == told == ("larger" in caplog.text)
+    assert not closed and ("beyond the detector" in why) == told == ("large enough" in caplog.text)

@@ -44,7 +44,8 @@ def matter_is_inside(projections: torch.Tensor, geometry: Geometry, grid: Volume
         if _truncated(projections, some, rows, typical):
             logger.warning(
                 "The object reaches beyond the detector on both sides, and few rays pass beside the volume: what lies"
-                " there ends up in the volume, which is too dense towards its border. Make the volume larger."
+                " there ends up in the volume, which is too dense towards its border. Make the volume large enough for"
+                " all of the object, if it is not."
             )
             return False, "not kept within the volume: the object reaches beyond the detector on both sides"
         if not len(through) and _missed(geometry.select(some), grid):
