@@ -68,13 +68,13 @@ def settings_for_agent(
         return _metal_as_named(settings, problem.materials)
     levels = levels_between((start / (problem.depth * first)).cpu().numpy(), settings.bone_level)
     if not levels:
-        words = f"not looked for: nothing of the start is denser than {settings.bone_level:g} soft references"
+        why_not = f"not looked for: nothing of the start is denser than {settings.bone_level:g} soft references"
         logger.warning(
             "The contrast agent that was named is %s. If it is a weak solution, settings={'bone_level': ...} with a"
             " level between that of soft matter, 1, and its own frees its material number.",
-            words,
+            why_not,
         )
-        return settings, {"agent": words}
+        return settings, {"agent": why_not}
     choices = [settings] + [
         replace(settings, bone_u=0.0, metal_u=1.0, metal_level=level, metal_rim=settings.bone_level)
         for level in levels
