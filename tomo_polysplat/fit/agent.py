@@ -68,7 +68,9 @@ def settings_for_agent(
         return _metal_as_named(settings, problem.materials)
     levels = levels_between((start / (problem.depth * first)).cpu().numpy(), settings.bone_level)
     if not levels:
-        why_not = f"not looked for: nothing of the start is denser than {settings.bone_level:g} soft references"
+        why_not = (
+            f"not looked for: nothing of the start is denser than {settings.bone_level:g} soft references"
+        )
         logger.warning(
             "The contrast agent that was named is %s. If it is a weak solution, settings={'bone_level': ...} with a"
             " level between that of soft matter, 1, and its own frees its material number.",
