@@ -100,10 +100,10 @@ def test_when_nothing_is_asked(changed, because):
 @pytest.mark.parametrize(("discs", "noise", "more"), [(FLAT, 0.05, True), (RINGS, 0.005, False)])
 def test_a_slice_of_few_views_is_asked_as_well(discs, noise, more):
     scan = slice_of(discs, noise, views=30)
-    found, thrice = fitted(scan), fitted(scan, tv_factor=3 if more else 1)
+    found, other = fitted(scan), fitted(scan, tv_factor=1 if more else 3)
     assert "misfit of the held-out rays" in found.plan["smoothing"]
     assert found.plan["smoothing"].startswith("3 times") == more
-    assert relative_error(found.volume, scan[3]) < 1.05 * relative_error(thrice.volume, scan[3])
+    assert relative_error(found.volume, scan[3]) < 0.8 * relative_error(other.volume, scan[3])
 
 
 def test_many_rays_a_voxel_need_no_more_smoothing():

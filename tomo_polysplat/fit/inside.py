@@ -77,8 +77,7 @@ def _typical(values: np.ndarray) -> float:
 
 def _missed(geometry: Geometry, grid: VolumeGrid) -> bool:
     """Whether no ray meets the volume, which those that were looked at may have missed alone."""
-    rows, columns = np.arange(geometry.rows), np.arange(geometry.columns)
-    return not _crosses(geometry, grid, rows, columns).any()
+    return not _crosses(geometry, grid, np.arange(geometry.rows), np.arange(geometry.columns)).any()
 
 
 def _truncated(projections: torch.Tensor, views: np.ndarray, rows: np.ndarray, typical: float) -> bool:

@@ -168,8 +168,8 @@ def set_up(
         put_group(first, some, position, scale, rotation, white, group)
         for v in range(len(origin)):
             place = origin[v, 0], origin[v, 1], origin[v, 2]
-            frame = rows_of(inverse[v]), rows_of(matrix[v])
-            _footprints(cone, planar, cutoff, rows, columns, place, frame[0], frame[1], group, out)
+            inverted, direct = rows_of(inverse[v]), rows_of(matrix[v])
+            _footprints(cone, planar, cutoff, rows, columns, place, inverted, direct, group, out)
             for k in range(some):
                 ahead = out[(RECORD + 4) * GROUP + k] > 0.0
                 skipped += not ahead

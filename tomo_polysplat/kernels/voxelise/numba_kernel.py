@@ -191,7 +191,7 @@ def _gather_range(
 ):  # fmt: skip
     """The gradients of the Gaussians start..stop."""
     white, q, rec, grad_white = np.empty((3, 3)), np.empty((3, 3)), np.empty(9), np.empty((3, 3))
-    single, m = np.empty(9, np.float32), np.empty(_MOMENTS)
+    single = np.empty(9, np.float32)
     value, total = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
     # As many sums as `lane_sums` makes at once.
     sums = np.empty(-(-(_MOMENTS + len(weight)) // LANES) * LANES, np.float32)
@@ -204,11 +204,9 @@ def _gather_range(
         _gather(n, single, weight, cutoff, nx, grad_volume, value, total, acc)
         for some in range(0, len(sums), LANES):
             lane_sums(sums, some, acc, some * LANES)
-        for k in range(_MOMENTS):
-            m[k] = sums[k]
         for c in range(len(weight)):
             grad_weight[c, n] = sums[_MOMENTS + c]
-        _pull_back(n, white, q, rec, spacing, m, grad_position, grad_white)
+        _pull_back(n, white, q, rec, spacing, sums, grad_position, grad_white)
         whitening_adjoint(scale, rotation, n, white, grad_white, grad_scale, grad_rotation)
 
 
