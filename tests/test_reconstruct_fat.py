@@ -26,7 +26,7 @@ def core_error(core, seed=0, **settings):
 @pytest.mark.parametrize(("matter", "number"), [("adipose", -0.056), ("polyethylene", -0.1)])
 def test_fat_is_too_light_by_waters_number_and_right_by_its_own(matter, number):
     assert core_error(matter) < -0.009
-    assert abs(core_error(matter, light_u=number)) < 0.007
+    assert abs(core_error(matter, light="fat", light_u=number)) < 0.007
 
 
 def test_what_is_no_lighter_than_water_keeps_its_number():
@@ -34,7 +34,7 @@ def test_what_is_no_lighter_than_water_keeps_its_number():
     held = {"tv_factor": 1.0, "soft_gain": 0.0}
     told, untold = (
         np.mean([core_error("muscle", seed, **held, **choice) for seed in range(3)])
-        for choice in ({"light_u": -0.056}, {"curves": 3})
+        for choice in ({"light": "fat"}, {"curves": 3})
     )
     assert told == pytest.approx(untold, abs=2e-3)
 
@@ -42,9 +42,9 @@ def test_what_is_no_lighter_than_water_keeps_its_number():
 @pytest.mark.parametrize("value", [0.3, -0.2])
 def test_the_number_is_one_that_curves_reach(value):
     with pytest.raises(ValueError, match=r"light_u.*>= -0.1 and <= 0.1"):
-        Settings(light_u=value)
+        Settings(light="fat", light_u=value)
 
 
 def test_one_curve_has_no_other_number():
-    with pytest.raises(ValueError, match="light_u"):
-        Settings(curves=1, light_u=-0.05)
+    with pytest.raises(ValueError, match="light"):
+        Settings(curves=1, light="fat")

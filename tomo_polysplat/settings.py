@@ -66,9 +66,11 @@ class Settings:
     """Material number of soft matter that the fit starts from; near dense matter it is free."""
     soft_gain: float = 1.0
     """Once a pass the soft matter's number moves by so much times the cupping, where it is one matter; 0 holds it."""
-    light_u: float = 0.0
-    """Material number, less that of soft matter, of what has 0.65 to 0.95 soft references: fat, which hardens the beam
-    less than water, has -0.056. The rays do not tell it from water that is less dense, so nothing is assumed."""
+    light: str = "auto"
+    """What has 0.65 to 0.95 soft references: "soft" matter that is less dense, or "fat", which hardens the beam less;
+    "auto" leaves it to the plan, which asks the rays where there is much of it."""
+    light_u: float = -0.056
+    """Material number of fat, less that of soft matter; that of adipose tissue by default."""
     bone_u: float = 0.3
     """Material number that matter of four soft references starts from, that of bone (``model/bone_numbers.py``)."""
     metal_u: float = 0.8
@@ -141,6 +143,7 @@ class Settings:
     def __post_init__(self) -> None:
         require_choice("settings['loss']", self.loss, ("huber", "weighted-l1", "l1"))
         require_choice("settings['edges']", self.edges, ("auto", "sharp", "blurred"))
+        require_choice("settings['light']", self.light, ("auto", "soft", "fat"))
         require_choice("settings['kernel']", self.kernel, ("auto", "triton", "numba", "reference"))
         for field in fields(self):
             name, value = f"settings[{field.name!r}]", getattr(self, field.name)
@@ -156,10 +159,10 @@ class Settings:
             raise fail("settings['curves']", "1, 3, or 0 for the plan to decide", repr(self.curves))
         if self.curves == 1 and self.soft_u:
             raise fail("settings['curves']", "3 with a soft_u other than 0", "1", "name the soft material")
-        if self.soft_u + self.light_u < -0.1:
+        if self.light == "fat" and self.soft_u + self.light_u < -0.1:
             raise fail("settings['light_u']", "-0.1 at least, together with soft_u", repr(self.light_u))
-        if self.curves == 1 and self.light_u:
-            raise fail("settings['curves']", "3 with a light_u other than 0", "1", "one curve has one number")
+        if self.curves == 1 and self.light == "fat":
+            raise fail("settings['curves']", "3 where light matter is fat", "1", "one curve has one number")
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values by name."""

@@ -17,8 +17,8 @@ from tomo_polysplat.bench.recon_report import as_text, write_figures
 from tomo_polysplat.bench.runs import timed_runs, warm_up, with_errors
 from tomo_polysplat.bench.scenes import cache_folder, cached_scan, fewer_views
 from tomo_polysplat.cli import main
+from tomo_polysplat.fit.fork import FEWEST_PASSES
 from tomo_polysplat.fit.optimise import FitState
-from tomo_polysplat.fit.pixel_averaging import FEWEST_PASSES
 from tomo_polysplat.result.metrics import compare
 
 QUICK = {"passes": 1.0}

@@ -51,4 +51,4 @@ def test_its_pace_goes_with_a_branch_and_a_snapshot():
     resumed = fitter_of(400)
     assert rates(resumed) != rates(hurried)
     resumed.restore(hurried.snapshot(None, {}))
-    assert rates(resumed) == rates(hurried.branch(1)) == rates(hurried)
+    assert rates(resumed) == rates(hurried.branch(pixel_rays=1)) == rates(hurried)

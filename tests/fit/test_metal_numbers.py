@@ -2,42 +2,22 @@
 
 import numpy as np
 import pytest
-import torch
+from small_clouds import blocks
 from small_scans import disc
 
 from tomo_polysplat import reconstruct
 from tomo_polysplat.fit.metal_numbers import number_metals
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.kernels.voxelise.box import VoxelBox
-from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.materials import density
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.settings import Settings
 
 
-def blocks(levels, size=11):
-    """A block of Gaussians for each level, so wide that its lattice is flat; soft matter first."""
-    scale, height = 0.6, 1 / (np.sqrt(2 * np.pi) * 0.6) ** 3
-    corners = np.stack(np.meshgrid(*[np.arange(size)] * 3, indexing="ij"), -1).reshape(-1, 3).astype(float)
-    places = [corners + [0, 0, 2 * size * k] for k in range(len(levels))]
-    heights = [np.full(len(corners), level * height) for level in levels]
-    groups = [np.full(len(corners), k) for k in range(len(levels))]
-    count = len(levels) * len(corners)
-    gaussians = Gaussians(
-        torch.from_numpy(np.concatenate(places)).float(), torch.full((count, 3), np.log(scale)),
-        torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1), torch.from_numpy(np.concatenate(heights)).float(),
-        torch.zeros(count), torch.tensor([0.0] + [0.8] * (len(levels) - 1)),
-        torch.from_numpy(np.concatenate(groups)), torch.zeros(1),
-    )  # fmt: skip
-    box = VoxelBox(np.zeros(3), np.ones(3), (2 * size * len(levels), size, size))
-    return gaussians, box
-
-
 def scene_of(box, numbers):
-    smooth = (8, (0.1, 0.1))
     return FitScene(
-        box, None, 1.0, None, None, -0.1, "reference", 3.0, 0.1, False, *smooth, False, 1, 0.2, numbers
-    )
+        box, None, 1.0, None, None, -0.1, "reference", 3.0, 0.1, False, (0.1, 0.1), False, 1, 0.2,
+        solid_number=numbers,
+    )  # fmt: skip
 
 
 def test_each_piece_gets_the_number_of_its_own_attenuation():

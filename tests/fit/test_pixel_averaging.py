@@ -81,7 +81,7 @@ def test_a_budget_that_ends_amid_the_question_leaves_the_run_as_it_was(passes):
         return made
 
     other = SimpleNamespace(ahead=slowly)
-    fitter = SimpleNamespace(ahead=slowly, branch=lambda rays: other, steps_of_a_pass=30)
+    fitter = SimpleNamespace(ahead=slowly, branch=lambda pixel_rays: other, steps_of_a_pass=30)
     chosen, last = PixelAveraging(plan).answered(fitter, clock)
     assert chosen is fitter and last == (made[0] if made else None)
     assert plan.pixel_rays == 1 and "time budget" in plan.reasons["pixel_rays"]
@@ -97,7 +97,7 @@ def test_each_way_has_steps_enough_to_get_used_to_it_but_no_more_than_a_fifth_of
         return []
 
     other = SimpleNamespace(ahead=ahead)
-    fitter = SimpleNamespace(ahead=ahead, branch=lambda rays: other, steps_of_a_pass=steps)
+    fitter = SimpleNamespace(ahead=ahead, branch=lambda pixel_rays: other, steps_of_a_pass=steps)
     PixelAveraging(plan).answered(fitter, Clock(10, None))
     assert asked == [passes, passes]
 

@@ -16,8 +16,8 @@ from tomo_polysplat.baselines.sirt import sirt
 from tomo_polysplat.baselines.voxel_poly import voxel_poly
 from tomo_polysplat.baselines.water_bhc import water_bhc, water_corrected
 from tomo_polysplat.bench import peers
+from tomo_polysplat.fit.fork import FEWEST_PASSES
 from tomo_polysplat.fit.optimise import FitState
-from tomo_polysplat.fit.pixel_averaging import FEWEST_PASSES
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.reconstruction import reconstruct
 from tomo_polysplat.result.result import Result

@@ -32,7 +32,7 @@ __all__ = ["Checkpoint", "Snapshot"]
 
 logger = logging.getLogger(__name__)
 
-FORMAT = 15
+FORMAT = 16
 # Writing takes at most this share of the time.
 _LARGEST_SHARE = 0.05
 _PARTS = tuple(field.name for field in fields(Gaussians))
@@ -218,6 +218,7 @@ def _plan(parts: dict[str, Any]) -> Plan:
         isinstance(corner, (int, float)) and corner >= 0 for corner in plan.tv_corners
     )
     choices = plan.curves in (1, 3) and isinstance(plan.blurred, bool) and isinstance(plan.sharp, bool)
+    choices = choices and isinstance(plan.fat, bool | None)
     if not (above_zero and whole and corners and choices and isinstance(plan.reasons, dict)):
         raise TypeError(f"a plan, got {parts}")
     soft, dense = plan.tv_corners

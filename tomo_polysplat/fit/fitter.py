@@ -15,6 +15,7 @@ import torch
 from tomo_polysplat.fit.checkpoint import Snapshot
 from tomo_polysplat.fit.choose_step import make_step
 from tomo_polysplat.fit.learning_rates import hurried
+from tomo_polysplat.fit.light_matter import tell_light
 from tomo_polysplat.fit.metal_numbers import number_metals
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
@@ -98,9 +99,9 @@ class Fitter:
         """What so many more passes gave, as `passes` tells it."""
         return list(itertools.islice(self.passes(clock), passes))
 
-    def branch(self, pixel_rays: int) -> Fitter:
-        """The same run from here on, with so many rays a pixel and axis, on Gaussians of its own."""
-        scene, rng = replace(self.scene, pixel_rays=pixel_rays), copy.deepcopy(self.rng)
+    def branch(self, **changes: Any) -> Fitter:
+        """The same run from here on, with changes to its scene by name, on Gaussians of its own."""
+        scene, rng = replace(self.scene, **changes), copy.deepcopy(self.rng)
         gaussians, counts = self.gaussians.copy(), (self.batch, self.steps)
         other = Fitter(gaussians, self.spacing, self.rays, scene, self.settings, *counts, rng)
         other.restore(self.snapshot(None, {}))
@@ -120,6 +121,7 @@ class Fitter:
         if self.gaussians.finite():
             flatten(self.gaussians, self.scene, self.settings, share)
             number_metals(self.gaussians, self.scene, self.settings, share)
+            tell_light(self.gaussians, self.scene, self.settings, share)
         return self.step.read()
 
     def snapshot(self, best: Gaussians | None, numbers: dict[str, Any]) -> Snapshot:

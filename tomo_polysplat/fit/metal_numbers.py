@@ -53,8 +53,7 @@ def number_metals(gaussians: Gaussians, scene: FitScene, settings: Settings, sha
 def _at_centres(metal: Gaussians, scene: FitScene) -> np.ndarray:
     """Attenuation in soft references of the voxel that each Gaussian is in, or of the nearest one."""
     box = scene.box
-    first, spacing, size = (metal.position.new_tensor(v) for v in (box.first, box.spacing, box.shape[::-1]))
-    index = torch.minimum(((metal.position - first) / spacing).round().clamp(min=0), size - 1).long().flip(1)
+    index = box.voxels_of(metal.position)
     lowest = index.amin(dim=0)
     nz, ny, nx = (index.amax(dim=0) - lowest + 1).tolist()
     z, y, x = lowest.tolist()

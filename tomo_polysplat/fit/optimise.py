@@ -13,7 +13,7 @@ import numpy as np
 
 from tomo_polysplat.fit.checkpoint import Checkpoint
 from tomo_polysplat.fit.fitter import Fitter, views_of_a_pass
-from tomo_polysplat.fit.pixel_averaging import PixelAveraging
+from tomo_polysplat.fit.fork import Question
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.stopping import Clock, FitState, Watch, is_true, patience_of
@@ -75,7 +75,7 @@ class _Run:
     clock: Clock
     started: float
     checkpoint: Checkpoint | None
-    averaging: PixelAveraging | None
+    questions: Sequence[Question]
     look: Callable[[Fitter, Clock], Any] | None
 
     def keep(self, *, now: bool) -> None:
@@ -127,13 +127,13 @@ class _Run:
                 return
 
     def _passes(self) -> Iterator[tuple[float, float, int]]:
-        """What each pass gave; where ``averaging`` is asked, two at once, so that no checkpoint lies between them."""
+        """What each pass gave; where something is asked, several at once, so that no checkpoint lies between them."""
         passes = self.fitter.passes(self.clock)
         while True:
             if self.look is not None:
                 self.look(self.fitter, self.clock)
-            if self.averaging is not None and self.averaging.due(self.clock):
-                self.fitter, made = self.averaging.answered(self.fitter, self.clock)
+            if (asked := next((one for one in self.questions if one.due(self.clock)), None)) is not None:
+                self.fitter, made = asked.answered(self.fitter, self.clock)
                 passes = self.fitter.passes(self.clock)
                 if made is not None:
                     yield made
@@ -163,7 +163,7 @@ def fit(
     volume: Callable[[Gaussians], np.ndarray],
     callbacks: Sequence[Callable[[FitState], Any]] = (),
     checkpoint: Checkpoint | None = None,
-    averaging: PixelAveraging | None = None,
+    questions: Sequence[Question] = (),
     look: Callable[[Fitter, Clock], Any] | None = None,
 ) -> FitOutcome:
     """Fit Gaussians to rays.
@@ -171,8 +171,8 @@ def fit(
     Stops after ``settings.passes`` over the views, at ``deadline`` (``time.perf_counter`` seconds), when the
     held-out rays have not improved for `patience_of` passes, when a callback returns True, or on
     KeyboardInterrupt; returns the Gaussians that `Watch` holds for the best. Where ``checkpoint``
-    holds a snapshot, ``gaussians`` are its own and the fit goes on from there. ``averaging`` is asked on the way, and
-    ``look`` called between passes.
+    holds a snapshot, ``gaussians`` are its own and the fit goes on from there. ``questions`` are asked on the
+    way, and ``look`` is called between passes.
 
     Raises
     ------
@@ -189,7 +189,7 @@ def fit(
     clock = Clock(steps, deadline)
     outcome = FitOutcome(gaussians)
     watch: Watch[Gaussians] = Watch(patience_of(settings, settings.passes))
-    run = _Run(fitter, outcome, watch, clock, started, checkpoint, averaging, look)
+    run = _Run(fitter, outcome, watch, clock, started, checkpoint, questions, look)
     run.restore()
     try:
         if not outcome.reason:

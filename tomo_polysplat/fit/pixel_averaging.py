@@ -7,15 +7,14 @@ made both ways for a few passes over the views, and goes on as it explains the r
 
 from __future__ import annotations
 
-import copy
 import logging
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 
 from tomo_polysplat.fit.fitter import Fitter
+from tomo_polysplat.fit.fork import FEWEST_PASSES, Made, fork, passes_of_a_fork
 from tomo_polysplat.fit.loss import misfit
 from tomo_polysplat.fit.plan import AVERAGED_RAYS, Plan
 from tomo_polysplat.fit.rays import batches_around
@@ -26,15 +25,13 @@ from tomo_polysplat.render.renderer import project_gaussians
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.initial import FEW_VIEWS
 
-__all__ = ["FEWEST_PASSES", "PixelAveraging", "pixel_averaging"]
+__all__ = ["PixelAveraging", "pixel_averaging"]
 
 logger = logging.getLogger(__name__)
 
-# Share of the run after which it is asked, the passes of each way at least, and their steps, but for more than this
-# share of the run: the first ones are spent on getting used to it.
-_FROM, _PASSES, _STEPS, _MOST = 0.4, 2, 60, 0.2
-# A run of fewer passes is in a hurry.
-FEWEST_PASSES = 10.0
+# Share of the run after which it is asked, and the steps of each way, but for more than this share of the run: the
+# first ones are spent on getting used to it.
+_FROM, _STEPS, _MOST = 0.4, 60, 0.2
 # So many times as long a step of averaged light may take, with two rays a pixel and axis.
 _SLOWER = 4.0
 # Light is averaged where that leaves as much of the misfit of the rays at metal: a fit makes up for most of what it
@@ -44,8 +41,6 @@ _SLOWER = 4.0
 _AS_WELL = (0.7, 1.2)
 # Rays at metal: they and their neighbours see this share of the most metal that any does.
 _SEEN = 0.05
-
-Made = tuple[float, float, int]
 
 
 @dataclass(frozen=True)
@@ -65,13 +60,11 @@ class PixelAveraging:
 
     def answered(self, fitter: Fitter, clock: Clock) -> tuple[Fitter, Made | None]:
         """The fitter to go on with, some passes later, and what the last of them gave, if time was left for any."""
-        other, its_clock = fitter.branch(AVERAGED_RAYS), copy.copy(clock)
-        enough = math.ceil(_STEPS / fitter.steps_of_a_pass)
-        passes = max(_PASSES, min(enough, round(_MOST * self.plan.passes)))
-        made = [fitter.ahead(clock, passes), other.ahead(its_clock, passes)]
-        if its_clock.late:
+        other = fitter.branch(pixel_rays=AVERAGED_RAYS)
+        ways = fork(fitter, other, clock, passes_of_a_fork(fitter, self.plan.passes, _STEPS, _MOST))
+        if ways.late:
             _not_asked(self.plan, "the time budget was used before the rays could tell")
-            return fitter, _last(made[0])
+            return fitter, ways.was
         left = _misfits_at_metal([fitter, other])
         share = left[1] / left[0] if left[0] else float("inf")
         averaged = _AS_WELL[0] <= share <= _AS_WELL[1]
@@ -81,7 +74,7 @@ class PixelAveraging:
         least, most = _AS_WELL
         self.plan.reasons["pixel_rays"] = f"{self.plan.pixel_rays}: {kind}; {words} {least:g} to {most:g}"
         logger.info("Pixels: %s.", self.plan.reasons["pixel_rays"])
-        return (other if averaged else fitter), _last(made[averaged])
+        return (other, ways.other) if averaged else (fitter, ways.was)
 
 
 def pixel_averaging(
@@ -107,11 +100,6 @@ def pixel_averaging(
         return PixelAveraging(plan)
     _not_asked(plan, why_not)
     return None
-
-
-def _last(made: list[Made]) -> Made | None:
-    """The errors of the last pass, and the pairs skipped in all."""
-    return (*made[-1][:2], sum(skipped for _, _, skipped in made)) if made else None
 
 
 def _not_asked(plan: Plan, why: str) -> None:

@@ -90,6 +90,8 @@ class Plan:
         Material curves of the model: three, or the first alone, as for a monochromatic one.
     pixel_rays : int
         Rays a pixel and axis over which the light is averaged; 0 until `fit.pixel_averaging` has told.
+    fat : bool or None
+        Whether light soft matter is fat; None until `fit.fat` has told.
     sharp : bool
         Whether seeds are thin across edges however close they are; `fit.sharpness` tells it by short fits.
     blurred : bool
@@ -115,6 +117,7 @@ class Plan:
     curves: int
     blurred: bool
     pixel_rays: int = 0
+    fat: bool | None = None
     sharp: bool = False
     tv_factor: float = 1.0
     reasons: dict[str, Any] = field(default_factory=dict)
@@ -169,6 +172,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
         curves=curves,
         blurred=blurred,
         pixel_rays=settings.pixel_rays,
+        fat={"auto": None, "soft": False, "fat": True}[settings.light],
     )
     unit = "g/cm3" if problem.polychromatic else "per unit of length"
     plan.reasons = {
@@ -205,7 +209,7 @@ def _curves(
         return settings.curves, "asked for"
     if settings.soft_u:
         return 3, "soft matter has a material number other than 0"
-    if settings.light_u:
+    if settings.light == "fat":
         return 3, "light matter has a material number of its own"
     dense = int((start > settings.bone_level * soft).sum())
     if dense:

@@ -251,6 +251,7 @@ class Problem:
             tv_every=plan.tv_every,
             smallest_scale=plan.smallest_scale,
             pixel_rays=max(plan.pixel_rays, 1),
+            light_u=settings.light_u if plan.fat else 0.0,
             solid_number=self._solid_number(plan, settings),
         )
 

@@ -61,6 +61,8 @@ class FitScene:
         Smallest deviation of a Gaussian, in voxels, or in spacings of the seeds where these are closer.
     pixel_rays : int
         Rays a pixel and axis over which the light is averaged; see ``physics.pixel_light``.
+    light_u : float
+        Material number of light soft matter, less that of the rest; see ``fit.light_matter``.
     solid_number : callable or None
         Material numbers of solids by their attenuation in soft references; None where that does not tell them.
     """
@@ -80,6 +82,7 @@ class FitScene:
     tv_every: int
     smallest_scale: float
     pixel_rays: int = 1
+    light_u: float = 0.0
     solid_number: Callable[[np.ndarray], np.ndarray] | None = None
 
     def fine(self, views: DetectorViews) -> DetectorViews:

@@ -13,6 +13,7 @@ import torch
 
 from tomo_polysplat.fit.calibration import Calibration
 from tomo_polysplat.fit.checkpoint import Checkpoint
+from tomo_polysplat.fit.fat import fat_question
 from tomo_polysplat.fit.optimise import FitOutcome, OtherPhysics, fit
 from tomo_polysplat.fit.pixel_averaging import pixel_averaging
 from tomo_polysplat.fit.plan import Plan
@@ -104,6 +105,10 @@ class Solver:
     def _fit(self, prepared: PreparedFit, problem: Problem, ask_scatter: bool) -> FitOutcome:
         plan, scene, run_options = prepared.plan, prepared.scene, self.run_options
         settings = plan.adapted(run_options.settings)
+        questions = (
+            pixel_averaging(plan, prepared.gaussians, settings, problem.geometry.views),
+            fat_question(plan, problem, prepared.gaussians, settings),
+        )
         return fit(
             prepared.gaussians,
             plan.spacing * problem.voxel,
@@ -117,7 +122,7 @@ class Solver:
             volume=_volume_of(scene, plan, problem, self.flipped),
             callbacks=[lambda state: self.report(state.share, state.describe()), *run_options.callbacks],
             checkpoint=self.saved,
-            averaging=pixel_averaging(plan, prepared.gaussians, settings, problem.geometry.views),
+            questions=[one for one in questions if one is not None],
             look=self._scatter_search(prepared, problem) if ask_scatter else None,
         )
 

@@ -18,6 +18,8 @@ __all__ = ["one_torch_thread", "pick_device", "usual_modes"]
 def pick_device(name: str | torch.device) -> torch.device:
     """The device of a name: ``"auto"``, ``"cpu"``, ``"cuda"`` or ``"cuda:N"``.
 
+    A GPU has its index, as that of a tensor on it has: what is kept for one is found by the other.
+
     Raises
     ------
     ValueError
@@ -25,7 +27,7 @@ def pick_device(name: str | torch.device) -> torch.device:
     """
     known = "auto, cpu, cuda or cuda:N"
     if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         device = torch.device(name)
     except (RuntimeError, TypeError):
@@ -35,6 +37,8 @@ def pick_device(name: str | torch.device) -> torch.device:
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
         found = f"torch finds {torch.cuda.device_count()} CUDA devices"
         raise fail("device", "a device that is there", repr(name), f"{found}: use device='auto'")
+    if device.type == "cuda" and device.index is None:
+        return torch.device("cuda", torch.cuda.current_device())
     return device
 
 

@@ -24,8 +24,6 @@ __all__ = ["seed_gaussians"]
 
 # Attenuation, in soft references, that a seed in what looks like air starts from: from zero it would not grow.
 _LEAST = 0.02
-# Light soft matter, in soft references: adipose tissue has 0.80 of the attenuation of water at 60 kV and 0.92 at 140.
-_LIGHT = (0.65, 0.95)
 
 
 def seed_gaussians(
@@ -225,20 +223,13 @@ def _materials(
     """Material numbers of their own, of the groups, and the group of every seed.
 
     Group 0 is the soft matter away from anything dense; then comes one for every separate piece of metal. In
-    between, where the start cannot be trusted to tell what is what, every Gaussian has its own, and so has light matter
-    where ``settings.light_u`` says that it is something else.
+    between, where the start cannot be trusted to tell what is what, every Gaussian has its own.
     """
     group = torch.zeros(len(points), dtype=torch.int64, device=points.device)
     if not polychromatic:
         return torch.full_like(value, settings.soft_u), value.new_tensor([settings.soft_u]), group
     own = start_numbers(value, settings)
     group[reaches(start, points, grid, settings.bone_level, reach)] = -1
-    if settings.light_u:
-        # In means over three voxels an axis, against noise.
-        mean = box_mean(start, np.minimum(3, start.shape))[voxel_of(points, grid)]
-        light = (mean > _LIGHT[0]) & (mean < _LIGHT[1])
-        own = torch.where(light, settings.soft_u + settings.light_u, own)
-        group[light] = -1
     box, pieces, number = _pieces(_metal(start, settings))
     labels = torch.zeros(start.shape, dtype=torch.int64, device=start.device)
     labels[box] = torch.from_numpy(pieces.astype(np.int64)).to(start.device)

@@ -97,12 +97,12 @@ def _require_some_light(finite: np.ndarray) -> None:
 
 def _air(some: np.ndarray, span: float) -> float | None:
     """The value at both ends of the columns, where it is flat and the same beside the span of all; else None."""
-    known = np.isfinite(some).mean(axis=(0, 1)) > 0.5
-    if np.count_nonzero(known) < _FEWEST_COLUMNS:
+    (known,) = (np.isfinite(some).mean(axis=(0, 1)) > 0.5).nonzero()
+    if len(known) < _FEWEST_COLUMNS:
         return None
-    profile = np.nanmedian(some[..., known], axis=(0, 1))
-    width = max(2, int(_BORDER * len(profile)))
-    ends = np.concatenate([profile[:width], profile[-width:]]).astype(np.float64)
+    width = max(2, int(_BORDER * len(known)))
+    columns = np.concatenate([known[:width], known[-width:]])
+    ends = np.nanmedian(some[..., columns], axis=(0, 1)).astype(np.float64)
     air = float(np.median(ends))
     return air if float(np.ptp(ends)) <= _FLAT * max(span, abs(air)) else None
 

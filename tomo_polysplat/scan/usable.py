@@ -105,6 +105,11 @@ def _tell_left_out(counts: Mapping[str, int], used: int) -> None:
 
 def _take_out(values: np.ndarray, marked: np.ndarray | None) -> dict[str, int]:
     """Make every ray that is not to be used NaN; how many there were of each kind, and how many are used."""
+    names = ["rays_not_finite", *(["rays_marked_invalid"] if marked is not None else []), "rays_out_of_range"]
+    extreme = max(float(values.max()), -float(values.min())) if values.size else 0.0
+    if extreme <= _LARGEST_LOGARITHM and (marked is None or not marked.any()):
+        # As of most scans: NaN, too, would be no such extreme.
+        return dict.fromkeys(names, 0) | {"used": values.size}
     bad = ~np.isfinite(values)
     counts = {"rays_not_finite": int(np.count_nonzero(bad))}
     if marked is not None:

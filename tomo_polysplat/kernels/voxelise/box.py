@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 __all__ = ["VoxelBox"]
 
@@ -35,3 +36,11 @@ class VoxelBox:
         spacing = self.spacing / factor[::-1]
         shape = tuple(int(n * f) for n, f in zip(self.shape, factor))
         return VoxelBox(self.first - 0.5 * (self.spacing - spacing), spacing, shape)  # type: ignore[arg-type]
+
+    def voxels_of(self, points: torch.Tensor) -> torch.Tensor:
+        """(n, 3) indices (z, y, x) of the voxels that hold points (n, 3), or of the nearest ones."""
+        first, spacing, size = (
+            points.new_tensor(values) for values in (self.first, self.spacing, self.shape[::-1])
+        )
+        index = ((points - first) / spacing).round().clamp(min=0)
+        return torch.minimum(index, size - 1).long().flip(1)

@@ -1,0 +1,57 @@
+"""A run made both ways for a few passes over the views, where its rays are to say which one explains them."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+from tomo_polysplat.fit.fitter import Fitter
+from tomo_polysplat.fit.stopping import Clock
+
+__all__ = ["FEWEST_PASSES", "Fork", "Made", "Question", "fork", "passes_of_a_fork"]
+
+# A run of fewer passes is in a hurry.
+FEWEST_PASSES = 10.0
+# Passes of each way at least.
+_PASSES = 2
+
+# Errors of the fitted and of the held-out rays, and the pairs skipped.
+Made = tuple[float, float, int]
+
+
+class Question(Protocol):
+    """What a run is asked on the way; its plan gets the answer."""
+
+    def due(self, clock: Clock) -> bool:
+        """Whether it is to be asked now."""
+
+    def answered(self, fitter: Fitter, clock: Clock) -> tuple[Fitter, Made | None]:
+        """The fitter to go on with, some passes later, and what the last of them gave, if there were any."""
+
+
+@dataclass(frozen=True)
+class Fork:
+    """What both ways came to: that of the run as it was, and the other."""
+
+    late: bool
+    was: Made | None
+    other: Made | None
+
+
+def passes_of_a_fork(fitter: Fitter, passes: float, steps: int, most: float) -> int:
+    """Passes of each way that make so many steps, but for no more than a share ``most`` of the run's passes."""
+    return max(_PASSES, min(math.ceil(steps / fitter.steps_of_a_pass), round(most * passes)))
+
+
+def fork(fitter: Fitter, other: Fitter, clock: Clock, passes: int) -> Fork:
+    """Go both ways for so many passes; the clock goes on with the first, and late is who had no time for the second."""
+    its_clock = copy.copy(clock)
+    made = [fitter.ahead(clock, passes), other.ahead(its_clock, passes)]
+    return Fork(its_clock.late, *(_last(some) for some in made))
+
+
+def _last(made: list[Made]) -> Made | None:
+    """The errors of the last pass, and the pairs skipped in all."""
+    return (*made[-1][:2], sum(skipped for _, _, skipped in made)) if made else None
