@@ -60,6 +60,7 @@ def gpu_without_compiler(monkeypatch):
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     monkeypatch.setattr(select, "_self_check", broken)
 
 
@@ -72,7 +73,8 @@ def test_a_gpu_without_compiled_kernels_is_refused_before_the_work(gpu_without_c
 def test_auto_is_the_cpu_where_the_gpu_has_no_compiled_kernels(gpu_without_compiler, caplog):
     assert select.pick_fast_device("auto") == CPU
     assert "no C compiler" in caplog.text
-    assert select.pick_fast_device("cuda") == torch.device("cuda")
+    # With its index, as tensors on it have theirs.
+    assert select.pick_fast_device("cuda") == torch.device("cuda", 0)
 
 
 def test_a_self_check_that_gives_nan_is_a_failure(monkeypatch):
