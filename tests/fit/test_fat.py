@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 import tomo_polysplat as tps
 from tomo_polysplat.fit import fat
@@ -78,6 +79,8 @@ def test_the_loser_leaves_no_trace_of_itself(pancreas, small, monkeypatch):
     told, wanted = reconstruct(pancreas), reconstruct(pancreas, {"light": "soft"})
     assert told.plan["light"].startswith("less dense soft matter: as fat it leaves +")
     assert wanted.plan["light"] == "soft: asked for"
+    assert told.plan["alternatives"]["light"].startswith("soft or fat: ")
+    assert "light" not in wanted.plan["alternatives"]
     assert np.array_equal(told.volume, wanted.volume)
 
 
@@ -95,7 +98,7 @@ def test_fat_goes_on_as_fat(pancreas, small, monkeypatch):
 
 
 def test_less_than_two_standard_errors_is_no_answer(pancreas, small, monkeypatch):
-    """Of 41 views, whose differences deviate by 0.7 %."""
+    """Of views whose differences deviate by 0.7 %."""
     answer_with(monkeypatch, 0.001)
     assert reconstruct(pancreas).plan["light"].startswith("less dense soft matter: as fat it leaves -")
 
@@ -105,6 +108,7 @@ def test_less_than_two_standard_errors_is_no_answer(pancreas, small, monkeypatch
     [
         ({}, {}, "fewer than 48 voxels"),
         ({"curves": 1}, {}, "one material curve"),
+        ({"light_u": 0.0}, {}, "that of other soft matter"),
         ({"soft_u": 0.1}, {}, "from water only"),
         ({}, {"materials": ("pmma", "cortical_bone", "iron")}, "from water only"),
         ({"passes": 9.0}, {}, "in so few passes"),
@@ -115,6 +119,10 @@ def test_nobody_asks_where_it_cannot_be_told(pancreas, monkeypatch, settings, op
         monkeypatch.setattr(fat, "_FEWEST_VOXELS", 10)
     told = reconstruct(pancreas, settings, **options).plan["light"]
     assert told.startswith("less dense soft matter, not asked: ") and words in told
+
+
+def test_fat_of_one_energy_is_of_no_effect(pancreas):
+    assert "of no effect" in reconstruct(pancreas, {"light": "fat"}, spectrum=None).plan["light"]
 
 
 def test_neither_slices_nor_few_views_are_asked(small):
@@ -130,7 +138,7 @@ def test_little_light_matter_is_left_alone(small):
 
 
 def question(passes=15.0):
-    return FatQuestion(SimpleNamespace(fat=None, reasons={}, passes=passes), -0.056)
+    return FatQuestion(SimpleNamespace(fat=None, reasons={}, passes=passes, soft_u=0.0), -0.056)
 
 
 def test_it_is_due_once_in_the_middle_of_a_run():
@@ -143,8 +151,9 @@ def test_it_is_due_once_in_the_middle_of_a_run():
 
 
 def fake_fitter(ahead, steps=30):
-    other = SimpleNamespace(ahead=ahead, gaussians=None, scene=None, settings=None)
-    return SimpleNamespace(ahead=ahead, branch=lambda light_u: other, steps_of_a_pass=steps)
+    other = SimpleNamespace(ahead=ahead, gaussians=None, scene=None)
+    cloud = SimpleNamespace(shared_material=torch.zeros(1))
+    return SimpleNamespace(ahead=ahead, branch=lambda light_u: other, steps_of_a_pass=steps, gaussians=cloud)
 
 
 @pytest.fixture
@@ -176,6 +185,23 @@ def test_a_budget_that_the_fit_needs_is_not_spent_on_it(much_light):
     fitter = fake_fitter(ahead)
     assert one.answered(fitter, clock) == (fitter, None)
     assert one.plan.fat is False and "kept for the fit" in one.plan.reasons["light"]
+
+
+def test_soft_matter_that_is_no_water_is_not_asked(much_light):
+    one, fitter = question(), fake_fitter(None)
+    fitter.gaussians.shared_material -= 0.06
+    assert one.answered(fitter, Clock(10, None)) == (fitter, None)
+    assert one.plan.fat is False and "number of its own" in one.plan.reasons["light"]
+
+
+def test_a_gpu_without_room_for_another_cloud_goes_on_without_asking(much_light):
+    def full(light_u):
+        raise torch.OutOfMemoryError("no room")
+
+    one, fitter = question(), fake_fitter(None)
+    fitter.branch = full
+    assert one.answered(fitter, Clock(10, None)) == (fitter, None)
+    assert one.plan.fat is False and one.plan.reasons["light"].endswith("not asked: no room")
 
 
 @pytest.mark.parametrize(("steps", "passes"), [(90, 2), (50, 2), (30, 4), (1, 4)])

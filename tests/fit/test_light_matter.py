@@ -9,7 +9,6 @@ from small_clouds import blocks
 
 from tomo_polysplat.fit.light_matter import light_gaussians, tell_light
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.settings import Settings
 
 CURVE = torch.ones(3)
 FAT = -0.056
@@ -56,19 +55,22 @@ def test_one_noisy_voxel_makes_nothing_light():
 def test_a_gaussian_gets_the_number_and_gives_it_back_when_its_place_is_light_no_longer():
     gaussians, scene, block, _ = of_levels([1.0, 0.8, 20.0])
     light = light_gaussians(gaussians, scene)
-    tell_light(gaussians, scene, Settings(), 0.1)
+    tell_light(gaussians, scene, 0.1)
     assert (gaussians.own_material[light] == np.float32(FAT)).all() and (gaussians.group[light] == -1).all()
     assert torch.equal(gaussians.group[~light], (block == 2)[~light].long())
     gaussians.own_material[light] += 0.01
     gaussians.attenuation[block == 1] = 1.0
-    tell_light(gaussians, scene, Settings(), 0.2)
+    tell_light(gaussians, scene, 0.2)
     assert (gaussians.own_material[light] == 0).all()
 
 
-def test_a_number_of_its_own_that_is_not_fats_stays():
+@pytest.mark.parametrize("soft", [0.0, -0.08, 0.1])
+def test_a_number_of_its_own_that_is_not_fats_stays(soft):
+    """Wherever soft matter has come to."""
     gaussians, scene, block, _ = of_levels([1.0, 0.8, 20.0])
+    gaussians.shared_material[0] = soft
     gaussians.group[block == 0], gaussians.own_material[block == 0] = -1, 0.3
-    tell_light(gaussians, scene, Settings(), 0.1)
+    tell_light(gaussians, scene, 0.1)
     assert (gaussians.own_material[block == 0] == np.float32(0.3)).all()
 
 
@@ -78,6 +80,6 @@ def test_a_number_of_its_own_that_is_not_fats_stays():
 def test_nothing_is_told_where_it_is_soft_matter_late_and_of_one_curve(changes, share):
     gaussians, scene, *_ = of_levels([1.0, 0.8, 20.0])
     before = gaussians.copy()
-    tell_light(gaussians, replace(scene, **changes), Settings(), share)
+    tell_light(gaussians, replace(scene, **changes), share)
     assert torch.equal(gaussians.own_material, before.own_material)
     assert torch.equal(gaussians.group, before.group)

@@ -121,7 +121,7 @@ class Fitter:
         if self.gaussians.finite():
             flatten(self.gaussians, self.scene, self.settings, share)
             number_metals(self.gaussians, self.scene, self.settings, share)
-            tell_light(self.gaussians, self.scene, self.settings, share)
+            tell_light(self.gaussians, self.scene, share)
         return self.step.read()
 
     def snapshot(self, best: Gaussians | None, numbers: dict[str, Any]) -> Snapshot:

@@ -12,7 +12,6 @@ import torch
 
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
-from tomo_polysplat.settings import Settings
 
 __all__ = ["light_gaussians", "tell_light"]
 
@@ -23,7 +22,7 @@ _UNTIL = 0.8
 
 
 @torch.no_grad()
-def tell_light(gaussians: Gaussians, scene: FitScene, settings: Settings, share: float) -> None:
+def tell_light(gaussians: Gaussians, scene: FitScene, share: float) -> None:
     """Give the Gaussians in light matter its number, and those no longer in it the soft one.
 
     Parameters
@@ -32,7 +31,6 @@ def tell_light(gaussians: Gaussians, scene: FitScene, settings: Settings, share:
         Changed in place.
     scene : FitScene
         With no ``light_u`` nothing is done.
-    settings : Settings
     share : float
         Of the run that is done.
     """
@@ -40,9 +38,9 @@ def tell_light(gaussians: Gaussians, scene: FitScene, settings: Settings, share:
         return
     light, own = light_gaussians(gaussians, scene), gaussians.own_material
     soft = gaussians.shared_material[0]
-    number = max(settings.soft_u + scene.light_u, scene.least_u)
+    number = (soft + scene.light_u).clamp(min=scene.least_u)
     # A free number moves less in a run than the two are apart.
-    told = (gaussians.group < 0) & ((own - number).abs() < (own - soft).abs())
+    told = (gaussians.group < 0) & ((own - number).abs() < 0.5 * (number - soft).abs())
     own.copy_(torch.where(light & ~told, number, torch.where(told & ~light, soft, own)))
     gaussians.group[light] = -1
 

@@ -184,12 +184,20 @@ def fit(
         return FitOutcome(gaussians, reason="nothing to fit: the start volume is empty")
     batch = min(views_per_step, len(rays.views))
     steps = max(1, math.ceil(settings.passes * views_of_a_pass(rays) / batch))
-    fitter = Fitter(gaussians, spacing, rays, scene, settings, batch, steps, rng)
-    # From now on: what compiling or recording the step took is no part of the run that the learning rates follow.
-    clock = Clock(steps, deadline)
     outcome = FitOutcome(gaussians)
     watch: Watch[Gaussians] = Watch(patience_of(settings, settings.passes))
-    run = _Run(fitter, outcome, watch, clock, started, checkpoint, questions, look)
+    # Nobody else holds the fitter, which makes room for another one where a question is answered by that.
+    run = _Run(
+        Fitter(gaussians, spacing, rays, scene, settings, batch, steps, rng),
+        outcome,
+        watch,
+        # From now on: what compiling or recording the step took is no part of the run that the learning rates follow.
+        clock := Clock(steps, deadline),
+        started,
+        checkpoint,
+        questions,
+        look,
+    )
     run.restore()
     try:
         if not outcome.reason:

@@ -57,8 +57,6 @@ def alternatives(plan: Plan, problem: Problem, settings: Settings, gaussians: in
     if plan.blurred:
         rays = "twice" if problem.planar else "four times"
         told["pixel_rays"] = f"1 or 2: not asked in the middle of the run; with 2 {rays} the pairs"
-    if plan.fat is None and not problem.planar:
-        told["light"] = "soft or fat: not asked in the middle of the run, which takes up to a tenth of it"
     if plan.views_per_step > 1:
         fewer = plan.views_per_step // 2
         told["views_per_step"] = (

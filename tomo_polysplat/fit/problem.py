@@ -297,8 +297,10 @@ class Problem:
         plan.reasons["work"] = work(plan, self, settings, len(gaussians))
         plan.reasons["alternatives"] = alternatives(plan, self, settings, len(gaussians))
         values = self.measured(device)
-        # While it is asked whether pixels average light there are two runs at once, of thin rays and of averaged ones.
-        runs, rays = (1, plan.pixel_rays**2) if plan.pixel_rays else (2, 1 + AVERAGED_RAYS**2)
+        # While it is asked whether pixels average light there are two runs at once, of thin rays and of averaged ones;
+        # while it is asked whether light matter is fat, two of the same.
+        runs = 1 if plan.pixel_rays and plan.fat is not None else 2
+        rays = runs * plan.pixel_rays**2 if plan.pixel_rays else 1 + AVERAGED_RAYS**2
         plan.reasons["memory"] = require_room(
             device,
             gaussians=runs * len(gaussians),
