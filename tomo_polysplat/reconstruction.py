@@ -27,6 +27,7 @@ from tomo_polysplat.physics.detector_blur import describe_blur
 from tomo_polysplat.physics.spectrum import Spectrum, require_spectrum
 from tomo_polysplat.physics.water_correction import describe_polynomial
 from tomo_polysplat.progress import progress_reports
+from tomo_polysplat.result.provenance import provenance
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import VolumeGrid, from_astra, is_planar_geometry
 from tomo_polysplat.scan.usable import usable_rays
@@ -164,6 +165,7 @@ def reconstruct(
                 flipped_2d=flipped,
                 counts=counts | outcome.counts(),
                 settings=run_options.settings.to_dict() | {"seed": run_options.seed, "quality": quality},
+                provenance=provenance(geometry, grid, unit, spectrum, run_options.device),
             )
     result.plan["stop"] = outcome.reason + (", then interrupted" if interruption.asked else "")
     result.seconds = time.perf_counter() - started

@@ -110,6 +110,7 @@ def test_the_page_stands_alone(tmp_path, flat):
         energy_kev=42.0,
         plan={"channels": {"value": 1, "reason": "<no spectrum> & none wanted"}},
         settings={"passes": 3.0},
+        provenance={"scan": "wrist <left>", "device": "CPU"},
         history=[{"seconds": 1.0, "loss": 0.1, "held_out": 0.2}],
         flipped_2d=flat,
     )
@@ -122,6 +123,7 @@ def test_the_page_stands_alone(tmp_path, flat):
     assert links.tags.count("img") == 2 and all(s.startswith("data:image/png;base64,") for s in links.sources)
     assert not {"script", "link", "iframe"} & set(links.tags)
     assert "&lt;no spectrum&gt; &amp; none wanted" in page and "<no spectrum>" not in page
+    assert "<title>tomo-polysplat reconstruction of wrist &lt;left&gt;</title>" in page
     assert "26.0" in page, "20 log10(0.2 / 0.01) dB against the truth"
     assert "All slices are shown from 0 to 0.22 1/cm" in page
 

@@ -36,6 +36,7 @@ def polychromatic(u=0.3, density=1.7, **changes):
         "plan": {"channels": {"value": 3, "reason": "a spectrum is given"}},
         "counts": {"masked_rays": np.int64(4)},
         "settings": {"passes": 2.0},
+        "provenance": {"geometry": "cone beam, 9 views"},
         "seconds": 1.25,
     }
     return Result(**(content | changes))
@@ -129,7 +130,17 @@ def test_everything_comes_back_from_a_file(tmp_path, flat):
     np.testing.assert_array_equal(back.basis, result.basis)
     for name, values in result.gaussians.items():
         np.testing.assert_array_equal(back.gaussians[name], values, err_msg=name)
-    for name in ("unit", "energy_kev", "materials", "spectrum", "plan", "settings", "seconds", "flipped_2d"):
+    for name in (
+        "unit",
+        "energy_kev",
+        "materials",
+        "spectrum",
+        "plan",
+        "settings",
+        "provenance",
+        "seconds",
+        "flipped_2d",
+    ):
         assert getattr(back, name) == getattr(result, name), name
     assert back.history == [{"seconds": 0.5, "iteration": 3, "loss": 0.25, "held_out": None}]
     assert back.counts == {"masked_rays": 4}

@@ -124,6 +124,7 @@ def run(arguments: argparse.Namespace) -> int:
     with postponed_interrupts("writing") as interruption:
         if arguments.energy is not None:
             result = replace(result, energy_kev=arguments.energy)
+        result.provenance = {"scan": scan.name} | result.provenance
         print(result)
         _write(result, scan, arguments)
     interrupted = interruption.asked or "interrupted" in result.plan.get("stop", "")
@@ -218,7 +219,8 @@ def _write(result: Result, scan: Scan, arguments: argparse.Namespace) -> None:
     if errors is not None:
         print(as_text([errors], result.unit))
     if arguments.json is not None:
-        about = {name: getattr(result, name) for name in ("unit", "energy_kev", "seconds", "plan", "counts")}
+        names = ("unit", "energy_kev", "seconds", "plan", "counts", "provenance")
+        about = {name: getattr(result, name) for name in names}
         write_json(arguments.json, about | {"scan": arguments.scan, "errors": errors}, overwrite=overwrite)
         print(f"wrote {arguments.json}")
 

@@ -62,9 +62,9 @@ def write_report(
     volume = _spatial(result, result.volume)
     true = None if truth is None else _spatial(result, truth)
     metal = None if metal_mask is None else _spatial(result, metal_mask).astype(bool)
-    title = "tomo-polysplat reconstruction"
+    title = f"tomo-polysplat reconstruction{_of_what(result)}"
     body = [
-        f"<h1>{title}</h1>",
+        f"<h1>{html.escape(title)}</h1>",
         f'<p class="note">{html.escape(repr(result))}</p>',
         *_slices(result, volume, true, metal),
         *_errors(result, volume, true, metal),
@@ -73,6 +73,7 @@ def write_report(
         *_section("What was modelled and why", result.plan),
         *_section("Left out or limited", result.counts),
         *_section("Settings", result.settings),
+        *_section("Made from and with", result.provenance),
     ]
     write_text(path, page(title, body), overwrite=overwrite)
 
@@ -80,6 +81,12 @@ def write_report(
 def page(title: str, body: Sequence[str]) -> str:
     """A whole page of these parts, which are HTML."""
     return PAGE.format(title=html.escape(title), body="\n".join(body), ink=INK, accent=ACCENT, quiet=QUIET)
+
+
+def _of_what(result: Result) -> str:
+    """The scan's name, where somebody has told it."""
+    name = result.provenance.get("scan")
+    return f" of {name}" if name else ""
 
 
 def image(png: bytes, description: str) -> str:

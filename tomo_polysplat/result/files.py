@@ -3,8 +3,8 @@
 The HDF5 file follows Data Exchange: ``/exchange/data`` (z, y, x) is the volume, with attributes ``unit``,
 ``energy_kev``, ``voxel_size`` and ``origin`` (x, y, z; the centre of the first voxel). What everything else
 is computed from stands in ``/polysplat``: ``basis``, ``gaussians``, ``spectrum``, and as JSON text
-``history``, ``plan``, ``counts``, ``settings`` and ``materials``. y ascends with the index, also after a 2D
-scan.
+``history``, ``plan``, ``counts``, ``settings``, ``provenance`` and ``materials``. y ascends with the index, also
+after a 2D scan.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from tomo_polysplat.units import LENGTH_UNITS
 __all__ = ["load_hdf5", "plain", "require_slices_folder", "save_hdf5", "save_npy", "save_tiff"]
 
 FORMAT = 1
-JSON_PARTS = ("history", "plan", "counts", "settings")
+JSON_PARTS = ("history", "plan", "counts", "settings", "provenance")
 
 
 def plain(value: Any) -> Any:
@@ -141,7 +141,7 @@ def _read_materials(group: Any) -> Materials | None:
 
 
 def _read_parts(group: Any) -> dict[str, Any]:
-    """History, plan, counts and settings, of the types that a result has them in."""
+    """History, plan and so on, of the types that a result has them in."""
     parts = {name: read_json(group, name, [] if name == "history" else {}) for name in JSON_PARTS}
     for name, content in parts.items():
         good = isinstance(content, list) if name == "history" else isinstance(content, dict)

@@ -49,6 +49,8 @@ class Result:
         ``seconds``, ``iteration``, ``loss``, ``held_out``, ``gaussians``, ``stage``: speed against error.
     plan, counts, settings : dict
         What was modelled and why; how many rays or Gaussians were masked, skipped or clamped; every tunable.
+    provenance : dict
+        Words on what it was made from and with: scanner, volume, spectrum, device and software.
     seconds : float
         Time that the reconstruction took.
     flipped_2d : bool
@@ -66,6 +68,7 @@ class Result:
     plan: dict[str, Any] = field(default_factory=dict)
     counts: dict[str, Any] = field(default_factory=dict)
     settings: dict[str, Any] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)
     seconds: float = 0.0
     flipped_2d: bool = False
 
@@ -227,7 +230,8 @@ class Result:
         metal_mask: np.ndarray | None = None,
         overwrite: bool = False,
     ) -> None:
-        """Write one self-contained HTML page: slices, speed against error, the plan and the settings.
+        """Write one self-contained HTML page: slices, speed against error, the plan, the
+        settings, and what it was made from and with.
 
         Parameters
         ----------
