@@ -6,16 +6,13 @@ import zipfile
 
 import numpy as np
 import pytest
+from killed_runs import Killed
 from small_scans import QUICK, cone, fan, reconstruct
 
 from tomo_polysplat.fit.checkpoint import Checkpoint
 
 # Relocation falls between the passes, metals are freed after two of five, and the state changes in all its parts.
 LONG = QUICK | {"passes": 5.0, "relocate_until": 1.0}
-
-
-class Killed(Exception):
-    """What no part of the package catches, as it catches no SIGKILL."""
 
 
 def killed_after(passes, scan, path, **options):

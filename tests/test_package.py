@@ -12,7 +12,17 @@ import tomo_polysplat
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "tomo_polysplat"
-BASICS = ("checks", "parallel", "files", "units", "settings", "progress", "interrupts", "transfer")
+BASICS = (
+    "checks",
+    "parallel",
+    "versions",
+    "files",
+    "units",
+    "settings",
+    "progress",
+    "interrupts",
+    "transfer",
+)
 LAYERS = (
     BASICS,
     ("kernels",),

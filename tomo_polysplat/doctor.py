@@ -7,12 +7,12 @@ import platform
 import shutil
 import subprocess
 import time
-from importlib import metadata
 from importlib.util import find_spec
 
 import tomo_polysplat
 from tomo_polysplat.files import available_memory
 from tomo_polysplat.parallel import cpu_threads
+from tomo_polysplat.versions import installed_version
 
 __all__ = ["findings", "self_test"]
 
@@ -88,15 +88,10 @@ def self_test() -> tuple[bool, str]:
     return ours > standard, f"24^3 voxels: {ours:.1f} dB, FDK {standard:.1f} dB, {seconds:.1f} s in all"
 
 
-def _version(name: str) -> str:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return ""
-
-
 def _packages() -> Lines:
-    lines = [(name, _version(name) or f"not installed {hint}".rstrip()) for name, hint in PACKAGES.items()]
+    lines = [
+        (name, installed_version(name) or f"not installed {hint}".rstrip()) for name, hint in PACKAGES.items()
+    ]
     return [*lines, ("tomopy", _tomopy()), ("dxchange", _dxchange())]
 
 
@@ -107,7 +102,7 @@ def _tomopy() -> str:
         importlib.import_module("tomopy")
     except Exception as error:  # its compiled libraries may be missing, or want another NumPy
         return f"cannot be imported ({error}); {TOMOPY_SOURCE}"
-    return _version("tomopy") or "installed"
+    return installed_version("tomopy") or "installed"
 
 
 def _dxchange() -> str:
@@ -119,7 +114,7 @@ def _dxchange() -> str:
     except Exception as error:  # a stranger's module may fail in any way when imported
         return f"cannot be imported ({error})"
     if hasattr(module, "read_aps_tomoscan_hdf5"):
-        return _version("dxchange") or "installed"
+        return installed_version("dxchange") or "installed"
     return f"an unrelated package of that name; remove it ({DXCHANGE_SOURCE})"
 
 

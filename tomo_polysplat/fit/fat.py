@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.fit.fitter import Fitter
-from tomo_polysplat.fit.fork import FEWEST_PASSES, Made, fork, passes_of_a_fork
+from tomo_polysplat.fit.fork import Made, fork, passes_of_a_fork, why_no_fork
 from tomo_polysplat.fit.light_matter import light_gaussians, tell_light
 from tomo_polysplat.fit.loss import misfit
 from tomo_polysplat.fit.plan import Plan
@@ -26,7 +26,6 @@ from tomo_polysplat.fit.stopping import Clock
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.settings import Settings
-from tomo_polysplat.start.initial import FEW_VIEWS
 
 __all__ = ["FatQuestion", "fat_question"]
 
@@ -44,7 +43,6 @@ _FEWEST_VOXELS = 48
 _MOVED = 0.01
 # So many times its standard error, over the views, the misfit must be less as fat.
 _CERTAIN = 2.0
-
 
 _ONE_CURVE = "there is one material curve"
 
@@ -132,11 +130,7 @@ def _why_not(plan: Plan, problem: Problem, gaussians: Gaussians, settings: Setti
         return "fat is told from water only"
     if problem.planar or max(problem.grid.shape) < _FEWEST_VOXELS:
         return f"slices, and volumes of fewer than {_FEWEST_VOXELS} voxels along an edge, do not tell"
-    if plan.passes < FEWEST_PASSES:
-        return "in so few passes more of them would take too long a part"
-    if problem.geometry.views < FEW_VIEWS:
-        return f"fewer than {FEW_VIEWS} views do not tell"
-    return ""
+    return why_no_fork(plan.passes, problem.geometry.views)
 
 
 def _taken_for_soft(plan: Plan, why: str) -> None:

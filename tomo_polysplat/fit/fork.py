@@ -9,8 +9,9 @@ from typing import Protocol
 
 from tomo_polysplat.fit.fitter import Fitter
 from tomo_polysplat.fit.stopping import Clock
+from tomo_polysplat.start.initial import FEW_VIEWS
 
-__all__ = ["FEWEST_PASSES", "Fork", "Made", "Question", "fork", "passes_of_a_fork"]
+__all__ = ["FEWEST_PASSES", "Fork", "Made", "Question", "fork", "passes_of_a_fork", "why_no_fork"]
 
 # A run of fewer passes is in a hurry.
 FEWEST_PASSES = 10.0
@@ -38,6 +39,15 @@ class Fork:
     late: bool
     was: Made | None
     other: Made | None
+
+
+def why_no_fork(passes: float, views: int) -> str:
+    """Why a run of so many passes over so many views is asked nothing, if so."""
+    if passes < FEWEST_PASSES:
+        return "in so few passes more of them would take too long a part"
+    if views < FEW_VIEWS:
+        return f"fewer than {FEW_VIEWS} views do not tell"
+    return ""
 
 
 def passes_of_a_fork(fitter: Fitter, passes: float, steps: int, most: float) -> int:

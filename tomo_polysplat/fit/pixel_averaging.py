@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 
 from tomo_polysplat.fit.fitter import Fitter
-from tomo_polysplat.fit.fork import FEWEST_PASSES, Made, fork, passes_of_a_fork
+from tomo_polysplat.fit.fork import Made, fork, passes_of_a_fork, why_no_fork
 from tomo_polysplat.fit.loss import misfit
 from tomo_polysplat.fit.plan import AVERAGED_RAYS, Plan
 from tomo_polysplat.fit.rays import batches_around
@@ -23,7 +23,6 @@ from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.render.renderer import project_gaussians
 from tomo_polysplat.settings import Settings
-from tomo_polysplat.start.initial import FEW_VIEWS
 
 __all__ = ["PixelAveraging", "pixel_averaging"]
 
@@ -111,11 +110,7 @@ def _why_not(plan: Plan, gaussians: Gaussians, views: int) -> str:
     """Why it is not asked, if so."""
     if not bool((gaussians.group > 0).any()):
         return "without metal it matters little"
-    if plan.passes < FEWEST_PASSES:
-        return "in so few passes more of them would take too long a part"
-    if views < FEW_VIEWS:
-        return f"fewer than {FEW_VIEWS} views do not tell"
-    return ""
+    return why_no_fork(plan.passes, views)
 
 
 @torch.no_grad()

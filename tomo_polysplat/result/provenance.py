@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from importlib import metadata
 
 import numpy as np
 import torch
@@ -11,6 +10,7 @@ import torch
 import tomo_polysplat
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.versions import installed_version
 
 __all__ = ["provenance"]
 
@@ -60,10 +60,5 @@ def _lengths(lengths: Iterable[float], unit: str) -> str:
 
 
 def _versions() -> list[str]:
-    found = []
-    for name in _PACKAGES:
-        try:
-            found.append(f"{name} {metadata.version(name)}")
-        except metadata.PackageNotFoundError:
-            continue
-    return found
+    found = ((name, installed_version(name)) for name in _PACKAGES)
+    return [f"{name} {version}" for name, version in found if version]
