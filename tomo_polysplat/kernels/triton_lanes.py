@@ -16,16 +16,18 @@ __all__ = [
     "SUMS",
     "add_four",
     "add_halves",
+    "add_within",
     "adds_four",
     "by_size",
     "from_lane",
     "lane_set",
     "load_four",
     "lowest_lane",
+    "next_lane",
+    "odd_ranks",
     "share_out",
     "store_four",
     "store_sums",
-    "two_lowest",
     "widest",
 ]
 
@@ -228,12 +230,44 @@ def lowest_lane(lanes):
 
 
 @triton.jit
-def two_lowest(lanes, upper, cut):
-    """The lowest bit of ``lanes`` for half of a warp, the next for the ``upper`` half, and the bits left.
+def odd_ranks(lanes):
+    """Every other bit that is set in ``lanes``: the lowest, the third lowest and so on."""
+    # Each bit becomes the parity of how many are set up to it.
+    odd = lanes ^ (lanes << 1)
+    odd ^= odd << 2
+    odd ^= odd << 4
+    odd ^= odd << 8
+    odd ^= odd << 16
+    return lanes & odd
 
-    With each comes ``cut``; where there is no second, the upper half has the first again, and -1 for a cut,
-    so that it adds nothing.
-    """
-    rest = lanes & (lanes - 1)
-    which = tl.where(upper & (rest != 0), lowest_lane(rest), lowest_lane(lanes))
-    return which, tl.where(upper & (rest == 0), -1.0, cut), rest & (rest - 1)
+
+@triton.jit
+def next_lane(lanes, cut):
+    """The lowest bit set in each of ``lanes`` with ``cut``, and the bits left; 0 and -1, below any q, where none is."""
+    lowest = lanes & -lanes
+    which = tl.maximum(lowest_lane(lowest), 0)
+    return which, tl.where(lanes != 0, cut, -1.0), lanes ^ lowest
+
+
+@triton.jit
+def add_where(total, q, cut, value, weight):
+    """``total``, with ``weight`` times ``value`` where ``q`` is no more than ``cut``: a product under a condition."""
+    if _INTERPRETED:
+        return tl.where(q <= cut, total + weight * value, total)
+    return tl.inline_asm_elementwise(
+        "{ .reg .pred p; setp.le.f32 p, $2, $3; mov.f32 $0, $1; @p fma.rn.f32 $0, $4, $5, $0; }",
+        "=&f,f,f,f,f,f", [total, q, cut, value, weight], dtype=tl.float32, is_pure=True, pack=1,
+    )  # fmt: skip
+
+
+@triton.jit
+def add_within(a0, a1, a2, a3, q, cut, value, w0, w1, w2, w3, CHANNELS: tl.constexpr):
+    """The sums of each channel, with its weight times ``value`` where ``q`` is no more than ``cut``."""
+    a0 = add_where(a0, q, cut, value, w0)
+    if CHANNELS > 1:
+        a1 = add_where(a1, q, cut, value, w1)
+    if CHANNELS > 2:
+        a2 = add_where(a2, q, cut, value, w2)
+    if CHANNELS > 3:
+        a3 = add_where(a3, q, cut, value, w3)
+    return a0, a1, a2, a3

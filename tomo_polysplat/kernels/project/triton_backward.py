@@ -51,15 +51,15 @@ def _pixel_moments_kernel(
     # What the warp does at a time takes as long as the largest footprint: like ones together.
     group, part = tl.program_id(0) // parts, tl.program_id(0) % parts
     own = tl.minimum(group * 32 + lane, count - 1).to(tl.int64) * RECORD
-    order = by_size(tl.load(record + own + 6) * tl.load(record + own + 9), lane)
+    order = by_size(tl.load(record + own + 17) * tl.load(record + own + 15), lane)
     for turn in range(part, 2, parts):
         n = group * 32 + from_lane(order, turn * 16 + lane // 2)
         at = record + tl.minimum(n, count - 1).to(tl.int64) * RECORD
         column0, row0, r11, r12 = load_four(at)
-        r22, yc, ry, xc = load_four(at + 4)
-        m, hx, lx, ly = load_four(at + 8)
-        lxx, lxy, lyy, unit = load_four(at + 12)
-        w0, w1, w2, w3 = load_four(at + 16)
+        r22, lt, lu, ltt = load_four(at + 4)
+        ltu, luu, w0, w1 = load_four(at + 8)
+        w2, w3, unit, hx = load_four(at + 12)
+        yc, ry, xc, m = load_four(at + 16)
         h_sum, ht, hu, htt, htu, huu = zero, zero, zero, zero, zero, zero
         k, kt, ku, ktt, ktu, kuu = zero, zero, zero, zero, zero, zero
         c0, c1, c2, c3 = zero, zero, zero, zero
@@ -90,10 +90,8 @@ def _pixel_moments_kernel(
             x = (first - middle) + across.to(tl.float32)
             pixel = (tl.minimum(block, last_block) * columns + first.to(tl.int32) + across) * BLOCK_H + down
             pixel = grad + pixel.to(tl.int64) * SPREAD
-            middle -= column0
-            shift = r11 * middle + r12 * y
-            l0, l1 = 1.0 + y * (ly + lyy * y), lx + lxy * y
-            l0, l1 = l0 + middle * (l1 + lxx * middle), l1 + 2.0 * lxx * middle
+            shift = r11 * (middle - column0) + r12 * y
+            l0, l1 = 1.0 + u * (lu + luu * u), lt + ltu * u
             block += 1
             offset += BLOCK_H
             h0, h1, k0, k1 = zero, zero, zero, zero
@@ -108,7 +106,7 @@ def _pixel_moments_kernel(
                 inside = tl.abs(x) <= half
                 if CONE:
                     # Far from a needle's footprint rounding can make l negative: no root is used there.
-                    root = tl.where(inside, tl.math.rsqrt(tl.abs(l0 + x * (l1 + lxx * x))), 0.0)
+                    root = tl.where(inside, tl.math.rsqrt(tl.abs(l0 + t * (l1 + ltt * t))), 0.0)
                     inverse = root * root
                     q *= inverse
                     value = tl.exp2(-1.0 * q) * root

@@ -17,11 +17,13 @@ from tomo_polysplat.kernels.project.triton_image import spread
 from tomo_polysplat.kernels.project.triton_setup import RECORD
 from tomo_polysplat.kernels.triton_lanes import (
     add_four,
+    add_within,
     adds_four,
     lane_set,
     load_four,
+    next_lane,
+    odd_ranks,
     share_out,
-    two_lowest,
 )
 from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, SIZES, grain, grained, on_device
 from tomo_polysplat.kernels.views import DetectorViews
@@ -40,14 +42,14 @@ def _outlines(record, group, count, GROUP: tl.constexpr):
     """yc, ry (-1 where there is no outline), xc, m, hx of a group's outlines; see triton_setup."""
     n = group * GROUP + tl.arange(0, GROUP)
     at = record + tl.minimum(n, count - 1).to(tl.int64) * RECORD
-    _, yc, ry, xc = load_four(at + 4)
-    m, hx, _, _ = load_four(at + 8)
+    yc, ry, xc, m = load_four(at + 16)
+    hx = tl.load(at + 15)
     return yc, tl.where(n < count, ry, -1.0), xc, m, hx
 
 
 @triton.jit
 def _columns(yc, by_ry, ry, xc, m, hx, ahead, top, bottom, columns):
-    """First and last column that the outlines reach between two rows; none (last < first) where they do not."""
+    """First and last column that the outlines reach between two rows; the last is -1 where they reach none."""
     low, high = tl.maximum(top - yc, -ry), tl.minimum(bottom - yc, ry)
     y_right, y_left = tl.minimum(tl.maximum(ahead, low), high), tl.minimum(tl.maximum(-ahead, low), high)
     u_right, u_left = y_right * by_ry, y_left * by_ry
@@ -56,58 +58,58 @@ def _columns(yc, by_ry, ry, xc, m, hx, ahead, top, bottom, columns):
     there = (low <= high) & (ry > 0)
     left = tl.where(there, tl.minimum(tl.maximum(left, 0.0), columns + 0.0), columns + 0.0)
     right = tl.where(there, tl.minimum(tl.maximum(right, -1.0), columns - 1.0), -1.0)
-    return tl.math.ceil(left).to(tl.int32), tl.math.floor(right).to(tl.int32)
+    first, last = tl.math.ceil(left).to(tl.int32), tl.math.floor(right).to(tl.int32)
+    return first, tl.where(first <= last, last, -1)
 
 
 @triton.jit
-def _value(x, uu, r11, shift, l0, l1, lxx, cut, CONE: tl.constexpr):
-    """What Gaussians add at column x of a row."""
-    t = r11 * x + shift
+def _add_value(a0, a1, a2, a3, t, uu, l0, l1, ltt, cut, w0, w1, w2, w3, CHANNELS: tl.constexpr, CONE: tl.constexpr):
+    """The sums of a pixel with what Gaussians add to it at ``t``."""
     q = t * t + uu
     if CONE:
-        root = tl.math.rsqrt(l0 + x * (l1 + lxx * x))
+        root = tl.math.rsqrt(l0 + t * (l1 + ltt * t))
         q *= root * root
-        return tl.where(q <= cut, tl.exp2(-1.0 * q) * root, 0.0)
-    return tl.where(q <= cut, tl.exp2(-1.0 * q), 0.0)
+        value = tl.exp2(-1.0 * q) * root
+    else:
+        value = tl.exp2(-1.0 * q)
+    return add_within(a0, a1, a2, a3, q, cut, value, w0, w1, w2, w3, CHANNELS)
 
 
 @triton.jit
 def _sum_tile(
-    record, found, upper, column, row, cut, CHANNELS: tl.constexpr, CONE: tl.constexpr, STEP: tl.constexpr
+    record, found, odd, upper, column, row, cut, CHANNELS: tl.constexpr, CONE: tl.constexpr, STEP: tl.constexpr
 ):
     """Sums of the Gaussians ``found`` at a row of every lane, from ``column`` on and STEP columns apart.
 
-    Both halves of the warp have the same four pixels and every other Gaussian. In the end the lower half has
+    Both halves of the warp have the same four pixels and every other Gaussian, the lower one those of ``odd`` rank. In the end the lower half has
     the sums of the first and the third pixel, by channel, and the ``upper`` half those of the second and fourth.
     """
     zero = tl.zeros([32], tl.float32)
     a0, a1, a2, a3, b0, b1, b2, b3 = zero, zero, zero, zero, zero, zero, zero, zero
     c0, c1, c2, c3, d0, d1, d2, d3 = zero, zero, zero, zero, zero, zero, zero, zero
-    lx, ly, lxx, lxy, lyy = zero, zero, zero, zero, zero
-    while found != 0:
-        which, limit, found = two_lowest(found, upper, cut)
+    w3, lt, lu, ltt, ltu, luu = zero, zero, zero, zero, zero, zero
+    lanes = tl.where(upper, found & ~odd, odd)
+    while odd != 0:
+        odd &= odd - 1
+        which, limit, lanes = next_lane(lanes, cut)
         at = record + which.to(tl.int64) * RECORD
         column0, row0, r11, r12 = load_four(at)
-        r22, _, _, _ = load_four(at + 4)
-        w0, w1, w2, w3 = load_four(at + 16)
-        if CONE:
-            _, _, lx, ly = load_four(at + 8)
-            lxx, lxy, lyy, _ = load_four(at + 12)
-        x, y = column - column0, row - row0
-        u = r22 * y
-        uu, shift = u * u, r12 * y
-        l0, l1 = 1.0 + y * (ly + lyy * y), lx + lxy * y
-        a = _value(x, uu, r11, shift, l0, l1, lxx, limit, CONE)
-        b = _value(x + STEP, uu, r11, shift, l0, l1, lxx, limit, CONE)
-        c = _value(x + 2 * STEP, uu, r11, shift, l0, l1, lxx, limit, CONE)
-        d = _value(x + 3 * STEP, uu, r11, shift, l0, l1, lxx, limit, CONE)
-        a0, b0, c0, d0 = a0 + w0 * a, b0 + w0 * b, c0 + w0 * c, d0 + w0 * d
-        if CHANNELS > 1:
-            a1, b1, c1, d1 = a1 + w1 * a, b1 + w1 * b, c1 + w1 * c, d1 + w1 * d
+        r22, lt, lu, ltt = load_four(at + 4)
+        ltu, luu, w0, w1 = load_four(at + 8)
+        w2 = zero
         if CHANNELS > 2:
-            a2, b2, c2, d2 = a2 + w2 * a, b2 + w2 * b, c2 + w2 * c, d2 + w2 * d
-        if CHANNELS > 3:
-            a3, b3, c3, d3 = a3 + w3 * a, b3 + w3 * b, c3 + w3 * c, d3 + w3 * d
+            w2, w3, _, _ = load_four(at + 12)
+        y = row - row0
+        u = r22 * y
+        uu, t, by = u * u, r11 * (column - column0) + r12 * y, STEP * r11
+        l0, l1 = 1.0 + u * (lu + luu * u), lt + ltu * u
+        a0, a1, a2, a3 = _add_value(a0, a1, a2, a3, t, uu, l0, l1, ltt, limit, w0, w1, w2, w3, CHANNELS, CONE)
+        t += by
+        b0, b1, b2, b3 = _add_value(b0, b1, b2, b3, t, uu, l0, l1, ltt, limit, w0, w1, w2, w3, CHANNELS, CONE)
+        t += by
+        c0, c1, c2, c3 = _add_value(c0, c1, c2, c3, t, uu, l0, l1, ltt, limit, w0, w1, w2, w3, CHANNELS, CONE)
+        t += by
+        d0, d1, d2, d3 = _add_value(d0, d1, d2, d3, t, uu, l0, l1, ltt, limit, w0, w1, w2, w3, CHANNELS, CONE)
     return share_out(a0, b0, c0, d0, a1, b1, c1, d1, a2, b2, c2, d2, a3, b3, c3, d3, CHANNELS)
 
 
@@ -123,7 +125,6 @@ def _add_pixel(
     if CHANNELS == 1:
         tl.atomic_add(image + pixel, v0, mask=inside & (v0 != 0), sem="relaxed")
     else:
-        inside &= (v0 != 0) | (v1 != 0) | (v2 != 0) | (v3 != 0)
         add_four(image + 4 * pixel, v0, v1, v2, v3, inside, AT_ONCE)
 
 
@@ -160,11 +161,13 @@ def _splat_pixels_kernel(
             first, last = _columns(yc, by_ry, ry, xc, m, hx, ahead, y0, y0 + (ROWS - 1), columns)
             # From an even column: two pixels of four channels fill one sector of memory.
             for left in range(tl.min(first, 0) // 2 * 2 + beside, tl.max(last, 0) + 1, along_by):
-                found = lane_set((first < left + COLUMNS) & (last >= left) & (first <= last), lane)
-                if found != 0:
+                found = lane_set((first < left + COLUMNS) & (last >= left), lane)
+                odd = odd_ranks(found)
+                if odd != 0:
                     i, j = top + down, left + across
                     a0, a1, a2, a3, c0, c1, c2, c3 = _sum_tile(
-                        record, found, upper, j.to(tl.float32), i.to(tl.float32), cut, CHANNELS, CONE, STEP
+                        record, found, odd, upper, j.to(tl.float32), i.to(tl.float32), cut,
+                        CHANNELS, CONE, STEP,
                     )
                     j += tl.where(upper, STEP, 0)
                     _add_pixel(image, i, j, rows, columns, a0, a1, a2, a3, shift, CHANNELS, AT_ONCE, GRAINED)

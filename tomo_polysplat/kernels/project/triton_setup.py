@@ -5,12 +5,14 @@ README.md has the formulas.
 ``record`` (views, count, 20) holds for one Gaussian, with x and y counted from the projected centre
 
 * 0, 1: column and row of the projected centre;
-* 2-4: r11, r12, r22 with q = ((r11 x + r12 y)^2 + (r22 y)^2) / l, the squared distance times HALF_LOG2E;
-* 5-9: the outline where the Gaussian is cut, as row yc and half-height ry, column xc, slope m and half-width hx
-  with |column - xc - m (row - yc)| <= hx sqrt(1 - ((row - yc) / ry)^2); ry = -1 if it misses the detector;
-* 10-14: l = 1 + x (l10 + l12 x + l13 y) + y (l11 + l14 y) = |e|^2 / |e_centre|^2 (one for parallel rays);
-* 15: 1 / |e_centre|;
-* 16-19: the weights, times 1 / |e_centre|.
+* 2-4: r11, r12, r22 of t = r11 x + r12 y and u = r22 y, with q = (t^2 + u^2) / l, the squared distance times HALF_LOG2E;
+* 5-9: l = 1 + t (l5 + l7 t + l8 u) + u (l6 + l9 u) = |e|^2 / |e_centre|^2 (one for parallel rays);
+* 10-13: the weights, times 1 / |e_centre|, which is
+* 14: itself;
+* 15-19: the outline where the Gaussian is cut, as half-width hx, row yc and half-height ry, column xc and slope m
+  with |column - xc - m (row - yc)| <= hx sqrt(1 - ((row - yc) / ry)^2); ry = -1 if it misses the detector.
+
+Sums over pixels need the first thirteen to fifteen, four loads of four.
 """
 
 from __future__ import annotations
@@ -164,10 +166,20 @@ def _footprint_kernel(
     r22 = tl.sqrt(dot(n0, n1, n2, n0, n1, n2)) * by_u * inverse
     zero = tl.zeros_like(r11)
     lx, ly, lxx, lxy, lyy = zero, zero, zero, zero, zero
+    lt, lu, ltt, ltu, luu = zero, zero, zero, zero, zero
     if CONE:
         lx, ly = dot(w0, w1, w2, a0, a1, a2) * kappa * square, dot(w0, w1, w2, b0, b1, b2) * kappa * square
         lxx, lxy = dot(a0, a1, a2, a0, a1, a2) * square, dot(a0, a1, a2, b0, b1, b2) * square
         lyy = dot(b0, b1, b2, b0, b1, b2) * square
+        # e = e_centre + t (a / r11) + u (b / r22 - a r12 / (r11 r22)), in the records' scale.
+        by_t = 1.0 / (ROOT * tl.where(r11 > 0, r11, 1.0))
+        by_u = tl.where(r22 > 0, 1.0 / (ROOT * tl.where(r22 > 0, r22, 1.0)), 0.0)
+        back = by_t * (ROOT * r12) * by_u
+        t0, t1, t2 = by_t * a0, by_t * a1, by_t * a2
+        u0, u1, u2 = by_u * b0 - back * a0, by_u * b1 - back * a1, by_u * b2 - back * a2
+        lt, lu = dot(w0, w1, w2, t0, t1, t2) * kappa * square, dot(w0, w1, w2, u0, u1, u2) * kappa * square
+        ltt, ltu = dot(t0, t1, t2, t0, t1, t2) * square, dot(t0, t1, t2, u0, u1, u2) * square
+        luu = dot(u0, u1, u2, u0, u1, u2) * square
     if PLANAR:
         row = zero
     cut = cutoff * cutoff
@@ -180,17 +192,14 @@ def _footprint_kernel(
     ry = tl.where(valid, ry, -1.0)
     to = record + (view * count + n) * RECORD
     _store(to, column, row, r11 * ROOT, r12 * ROOT, live)
-    _store(to + 4, r22 * ROOT, yc, ry, xc, live)
-    _store(to + 8, m, hx, 2 * lx, 2 * ly, live)
-    _store(to + 12, lxx, 2 * lxy, lyy, inverse, live)
-    store_four(
-        to + 16,
-        _weight(weight, n, count, live, 0, inverse, CHANNELS),
-        _weight(weight, n, count, live, 1, inverse, CHANNELS),
-        _weight(weight, n, count, live, 2, inverse, CHANNELS),
-        _weight(weight, n, count, live, 3, inverse, CHANNELS),
-        live,
-    )
+    _store(to + 4, r22 * ROOT, 2 * lt, 2 * lu, ltt, live)
+    c0 = _weight(weight, n, count, live, 0, inverse, CHANNELS)
+    c1 = _weight(weight, n, count, live, 1, inverse, CHANNELS)
+    c2 = _weight(weight, n, count, live, 2, inverse, CHANNELS)
+    c3 = _weight(weight, n, count, live, 3, inverse, CHANNELS)
+    _store(to + 8, 2 * ltu, luu, c0, c1, live)
+    _store(to + 12, c2, c3, inverse, hx, live)
+    _store(to + 16, yc, ry, xc, m, live)
 
 
 def footprints(

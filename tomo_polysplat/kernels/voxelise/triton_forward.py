@@ -10,7 +10,14 @@ import torch
 import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
-from tomo_polysplat.kernels.triton_lanes import lane_set, load_four, share_out, two_lowest
+from tomo_polysplat.kernels.triton_lanes import (
+    add_within,
+    lane_set,
+    load_four,
+    next_lane,
+    odd_ranks,
+    share_out,
+)
 from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, SIZES, grain, grained, on_device
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.kernels.voxelise.triton_setup import RECORD
@@ -36,7 +43,7 @@ def _window(centre, half, live, length):
 def _columns(
     xc, yc, zc, r11, r12, r13, r22, r23, r33, half_x, live, y, z, nx, cut, H: tl.constexpr, D: tl.constexpr
 ):
-    """First and last column that ellipsoids can reach along a beam of H x D lines around (y, z); or none.
+    """First and last column that ellipsoids can reach along a beam of H x D lines around (y, z); the last is -1 where none.
 
     From the least that each of q's other terms, and the farthest that the middle of a line, comes to in the beam:
     never too narrow.
@@ -52,18 +59,19 @@ def _columns(
     there = live & (rest >= 0)
     left = tl.where(there, tl.minimum(tl.maximum(left, 0.0), nx + 0.0), nx + 0.0)
     right = tl.where(there, tl.minimum(tl.maximum(right, -1.0), nx - 1.0), -1.0)
-    return tl.math.ceil(left).to(tl.int32), tl.math.floor(right).to(tl.int32)
+    first, last = tl.math.ceil(left).to(tl.int32), tl.math.floor(right).to(tl.int32)
+    return first, tl.where(first <= last, last, -1)
 
 
 @triton.jit
-def _value(x, r11, shift, rest, cut):
-    t = r11 * x + shift
+def _add_value(a0, a1, a2, a3, t, rest, cut, w0, w1, w2, w3, CHANNELS: tl.constexpr):
+    """The sums of a voxel with what Gaussians add to it at ``t``."""
     q = t * t + rest
-    return tl.where(q <= cut, tl.exp2(-1.0 * q), 0.0)
+    return add_within(a0, a1, a2, a3, q, cut, tl.exp2(-1.0 * q), w0, w1, w2, w3, CHANNELS)
 
 
 @triton.jit
-def _sum_brick(record, found, upper, x, y, z, cut, CHANNELS: tl.constexpr):
+def _sum_brick(record, found, odd, upper, x, y, z, cut, CHANNELS: tl.constexpr):
     """Sums of the Gaussians ``found`` at a line of every lane, at four columns from ``x`` on.
 
     Halves of the warp share out Gaussians and in the end columns as in the projection.
@@ -71,25 +79,25 @@ def _sum_brick(record, found, upper, x, y, z, cut, CHANNELS: tl.constexpr):
     zero = tl.zeros([32], tl.float32)
     a0, a1, a2, a3, b0, b1, b2, b3 = zero, zero, zero, zero, zero, zero, zero, zero
     c0, c1, c2, c3, d0, d1, d2, d3 = zero, zero, zero, zero, zero, zero, zero, zero
-    while found != 0:
-        which, limit, found = two_lowest(found, upper, cut)
+    lanes = tl.where(upper, found & ~odd, odd)
+    while odd != 0:
+        odd &= odd - 1
+        which, limit, lanes = next_lane(lanes, cut)
         at = record + which.to(tl.int64) * RECORD
         cx, cy, cz, r11 = load_four(at)
         r12, r13, r22, r23 = load_four(at + 4)
         r33, _, _, _ = load_four(at + 8)
         w0, w1, w2, w3 = load_four(at + 12)
-        dx, dy, dz = x - cx, y - cy, z - cz
+        dy, dz = y - cy, z - cz
         up, out = r22 * dy + r23 * dz, r33 * dz
-        shift, rest = r12 * dy + r13 * dz, up * up + out * out
-        a, b = _value(dx, r11, shift, rest, limit), _value(dx + 1.0, r11, shift, rest, limit)
-        c, d = _value(dx + 2.0, r11, shift, rest, limit), _value(dx + 3.0, r11, shift, rest, limit)
-        a0, b0, c0, d0 = a0 + w0 * a, b0 + w0 * b, c0 + w0 * c, d0 + w0 * d
-        if CHANNELS > 1:
-            a1, b1, c1, d1 = a1 + w1 * a, b1 + w1 * b, c1 + w1 * c, d1 + w1 * d
-        if CHANNELS > 2:
-            a2, b2, c2, d2 = a2 + w2 * a, b2 + w2 * b, c2 + w2 * c, d2 + w2 * d
-        if CHANNELS > 3:
-            a3, b3, c3, d3 = a3 + w3 * a, b3 + w3 * b, c3 + w3 * c, d3 + w3 * d
+        t, rest = r11 * (x - cx) + (r12 * dy + r13 * dz), up * up + out * out
+        a0, a1, a2, a3 = _add_value(a0, a1, a2, a3, t, rest, limit, w0, w1, w2, w3, CHANNELS)
+        t += r11
+        b0, b1, b2, b3 = _add_value(b0, b1, b2, b3, t, rest, limit, w0, w1, w2, w3, CHANNELS)
+        t += r11
+        c0, c1, c2, c3 = _add_value(c0, c1, c2, c3, t, rest, limit, w0, w1, w2, w3, CHANNELS)
+        t += r11
+        d0, d1, d2, d3 = _add_value(d0, d1, d2, d3, t, rest, limit, w0, w1, w2, w3, CHANNELS)
     return share_out(a0, b0, c0, d0, a1, b1, c1, d1, a2, b2, c2, d2, a3, b3, c3, d3, CHANNELS)
 
 
@@ -141,10 +149,11 @@ def _splat_voxels_kernel(
             line = volume + (iz.to(tl.int64) * ny + iy) * nx
             # From a column that four divides: four voxels fill half a sector of memory.
             for left in range(tl.min(first, 0) // 4 * 4, tl.max(last, 0) + 1, 4):
-                found = lane_set((first < left + 4) & (last >= left) & (first <= last), lane)
-                if found != 0:
+                found = lane_set((first < left + 4) & (last >= left), lane)
+                odd = odd_ranks(found)
+                if odd != 0:
                     a0, a1, a2, a3, c0, c1, c2, c3 = _sum_brick(
-                        record, found, upper, left + 0.0, iy.to(tl.float32), iz.to(tl.float32), cut, CHANNELS
+                        record, found, odd, upper, left + 0.0, iy.to(tl.float32), iz.to(tl.float32), cut, CHANNELS
                     )
                     ix = left + upper.to(tl.int32)
                     inside = (ix < nx) & (iy < ny) & (iz < nz)
