@@ -13,6 +13,7 @@ import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.checks import fail
+from tomo_polysplat.kernels.triton_lanes import load_four
 
 __all__ = [
     "GROUP",
@@ -22,6 +23,8 @@ __all__ = [
     "dot",
     "grain",
     "grained",
+    "load_shape",
+    "load_three",
     "on_device",
     "require_scene",
     "rotation_matrix",
@@ -85,19 +88,35 @@ def dot(a0, a1, a2, b0, b1, b2):
 
 
 @triton.jit
-def _unit_quaternion(rotation, n, live):
-    w = tl.load(rotation + n * 4, mask=live, other=1.0).to(tl.float64)
-    x = tl.load(rotation + n * 4 + 1, mask=live, other=0.0).to(tl.float64)
-    y = tl.load(rotation + n * 4 + 2, mask=live, other=0.0).to(tl.float64)
-    z = tl.load(rotation + n * 4 + 3, mask=live, other=0.0).to(tl.float64)
+def load_three(values, n):
+    """The three numbers of each of the Gaussians ``n``."""
+    at = values + n * 3
+    return tl.load(at), tl.load(at + 1), tl.load(at + 2)
+
+
+@triton.jit
+def load_shape(scale, rotation, n):
+    """Scales and quaternions (w, x, y, z) of the Gaussians ``n``, seven numbers as they are stored.
+
+    Kernels load all that they need before they compute: what memory takes is then waited for once, and it is more
+    than what the arithmetic takes.
+    """
+    s0, s1, s2 = load_three(scale, n)
+    w, x, y, z = load_four(rotation + n * 4)
+    return s0, s1, s2, w, x, y, z
+
+
+@triton.jit
+def _unit_quaternion(w, x, y, z):
+    w, x, y, z = w.to(tl.float64), x.to(tl.float64), y.to(tl.float64), z.to(tl.float64)
     inverse = tl.math.rsqrt(w * w + x * x + y * y + z * z)
     return w * inverse, x * inverse, y * inverse, z * inverse, inverse
 
 
 @triton.jit
-def rotation_matrix(rotation, n, live):
-    """R^T, row by row, of the quaternions (w, x, y, z) of the Gaussians ``n``."""
-    w, x, y, z, _ = _unit_quaternion(rotation, n, live)
+def rotation_matrix(w, x, y, z):
+    """R^T, row by row, of quaternions, in float64."""
+    w, x, y, z, _ = _unit_quaternion(w, x, y, z)
     return (
         1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y),
         2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x),
@@ -107,13 +126,11 @@ def rotation_matrix(rotation, n, live):
 
 @triton.jit
 def whitening_adjoint(
-    scale, rotation, n, live, w00, w01, w02, w10, w11, w12, w20, w21, w22,
+    s0, s1, s2, qw, qx, qy, qz, n, live, w00, w01, w02, w10, w11, w12, w20, w21, w22,
     g00, g01, g02, g10, g11, g12, g20, g21, g22, grad_scale, grad_rotation,
 ):  # fmt: skip
     """Store the gradients of scale and quaternion from the whitening matrix ``w`` and ``g`` = dL/dw."""
-    a = 1.0 / tl.load(scale + n * 3, mask=live, other=1.0).to(tl.float64)
-    b = 1.0 / tl.load(scale + n * 3 + 1, mask=live, other=1.0).to(tl.float64)
-    c = 1.0 / tl.load(scale + n * 3 + 2, mask=live, other=1.0).to(tl.float64)
+    a, b, c = 1.0 / s0.to(tl.float64), 1.0 / s1.to(tl.float64), 1.0 / s2.to(tl.float64)
     # W's row k is R's column k over scale_k, so dW/dscale_k = -W_k / scale_k.
     tl.store(grad_scale + n * 3, (-a * dot(g00, g01, g02, w00, w01, w02)).to(tl.float32), mask=live)
     tl.store(grad_scale + n * 3 + 1, (-b * dot(g10, g11, g12, w10, w11, w12)).to(tl.float32), mask=live)
@@ -121,7 +138,7 @@ def whitening_adjoint(
     g00, g01, g02 = g00 * a, g01 * a, g02 * a
     g10, g11, g12 = g10 * b, g11 * b, g12 * b
     g20, g21, g22 = g20 * c, g21 * c, g22 * c
-    w, x, y, z, inverse = _unit_quaternion(rotation, n, live)
+    w, x, y, z, inverse = _unit_quaternion(qw, qx, qy, qz)
     gw = 2 * (z * (g01 - g10) + y * (g20 - g02) + x * (g12 - g21))
     gx = 2 * (y * (g01 + g10) + z * (g02 + g20) + w * (g12 - g21) - 2 * x * (g11 + g22))
     gy = 2 * (x * (g01 + g10) + z * (g12 + g21) + w * (g20 - g02) - 2 * y * (g00 + g22))

@@ -10,7 +10,7 @@ import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.kernels.project.triton_image import folded, spread
-from tomo_polysplat.kernels.project.triton_setup import RECORD, SLACK
+from tomo_polysplat.kernels.project.triton_setup import QUAD, RECORD, SLACK
 from tomo_polysplat.kernels.triton_lanes import SUMS, by_size, from_lane, load_four, store_sums, widest
 from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, SIZES, on_device
 from tomo_polysplat.kernels.views import DetectorViews
@@ -36,30 +36,30 @@ def _row_ends(offset, last, by_ry, xc, m, hx, columns):
 
 @triton.jit(do_not_specialize=SIZES)
 def _pixel_moments_kernel(
-    record, grad, moments, count, rows, columns, parts,
-    CHANNELS: tl.constexpr, CONE: tl.constexpr, BLOCK_H: tl.constexpr, SPREAD: tl.constexpr,
+    record, grad, moments, rows, columns, parts,
+    CHANNELS: tl.constexpr, CONE: tl.constexpr, BLOCK_H: tl.constexpr, SPREAD: tl.constexpr, GROUP: tl.constexpr,
 ):  # fmt: skip
     view = tl.program_id(1).to(tl.int64)
     last_block = (rows - 1) // BLOCK_H
-    record += view * count * RECORD
-    moments += view * count * SUMS
+    # What the warp does at a time takes as long as the largest footprint: like ones together.
+    group, part = tl.program_id(0) // parts, tl.program_id(0) % parts
+    record += (view * (tl.num_programs(0) // parts) + group) * (GROUP * RECORD)
+    moments += (view * (tl.num_programs(0) // parts) + group) * (GROUP * SUMS)
     grad += view * (last_block + 1) * columns * (BLOCK_H * SPREAD)
     lane = tl.arange(0, 32)
     BLOCK_W: tl.constexpr = 2 // BLOCK_H
     down, across = lane % 2 // BLOCK_W, lane % BLOCK_W
     zero = tl.zeros([32], tl.float32)
-    # What the warp does at a time takes as long as the largest footprint: like ones together.
-    group, part = tl.program_id(0) // parts, tl.program_id(0) % parts
-    own = tl.minimum(group * 32 + lane, count - 1).to(tl.int64) * RECORD
-    order = by_size(tl.load(record + own + 17) * tl.load(record + own + 15), lane)
+    own = record + 4 * lane
+    order = by_size(tl.load(own + (4 * QUAD + 1)) * tl.load(own + (3 * QUAD + 3)), lane)
     for turn in range(part, 2, parts):
-        n = group * 32 + from_lane(order, turn * 16 + lane // 2)
-        at = record + tl.minimum(n, count - 1).to(tl.int64) * RECORD
+        n = from_lane(order, turn * 16 + lane // 2)
+        at = record + 4 * n
         column0, row0, r11, r12 = load_four(at)
-        r22, lt, lu, ltt = load_four(at + 4)
-        ltu, luu, w0, w1 = load_four(at + 8)
-        w2, w3, unit, hx = load_four(at + 12)
-        yc, ry, xc, m = load_four(at + 16)
+        r22, lt, lu, ltt = load_four(at + QUAD)
+        ltu, luu, w0, w1 = load_four(at + 2 * QUAD)
+        w2, w3, unit, hx = load_four(at + 3 * QUAD)
+        yc, ry, xc, m = load_four(at + 4 * QUAD)
         h_sum, ht, hu, htt, htu, huu = zero, zero, zero, zero, zero, zero
         k, kt, ku, ktt, ktu, kuu = zero, zero, zero, zero, zero, zero
         c0, c1, c2, c3 = zero, zero, zero, zero
@@ -68,7 +68,7 @@ def _pixel_moments_kernel(
         # A Gaussian off the detector has no rows, from a pixel that exists all the same.
         low = tl.math.ceil(tl.minimum(tl.maximum(yc - ry, 0.0), rows - 1.0))
         high = tl.math.floor(tl.minimum(tl.maximum(yc + ry, -1.0), rows - 1.0))
-        high = tl.where((ry > 0) & (n < count), high, -1.0)
+        high = tl.where(ry > 0, high, -1.0)
         # From where rows that lie interleaved begin.
         low = tl.math.floor(low / BLOCK_H) * BLOCK_H
         by_ry = 1.0 / tl.maximum(ry - SLACK, _TINY)
@@ -152,26 +152,25 @@ def _pixel_moments_kernel(
         st, su = ht - _TWO_LN2 * kt, hu - _TWO_LN2 * ku
         stt, stu, suu = htt - _TWO_LN2 * ktt, htu - _TWO_LN2 * ktu, huu - _TWO_LN2 * kuu
         store_sums(
-            moments + n.to(tl.int64) * SUMS, n < count, lane,
+            moments + n * SUMS, n >= 0, lane,
             ht, hu, htt, htu, huu, s, st, su, stt, stu, suu, c0, c1, c2, c3, unit, LANES=2,
         )  # fmt: skip
 
 
 def sum_moments(record, pixels: torch.Tensor, channels: int, views: DetectorViews) -> torch.Tensor:
-    """(views, count, 16) sums over each footprint, with t = r11 x + r12 y and u = r22 y of the record.
+    """(views, Gaussians of whole groups, 16) sums over each footprint, with t = r11 x + r12 y and u = r22 y of the record.
 
     First of h (t, u, t^2, tu, u^2), from 5 of s (1, t, u, t^2, tu, u^2), from 11 of f dL/df by channel, where
     dL/d(distance^2 |e|^2) = -h / 2 and dL/d|e|^2 = -s / 2, all in units of |e_centre|; last 1 / |e_centre| itself, 0
     for a Gaussian that misses the detector. ``pixels`` is the gradient of the image of as many ``channels`` in the
     kernels' layout for gradients.
     """
-    many, count = record.shape[:2]
-    moments = record.new_empty((many, count, SUMS.value))
-    groups = triton.cdiv(count, GROUP)
+    many, groups = record.shape[:2]
+    moments = record.new_empty((many, groups * GROUP, SUMS.value))
     parts = 2 if groups * many < _PROGRAMS else 1
     with on_device(record):
         _pixel_moments_kernel[(groups * parts, many)](
-            record, pixels, moments, count, views.rows, views.columns, parts, CHANNELS=channels, CONE=views.cone,
-            BLOCK_H=folded(views), SPREAD=spread(channels), num_warps=1, num_stages=1,
+            record, pixels, moments, views.rows, views.columns, parts, CHANNELS=channels, CONE=views.cone,
+            BLOCK_H=folded(views), SPREAD=spread(channels), GROUP=GROUP, num_warps=1, num_stages=1,
         )  # fmt: skip
     return moments

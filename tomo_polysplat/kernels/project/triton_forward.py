@@ -14,7 +14,7 @@ import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.kernels.project.triton_image import spread
-from tomo_polysplat.kernels.project.triton_setup import RECORD
+from tomo_polysplat.kernels.project.triton_setup import QUAD, RECORD
 from tomo_polysplat.kernels.triton_lanes import (
     add_four,
     add_within,
@@ -38,13 +38,12 @@ _FAR = tl.constexpr(1e30)
 
 
 @triton.jit
-def _outlines(record, group, count, GROUP: tl.constexpr):
+def _outlines(record, lane):
     """yc, ry (-1 where there is no outline), xc, m, hx of a group's outlines; see triton_setup."""
-    n = group * GROUP + tl.arange(0, GROUP)
-    at = record + tl.minimum(n, count - 1).to(tl.int64) * RECORD
-    yc, ry, xc, m = load_four(at + 16)
-    hx = tl.load(at + 15)
-    return yc, tl.where(n < count, ry, -1.0), xc, m, hx
+    at = record + 4 * lane
+    yc, ry, xc, m = load_four(at + 4 * QUAD)
+    _, _, _, hx = load_four(at + 3 * QUAD)
+    return yc, ry, xc, m, hx
 
 
 @triton.jit
@@ -92,13 +91,13 @@ def _sum_tile(
     while odd != 0:
         odd &= odd - 1
         which, limit, lanes = next_lane(lanes, cut)
-        at = record + which.to(tl.int64) * RECORD
+        at = record + 4 * which
         column0, row0, r11, r12 = load_four(at)
-        r22, lt, lu, ltt = load_four(at + 4)
-        ltu, luu, w0, w1 = load_four(at + 8)
+        r22, lt, lu, ltt = load_four(at + QUAD)
+        ltu, luu, w0, w1 = load_four(at + 2 * QUAD)
         w2 = zero
         if CHANNELS > 2:
-            w2, w3, _, _ = load_four(at + 12)
+            w2, w3, _, _ = load_four(at + 3 * QUAD)
         y = row - row0
         u = r22 * y
         uu, t, by = u * u, r11 * (column - column0) + r12 * y, STEP * r11
@@ -130,24 +129,23 @@ def _add_pixel(
 
 @triton.jit(do_not_specialize=SIZES)
 def _splat_pixels_kernel(
-    record, image, largest, count, rows, columns, parts, cut,
+    record, image, largest, rows, columns, parts, cut,
     CHANNELS: tl.constexpr, CONE: tl.constexpr, ROWS: tl.constexpr,
     GROUP: tl.constexpr, AT_ONCE: tl.constexpr, GRAINED: tl.constexpr, SPREAD: tl.constexpr,
 ):  # fmt: skip
     shift = grain(largest, GRAINED)
     group, part = tl.program_id(0) // parts, tl.program_id(0) % parts
     view = tl.program_id(1).to(tl.int64)
-    record += view * count * RECORD
+    record += (view * (tl.num_programs(0) // parts) + group) * (GROUP * RECORD)
     image += view * rows * columns * SPREAD
-    yc, ry, xc, m, hx = _outlines(record, group, count, GROUP)
-    record += group.to(tl.int64) * GROUP * RECORD
+    lane = tl.arange(0, GROUP)
+    yc, ry, xc, m, hx = _outlines(record, lane)
     by_ry = 1.0 / ry
     # The outline's rightmost point lies ``ahead`` rows below the centre and its leftmost as many above.
     ahead = m * ry * ry / tl.sqrt(m * m * ry * ry + hx * hx)
     seen = ry > 0
     y_low = tl.maximum(tl.min(tl.where(seen, yc - ry, _FAR), 0), 0.0)
     y_high = tl.minimum(tl.max(tl.where(seen, yc + ry, -_FAR), 0), rows - 1.0)
-    lane = tl.arange(0, 32)
     STEP: tl.constexpr = _HALF // ROWS
     COLUMNS: tl.constexpr = 4 * STEP
     upper, down, across = lane >= _HALF, lane % _HALF // STEP, lane % STEP
@@ -183,15 +181,14 @@ def splat(
     With ``largest``, a float32 tensor of the largest value that such an image has had, it has the same bits every
     time: what is added is rounded to some 2e-7 of that (`grained`).
     """
-    many, count = record.shape[:2]
+    many, groups = record.shape[:2]
     image = record.new_zeros((many, views.rows, views.columns, spread(channels)))
-    if not (count and image.numel()):
+    if not (groups and image.numel()):
         return image
-    groups = triton.cdiv(count, GROUP)
     parts = triton.next_power_of_2(max(1, min(_MOST_PARTS, _PROGRAMS // (groups * many))))
     with on_device(record):
         _splat_pixels_kernel[(groups * parts, many)](
-            record, image, record if largest is None else largest, count, views.rows, views.columns,
+            record, image, record if largest is None else largest, views.rows, views.columns,
             parts, cutoff * cutoff * HALF_LOG2E,
             CHANNELS=channels, CONE=views.cone, ROWS=1 if views.rows == 1 else _TILE_ROWS,
             GROUP=GROUP, AT_ONCE=adds_four(record.device), GRAINED=largest is not None, SPREAD=spread(channels),

@@ -12,7 +12,7 @@ import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.kernels.project.triton_setup import ROOT, VIEW, chain, whitening
 from tomo_polysplat.kernels.triton_lanes import SUMS, load_four
-from tomo_polysplat.kernels.triton_maths import SIZES, cross, dot, on_device, whitening_adjoint
+from tomo_polysplat.kernels.triton_maths import SIZES, cross, dot, load_shape, load_three, on_device, whitening_adjoint
 from tomo_polysplat.kernels.views import DetectorViews
 
 __all__ = ["pull_back"]
@@ -20,19 +20,27 @@ __all__ = ["pull_back"]
 _BLOCK = 64
 # Of a lane. It would take 208, with which too few warps are at work to hide what each waits for: 58 us for 66 (194 000
 # Gaussians, four views). With 128 it spills too much.
-_REGISTERS = 168
+_REGISTERS = 232
 
 
 @triton.jit
-def _moments(at, live, a, b, c, d):
+def _moments(live, m0, m1, m2, m3, a, b, c, d):
     """Four of the sums, in float64, each times its unit; zero where the Gaussian has no footprint."""
-    m0, m1, m2, m3 = load_four(at)
     return (
         tl.where(live, m0, 0.0).to(tl.float64) * a,
         tl.where(live, m1, 0.0).to(tl.float64) * b,
         tl.where(live, m2, 0.0).to(tl.float64) * c,
         tl.where(live, m3, 0.0).to(tl.float64) * d,
     )
+
+
+@triton.jit
+def _load_moments(at):
+    m0, m1, m2, m3 = load_four(at)
+    m4, m5, m6, m7 = load_four(at + 4)
+    m8, m9, m10, m11 = load_four(at + 8)
+    m12, m13, m14, m15 = load_four(at + 12)
+    return m0, m1, m2, m3, m4, m5, m6, m7, m8, m9, m10, m11, m12, m13, m14, m15
 
 
 @triton.jit
@@ -43,33 +51,35 @@ def _mix(a, x0, x1, x2, b, y0, y1, y2):
 @triton.jit(do_not_specialize=SIZES)
 def _pull_back_kernel(
     position, scale, rotation, views, moments,
-    grad_position, grad_scale, grad_rotation, grad_weight, count, many,
+    grad_position, grad_scale, grad_rotation, grad_weight, count, beyond, many,
     CHANNELS: tl.constexpr, CONE: tl.constexpr, PLANAR: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = n < count
-    m00, m01, m02, m10, m11, m12, m20, m21, m22, _, _, _ = whitening(scale, rotation, n, live)
+    known = tl.minimum(n, count - 1)
+    at, sums = views, moments + known * SUMS
+    s0, s1, s2, qw, qx, qy, qz = load_shape(scale, rotation, known)
+    p0, p1, p2 = load_three(position, known)
+    m00, m01, m02, m10, m11, m12, m20, m21, m22 = whitening(s0, s1, s2, qw, qx, qy, qz)
     none = tl.zeros([BLOCK], tl.float64)
     G00, G01, G02, G10, G11, G12, G20, G21, G22 = none, none, none, none, none, none, none, none, none
     P0, P1, P2 = none, none, none
     C0, C1, C2, C3 = none, none, none, none
-    known = tl.minimum(n, count - 1)
-    at, sums = views, moments + known * SUMS
     for _view in range(many):
-        c1, c2, c3, inverse = load_four(sums + 12)
-        seen, inverse = live & (inverse > 0), inverse.to(tl.float64)
+        k0, k1, k2, k3, k4, k5, k6, k7, k8, k9, k10, k11, c1, c2, c3, unit = _load_moments(sums)
+        seen, inverse = live & (unit > 0), unit.to(tl.float64)
         (
             _, kappa, column, row, r0, r1, r2, w0, w1, w2, a0, a1, a2, b0, b1, b2,
             nu0, nu1, nu2, nv0, nv1, nv2,
-        ) = chain(position, n, live, at, m00, m01, m02, m10, m11, m12, m20, m21, m22, CONE)  # fmt: skip
+        ) = chain(p0, p1, p2, at, m00, m01, m02, m10, m11, m12, m20, m21, m22, CONE)  # fmt: skip
         # dL/d(distance^2 |e|^2) = -h / 2 and dL/d|e|^2 = -s / 2, here doubled: every use has a factor 2. The
         # sums take t and u ROOT / |e_centre| times too large.
         one, two, zero = -inverse * inverse, -inverse / ROOT, -1.0 / (ROOT * ROOT)
-        ht, hu, htt, htu = _moments(sums, seen, two, two, zero, zero)
-        huu, s, st, su = _moments(sums + 4, seen, zero, one, two, two)
-        stt, stu, suu, c0 = _moments(sums + 8, seen, zero, zero, zero, inverse)
-        unit = tl.where(seen, inverse, 0.0)
-        C0, C1, C2, C3 = C0 + c0, C1 + c1 * unit, C2 + c2 * unit, C3 + c3 * unit
+        ht, hu, htt, htu = _moments(seen, k0, k1, k2, k3, two, two, zero, zero)
+        huu, s, st, su = _moments(seen, k4, k5, k6, k7, zero, one, two, two)
+        stt, stu, suu, c0 = _moments(seen, k8, k9, k10, k11, zero, zero, zero, inverse)
+        own = tl.where(seen, inverse, 0.0)
+        C0, C1, C2, C3 = C0 + c0, C1 + c1 * own, C2 + c2 * own, C3 + c3 * own
         # nu = r11 q1 and nv = r12 q1 + r22 q2, so x = by_t t - back u and y = by_u u.
         by_t = tl.math.rsqrt(tl.where(seen, dot(nu0, nu1, nu2, nu0, nu1, nu2), 1.0))
         q10, q11, q12 = by_t * nu0, by_t * nu1, by_t * nu2
@@ -135,7 +145,7 @@ def _pull_back_kernel(
         P1 += dot(tl.load(at + 4), tl.load(at + 7), tl.load(at + 10), g_column, g_row, g_depth)
         P2 += dot(tl.load(at + 5), tl.load(at + 8), tl.load(at + 11), g_column, g_row, g_depth)
         at += VIEW
-        sums += tl.cast(count, tl.int64) * SUMS
+        sums += tl.cast(beyond, tl.int64) * SUMS
     tl.store(grad_position + n * 3, P0.to(tl.float32), mask=live)
     tl.store(grad_position + n * 3 + 1, P1.to(tl.float32), mask=live)
     tl.store(grad_position + n * 3 + 2, P2.to(tl.float32), mask=live)
@@ -147,7 +157,7 @@ def _pull_back_kernel(
     if CHANNELS > 3:
         tl.store(grad_weight + 3 * count + n, C3.to(tl.float32), mask=live)
     whitening_adjoint(
-        scale, rotation, n, live, m00, m01, m02, m10, m11, m12, m20, m21, m22,
+        s0, s1, s2, qw, qx, qy, qz, n, live, m00, m01, m02, m10, m11, m12, m20, m21, m22,
         G00, G01, G02, G10, G11, G12, G20, G21, G22, grad_scale, grad_rotation,
     )  # fmt: skip
 
@@ -159,7 +169,7 @@ def pull_back(
     grads = tuple(torch.empty_like(t) for t in (position, scale, rotation, weight))
     with on_device(position):
         _pull_back_kernel[(triton.cdiv(len(position), _BLOCK),)](
-            position, scale, rotation, table, moments, *grads, len(position), len(views),
+            position, scale, rotation, table, moments, *grads, len(position), moments.shape[1], len(views),
             CHANNELS=len(weight), CONE=views.cone, PLANAR=views.planar, BLOCK=_BLOCK, num_warps=2, maxnreg=_REGISTERS,
         )  # fmt: skip
     return grads

@@ -2,7 +2,9 @@
 
 README.md has the formulas.
 
-``record`` (views, count, 20) holds for one Gaussian, with x and y counted from the projected centre
+``record`` (views, groups, 5, GROUP, 4) holds by fours, of neighbours in the list side by side, for one Gaussian the
+twenty numbers below; those after the last Gaussian are as one that misses the detector. x and y are counted from the
+projected centre.
 
 * 0, 1: column and row of the projected centre;
 * 2-4: r11, r12, r22 of t = r11 x + r12 y and u = r22 y, with q = (t^2 + u^2) / l, the squared distance times HALF_LOG2E;
@@ -22,27 +24,34 @@ import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.kernels.triton_lanes import store_four
-from tomo_polysplat.kernels.triton_maths import HALF_LOG2E, SIZES, cross, dot, on_device, rotation_matrix
+from tomo_polysplat.kernels.triton_maths import (
+    GROUP,
+    HALF_LOG2E,
+    SIZES,
+    cross,
+    dot,
+    load_shape,
+    load_three,
+    on_device,
+    rotation_matrix,
+)
 from tomo_polysplat.kernels.views import DetectorViews
 
-__all__ = ["RECORD", "ROOT", "SLACK", "VIEW", "chain", "footprints", "whitening"]
+__all__ = ["QUAD", "RECORD", "ROOT", "SLACK", "VIEW", "chain", "footprints", "whitening"]
 
 RECORD = tl.constexpr(20)
+QUAD = tl.constexpr(4 * GROUP)  # from four numbers of a Gaussian to its next four
 VIEW = tl.constexpr(21)  # origin, inverse and matrix of a view, row by row
 ROOT = tl.constexpr(HALF_LOG2E**0.5)
 SLACK = tl.constexpr(0.01)  # of a pixel, on the outline: rounding must not cut what q still includes
-_BLOCK = 32
 
 
 @triton.jit
-def whitening(scale, rotation, n, live):
-    """``W = diag(1/scale) R^T`` row by row, then scale, in float64."""
-    w00, w01, w02, w10, w11, w12, w20, w21, w22 = rotation_matrix(rotation, n, live)
-    s0 = tl.load(scale + n * 3, mask=live, other=1.0).to(tl.float64)
-    s1 = tl.load(scale + n * 3 + 1, mask=live, other=1.0).to(tl.float64)
-    s2 = tl.load(scale + n * 3 + 2, mask=live, other=1.0).to(tl.float64)
-    a, b, c = 1.0 / s0, 1.0 / s1, 1.0 / s2
-    return w00 * a, w01 * a, w02 * a, w10 * b, w11 * b, w12 * b, w20 * c, w21 * c, w22 * c, s0, s1, s2
+def whitening(s0, s1, s2, w, x, y, z):
+    """``W = diag(1/scale) R^T`` row by row, in float64."""
+    w00, w01, w02, w10, w11, w12, w20, w21, w22 = rotation_matrix(w, x, y, z)
+    a, b, c = 1.0 / s0.to(tl.float64), 1.0 / s1.to(tl.float64), 1.0 / s2.to(tl.float64)
+    return w00 * a, w01 * a, w02 * a, w10 * b, w11 * b, w12 * b, w20 * c, w21 * c, w22 * c
 
 
 @triton.jit
@@ -51,14 +60,14 @@ def _apply(w00, w01, w02, w10, w11, w12, w20, w21, w22, x, y, z):
 
 
 @triton.jit
-def chain(position, n, live, view, w00, w01, w02, w10, w11, w12, w20, w21, w22, CONE: tl.constexpr):
+def chain(p0, p1, p2, view, w00, w01, w02, w10, w11, w12, w20, w21, w22, CONE: tl.constexpr):
     """Depth c, kappa, column0, row0 and the vectors r, w = W r, WU, WV, nu = w x WU, nv = w x WV in float64.
 
     r runs from the source to the Gaussian, or is the direction of parallel rays.
     """
-    r0 = tl.load(position + n * 3, mask=live, other=0.0).to(tl.float64) - tl.load(view)
-    r1 = tl.load(position + n * 3 + 1, mask=live, other=0.0).to(tl.float64) - tl.load(view + 1)
-    r2 = tl.load(position + n * 3 + 2, mask=live, other=0.0).to(tl.float64) - tl.load(view + 2)
+    r0 = p0.to(tl.float64) - tl.load(view)
+    r1 = p1.to(tl.float64) - tl.load(view + 1)
+    r2 = p2.to(tl.float64) - tl.load(view + 2)
     column = dot(tl.load(view + 3), tl.load(view + 4), tl.load(view + 5), r0, r1, r2)
     row = dot(tl.load(view + 6), tl.load(view + 7), tl.load(view + 8), r0, r1, r2)
     depth = dot(tl.load(view + 9), tl.load(view + 10), tl.load(view + 11), r0, r1, r2)
@@ -88,7 +97,7 @@ def chain(position, n, live, view, w00, w01, w02, w10, w11, w12, w20, w21, w22, 
 def _turned(w0, w1, w2, c0, c1, c2, s):
     """Square of one component of S R^T c; zero, not NaN, where an infinite scale does not see c."""
     turned = dot(w0, w1, w2, c0, c1, c2)
-    turned = tl.where(turned != 0, turned * s * s, 0.0)
+    turned = tl.where(turned != 0, turned * s.to(tl.float64) * s, 0.0)
     return turned * turned
 
 
@@ -119,37 +128,42 @@ def _outline(cut, r11, r12, r22, lc, lx, ly, lxx, lxy, lyy, PLANAR: tl.constexpr
 
 
 @triton.jit
-def _store(at, a, b, c, d, live):
-    store_four(at, a.to(tl.float32), b.to(tl.float32), c.to(tl.float32), d.to(tl.float32), live)
+def _store(at, a, b, c, d, every):
+    store_four(at, a.to(tl.float32), b.to(tl.float32), c.to(tl.float32), d.to(tl.float32), every)
 
 
 @triton.jit
-def _weight(weight, n, count, live, k, inverse, CHANNELS: tl.constexpr):
+def _weight(weight, n, count, k, CHANNELS: tl.constexpr):
     if k < CHANNELS:
-        return (tl.load(weight + k * count + n, mask=live, other=0.0) * inverse).to(tl.float32)
-    return tl.zeros_like(inverse).to(tl.float32)
+        return tl.load(weight + k * count + n)
+    return tl.zeros(n.shape, tl.float32)
 
 
 @triton.jit(do_not_specialize=SIZES)
 def _footprint_kernel(
     position, scale, rotation, weight, views, record, skipped, count, rows, columns, cutoff,
-    CHANNELS: tl.constexpr, CONE: tl.constexpr, PLANAR: tl.constexpr, BLOCK: tl.constexpr,
+    CHANNELS: tl.constexpr, CONE: tl.constexpr, PLANAR: tl.constexpr, GROUP: tl.constexpr,
 ):  # fmt: skip
-    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    n = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)
     view = tl.program_id(1).to(tl.int64)
     live = n < count
+    known = tl.minimum(n, count - 1)
+    s0, s1, s2, qw, qx, qy, qz = load_shape(scale, rotation, known)
+    p0, p1, p2 = load_three(position, known)
+    c0, c1 = _weight(weight, known, count, 0, CHANNELS), _weight(weight, known, count, 1, CHANNELS)
+    c2, c3 = _weight(weight, known, count, 2, CHANNELS), _weight(weight, known, count, 3, CHANNELS)
     at = views + view * VIEW
-    w00, w01, w02, w10, w11, w12, w20, w21, w22, s0, s1, s2 = whitening(scale, rotation, n, live)
+    w00, w01, w02, w10, w11, w12, w20, w21, w22 = whitening(s0, s1, s2, qw, qx, qy, qz)
     (
         depth, kappa, column, row, r0, r1, r2, w0, w1, w2, a0, a1, a2, b0, b1, b2,
         nu0, nu1, nu2, nv0, nv1, nv2,
-    ) = chain(position, n, live, at, w00, w01, w02, w10, w11, w12, w20, w21, w22, CONE)  # fmt: skip
+    ) = chain(p0, p1, p2, at, w00, w01, w02, w10, w11, w12, w20, w21, w22, CONE)  # fmt: skip
     valid = live
     if CONE:
         # The cut Gaussian must lie in front of the source plane: its half-width in depth is |S R^T c_row|.
-        c0, c1, c2 = tl.load(at + 9), tl.load(at + 10), tl.load(at + 11)
-        reach = _turned(w00, w01, w02, c0, c1, c2, s0) + _turned(w10, w11, w12, c0, c1, c2, s1)
-        reach += _turned(w20, w21, w22, c0, c1, c2, s2)
+        i0, i1, i2 = tl.load(at + 9), tl.load(at + 10), tl.load(at + 11)
+        reach = _turned(w00, w01, w02, i0, i1, i2, s0) + _turned(w10, w11, w12, i0, i1, i2, s1)
+        reach += _turned(w20, w21, w22, i0, i1, i2, s2)
         valid = live & (depth > 1.001 * cutoff * tl.sqrt(reach))
         behind = tl.sum((live & ~valid).to(tl.int64), 0)
         # Additions to one place wait for each other, and nearly all would add nothing.
@@ -190,16 +204,13 @@ def _footprint_kernel(
         outlined & (yc + ry >= 0) & (yc - ry <= rows - 1) & (xc + reach >= 0) & (xc - reach <= columns - 1)
     )
     ry = tl.where(valid, ry, -1.0)
-    to = record + (view * count + n) * RECORD
-    _store(to, column, row, r11 * ROOT, r12 * ROOT, live)
-    _store(to + 4, r22 * ROOT, 2 * lt, 2 * lu, ltt, live)
-    c0 = _weight(weight, n, count, live, 0, inverse, CHANNELS)
-    c1 = _weight(weight, n, count, live, 1, inverse, CHANNELS)
-    c2 = _weight(weight, n, count, live, 2, inverse, CHANNELS)
-    c3 = _weight(weight, n, count, live, 3, inverse, CHANNELS)
-    _store(to + 8, 2 * ltu, luu, c0, c1, live)
-    _store(to + 12, c2, c3, inverse, hx, live)
-    _store(to + 16, yc, ry, xc, m, live)
+    to = record + (view * tl.num_programs(0) + tl.program_id(0)) * (GROUP * RECORD) + 4 * tl.arange(0, GROUP)
+    every = n >= 0
+    _store(to, column, row, r11 * ROOT, r12 * ROOT, every)
+    _store(to + QUAD, r22 * ROOT, 2 * lt, 2 * lu, ltt, every)
+    _store(to + 2 * QUAD, 2 * ltu, luu, c0 * inverse, c1 * inverse, every)
+    _store(to + 3 * QUAD, c2 * inverse, c3 * inverse, inverse, hx, every)
+    _store(to + 4 * QUAD, yc, ry, xc, m, every)
 
 
 def footprints(
@@ -214,11 +225,12 @@ def footprints(
 ) -> torch.Tensor:
     """``record`` of the module docstring; the number of skipped pairs is added to ``skipped``, 0-dim int64."""
     count, many = len(position), len(views)
-    record = position.new_empty((many, count, RECORD.value))
+    groups = triton.cdiv(count, GROUP)
+    record = position.new_empty((many, groups, RECORD.value // 4, GROUP, 4))
     if count and many:
         with on_device(position):
-            _footprint_kernel[(triton.cdiv(count, _BLOCK), many)](
+            _footprint_kernel[(groups, many)](
                 position, scale, rotation, weight, table, record, skipped, count, views.rows, views.columns,
-                cutoff, CHANNELS=len(weight), CONE=views.cone, PLANAR=views.planar, BLOCK=_BLOCK, num_warps=1,
+                cutoff, CHANNELS=len(weight), CONE=views.cone, PLANAR=views.planar, GROUP=GROUP, num_warps=1,
             )  # fmt: skip
     return record

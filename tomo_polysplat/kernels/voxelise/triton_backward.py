@@ -11,7 +11,7 @@ import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.kernels.triton_lanes import SUMS, load_four, store_sums
-from tomo_polysplat.kernels.triton_maths import HALF_LOG2E, SIZES, dot, on_device, whitening_adjoint
+from tomo_polysplat.kernels.triton_maths import HALF_LOG2E, SIZES, dot, load_shape, on_device, whitening_adjoint
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.kernels.voxelise.triton_setup import RECORD, ROOT, scaled_whitening, triangle
 
@@ -177,23 +177,25 @@ def _pull_back_block(
     scale, rotation, table, moments, grad_position, grad_scale, grad_rotation, grad_weight, n, live, count,
     CHANNELS: tl.constexpr,
 ):  # fmt: skip
-    (
-        t00, t01, t02, t10, t11, t12, t20, t21, t22,
-        a00, a01, a02, a10, a11, a12, a20, a21, a22, s0, s1, s2,
-    ) = scaled_whitening(scale, rotation, table, n, live)  # fmt: skip
-    r11, r12, r13, r22, r23, r33, q00, q10, q20, q01, q11, q21, q02, q12, q22 = triangle(
-        a00, a01, a02, a10, a11, a12, a20, a21, a22
-    )
-    at = moments + tl.minimum(n, count - 1) * SUMS
+    known = tl.minimum(n, count - 1)
+    s0, s1, s2, qw, qx, qy, qz = load_shape(scale, rotation, known)
+    at = moments + known * SUMS
     t, u, v, tt = load_four(at)
     tu, tv, uu, uv = load_four(at + 4)
     vv, _, _, _ = load_four(at + 8)
+    (
+        t00, t01, t02, t10, t11, t12, t20, t21, t22,
+        a00, a01, a02, a10, a11, a12, a20, a21, a22,
+    ) = scaled_whitening(s0, s1, s2, qw, qx, qy, qz, table)  # fmt: skip
+    r11, r12, r13, r22, r23, r33, q00, q10, q20, q01, q11, q21, q02, q12, q22 = triangle(
+        a00, a01, a02, a10, a11, a12, a20, a21, a22
+    )
     # distance^2 = t^2 + u^2 + v^2 in units of ROOT: dL/dA = -q M r^-T, dL/dposition = W^T q m.
     one, two = 1.0 / ROOT, -1.0 / (ROOT * ROOT)
     t, u, v = t.to(tl.float64) * one, u.to(tl.float64) * one, v.to(tl.float64) * one
     tt, tu, tv = tt.to(tl.float64) * two, tu.to(tl.float64) * two, tv.to(tl.float64) * two
     uu, uv, vv = uu.to(tl.float64) * two, uv.to(tl.float64) * two, vv.to(tl.float64) * two
-    a, b, c = 1.0 / s0, 1.0 / s1, 1.0 / s2
+    a, b, c = 1.0 / s0.to(tl.float64), 1.0 / s1.to(tl.float64), 1.0 / s2.to(tl.float64)
     m0, m1, m2 = (
         dot(q00, q01, q02, t, u, v) * a,
         dot(q10, q11, q12, t, u, v) * b,
@@ -209,7 +211,7 @@ def _pull_back_block(
     for k in tl.static_range(CHANNELS):
         tl.store(grad_weight + k * count + n, tl.load(at + 12 + k), mask=live)
     whitening_adjoint(
-        scale, rotation, n, live,
+        s0, s1, s2, qw, qx, qy, qz, n, live,
         t00 * a, t01 * a, t02 * a, t10 * b, t11 * b, t12 * b, t20 * c, t21 * c, t22 * c,
         g00 * sx, g01 * sy, g02 * sz, g10 * sx, g11 * sy, g12 * sz, g20 * sx, g21 * sy, g22 * sz,
         grad_scale, grad_rotation,

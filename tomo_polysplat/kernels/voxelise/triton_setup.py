@@ -17,7 +17,15 @@ import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.kernels.triton_lanes import store_four
-from tomo_polysplat.kernels.triton_maths import HALF_LOG2E, SIZES, dot, on_device, rotation_matrix
+from tomo_polysplat.kernels.triton_maths import (
+    HALF_LOG2E,
+    SIZES,
+    dot,
+    load_shape,
+    load_three,
+    on_device,
+    rotation_matrix,
+)
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 
 __all__ = ["RECORD", "ROOT", "box_table", "ellipsoids", "scaled_whitening", "triangle"]
@@ -35,18 +43,15 @@ def box_table(box: VoxelBox, device: torch.device) -> torch.Tensor:
 
 
 @triton.jit
-def scaled_whitening(scale, rotation, table, n, live):
-    """R^T row by row, then ``A = diag(1/scale) R^T diag(spacing)`` row by row, then scale, in float64."""
-    t00, t01, t02, t10, t11, t12, t20, t21, t22 = rotation_matrix(rotation, n, live)
-    s0 = tl.load(scale + n * 3, mask=live, other=1.0).to(tl.float64)
-    s1 = tl.load(scale + n * 3 + 1, mask=live, other=1.0).to(tl.float64)
-    s2 = tl.load(scale + n * 3 + 2, mask=live, other=1.0).to(tl.float64)
+def scaled_whitening(s0, s1, s2, w, x, y, z, table):
+    """R^T row by row, then ``A = diag(1/scale) R^T diag(spacing)`` row by row, in float64."""
+    t00, t01, t02, t10, t11, t12, t20, t21, t22 = rotation_matrix(w, x, y, z)
     x, y, z = tl.load(table + 3), tl.load(table + 4), tl.load(table + 5)
-    a, b, c = 1.0 / s0, 1.0 / s1, 1.0 / s2
+    a, b, c = 1.0 / s0.to(tl.float64), 1.0 / s1.to(tl.float64), 1.0 / s2.to(tl.float64)
     return (
         t00, t01, t02, t10, t11, t12, t20, t21, t22,
         t00 * a * x, t01 * a * y, t02 * a * z, t10 * b * x, t11 * b * y, t12 * b * z,
-        t20 * c * x, t21 * c * y, t22 * c * z, s0, s1, s2,
+        t20 * c * x, t21 * c * y, t22 * c * z,
     )  # fmt: skip
 
 
@@ -76,9 +81,8 @@ def triangle(a00, a01, a02, a10, a11, a12, a20, a21, a22):
 
 
 @triton.jit
-def _centre(position, table, n, live, axis):
-    p = tl.load(position + n * 3 + axis, mask=live, other=0.0).to(tl.float64)
-    return (p - tl.load(table + axis)) / tl.load(table + 3 + axis)
+def _centre(p, table, axis):
+    return (p.to(tl.float64) - tl.load(table + axis)) / tl.load(table + 3 + axis)
 
 
 @triton.jit
@@ -96,9 +100,9 @@ def _store(at, a, b, c, d, live):
 
 
 @triton.jit
-def _weight(weight, n, count, live, k, CHANNELS: tl.constexpr):
+def _weight(weight, n, count, k, CHANNELS: tl.constexpr):
     if k < CHANNELS:
-        return tl.load(weight + k * count + n, mask=live, other=0.0)
+        return tl.load(weight + k * count + n)
     return tl.zeros(n.shape, tl.float32)
 
 
@@ -109,10 +113,15 @@ def _ellipsoid_kernel(
 ):  # fmt: skip
     n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = n < count
+    known = tl.minimum(n, count - 1)
+    s0, s1, s2, qw, qx, qy, qz = load_shape(scale, rotation, known)
+    p0, p1, p2 = load_three(position, known)
+    w0, w1 = _weight(weight, known, count, 0, CHANNELS), _weight(weight, known, count, 1, CHANNELS)
+    w2, w3 = _weight(weight, known, count, 2, CHANNELS), _weight(weight, known, count, 3, CHANNELS)
     (
         t00, t01, t02, t10, t11, t12, t20, t21, t22,
-        a00, a01, a02, a10, a11, a12, a20, a21, a22, s0, s1, s2,
-    ) = scaled_whitening(scale, rotation, table, n, live)  # fmt: skip
+        a00, a01, a02, a10, a11, a12, a20, a21, a22,
+    ) = scaled_whitening(s0, s1, s2, qw, qx, qy, qz, table)  # fmt: skip
     r11, r12, r13, r22, r23, r33, _, _, _, _, _, _, _, _, _ = triangle(
         a00, a01, a02, a10, a11, a12, a20, a21, a22
     )
@@ -120,15 +129,10 @@ def _ellipsoid_kernel(
     y = cutoff * _reach(t01, t11, t21, s0, s1, s2) / tl.load(table + 4) + _SLACK
     z = cutoff * _reach(t02, t12, t22, s0, s1, s2) / tl.load(table + 5) + _SLACK
     to = record + n * RECORD
-    cx, cy, cz = (
-        _centre(position, table, n, live, 0), _centre(position, table, n, live, 1),
-        _centre(position, table, n, live, 2),
-    )  # fmt: skip
+    cx, cy, cz = _centre(p0, table, 0), _centre(p1, table, 1), _centre(p2, table, 2)
     _store(to, cx, cy, cz, r11 * ROOT, live)
     _store(to + 4, r12 * ROOT, r13 * ROOT, r22 * ROOT, r23 * ROOT, live)
     _store(to + 8, r33 * ROOT, x, y, z, live)
-    w0, w1 = _weight(weight, n, count, live, 0, CHANNELS), _weight(weight, n, count, live, 1, CHANNELS)
-    w2, w3 = _weight(weight, n, count, live, 2, CHANNELS), _weight(weight, n, count, live, 3, CHANNELS)
     store_four(to + 12, w0, w1, w2, w3, live)
 
 
