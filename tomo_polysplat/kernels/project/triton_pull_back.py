@@ -12,7 +12,15 @@ import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.kernels.project.triton_setup import ROOT, VIEW, chain, whitening
 from tomo_polysplat.kernels.triton_lanes import SUMS, load_four
-from tomo_polysplat.kernels.triton_maths import SIZES, cross, dot, load_shape, load_three, on_device, whitening_adjoint
+from tomo_polysplat.kernels.triton_maths import (
+    SIZES,
+    cross,
+    dot,
+    load_shape,
+    load_three,
+    on_device,
+    whitening_adjoint,
+)
 from tomo_polysplat.kernels.views import DetectorViews
 
 __all__ = ["pull_back"]

@@ -11,7 +11,14 @@ import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.kernels.triton_lanes import SUMS, load_four, store_sums
-from tomo_polysplat.kernels.triton_maths import HALF_LOG2E, SIZES, dot, load_shape, on_device, whitening_adjoint
+from tomo_polysplat.kernels.triton_maths import (
+    HALF_LOG2E,
+    SIZES,
+    dot,
+    load_shape,
+    on_device,
+    whitening_adjoint,
+)
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.kernels.voxelise.triton_setup import RECORD, ROOT, scaled_whitening, triangle
 
