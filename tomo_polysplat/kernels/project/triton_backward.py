@@ -163,7 +163,7 @@ def _pixel_moments_kernel(
 
 
 def sum_moments(record, pixels: torch.Tensor, channels: int, views: DetectorViews) -> torch.Tensor:
-    """(views, Gaussians of whole groups, 16) sums over each footprint, with t = r11 x + r12 y and u = r22 y of the record.
+    """(views, Gaussians of whole groups, 16) sums over each footprint, with t = r11 x + r12 y and u = r22 y.
 
     First of h (t, u, t^2, tu, u^2), from 5 of s (1, t, u, t^2, tu, u^2), from 11 of f dL/df by channel, where
     dL/d(distance^2 |e|^2) = -h / 2 and dL/d|e|^2 = -s / 2, all in units of |e_centre|; last 1 / |e_centre| itself, 0

@@ -91,8 +91,9 @@ def _sum_tile(
 ):
     """Sums of the Gaussians ``found`` at a row of every lane, from ``column`` on and STEP columns apart.
 
-    Both halves of the warp have the same four pixels and every other Gaussian, the lower one those of ``odd`` rank. In the end the lower half has
-    the sums of the first and the third pixel, by channel, and the ``upper`` half those of the second and fourth.
+    Both halves of the warp have the same four pixels and every other Gaussian, the lower one those of ``odd`` rank.
+    In the end the lower half has the sums of the first and the third pixel, by channel, and the ``upper`` half those
+    of the second and fourth.
     """
     zero = tl.zeros([32], tl.float32)
     a0, a1, a2, a3, b0, b1, b2, b3 = zero, zero, zero, zero, zero, zero, zero, zero

@@ -2,12 +2,12 @@
 
 README.md has the formulas.
 
-``record`` (views, groups, GROUP_RECORD) holds neighbours in the list in the order of their size, as those of like size are
-worked on together: by fours, side by side, the twenty numbers below, and then which one of the group each is. Beyond the
-last Gaussian there are some that miss the detector. Of one, with x and y counted from the projected centre:
+``record`` (views, groups, GROUP_RECORD) holds neighbours in the list in the order of their size, as those of like size
+are worked on together: by fours, side by side, the twenty numbers below, and then which one of the group each is. Beyond
+the last Gaussian there are some that miss the detector. Of one, with x and y counted from the projected centre:
 
 * 0, 1: column and row of the projected centre;
-* 2-4: r11, r12, r22 of t = r11 x + r12 y and u = r22 y, with q = (t^2 + u^2) / l, the squared distance times HALF_LOG2E;
+* 2-4: r11, r12, r22 of t = r11 x + r12 y and u = r22 y; q = (t^2 + u^2) / l is the squared distance times HALF_LOG2E;
 * 5-9: l = 1 + t (l5 + l7 t + l8 u) + u (l6 + l9 u) = |e|^2 / |e_centre|^2 (one for parallel rays);
 * 10-13: the weights, times 1 / |e_centre|, which is
 * 14: itself;

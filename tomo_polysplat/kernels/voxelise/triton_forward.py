@@ -43,7 +43,7 @@ def _window(centre, half, live, length):
 def _columns(
     xc, yc, zc, r11, r12, r13, r22, r23, r33, half_x, live, y, z, nx, cut, H: tl.constexpr, D: tl.constexpr
 ):
-    """First and last column that ellipsoids can reach along a beam of H x D lines around (y, z); the last is -1 where none.
+    """First and last column that ellipsoids can reach along a beam of H x D lines around (y, z); -1 is last where none.
 
     From the least that each of q's other terms, and the farthest that the middle of a line, comes to in the beam:
     never too narrow.
