@@ -18,7 +18,6 @@ __all__ = [
     "add_halves",
     "add_within",
     "adds_four",
-    "ask_for",
     "by_size",
     "from_lane",
     "lane_set",
@@ -52,16 +51,6 @@ def load_four(at):
         "ld.global.nc.v4.f32 {$0, $1, $2, $3}, [$4];", "=f,=f,=f,=f,l", [at.to(tl.int64)],
         dtype=(tl.float32, tl.float32, tl.float32, tl.float32), is_pure=True, pack=1,
     )  # fmt: skip
-
-
-@triton.jit
-def ask_for(at):
-    """Have the cache fetch the line that ``at`` lies in, which is read a little later."""
-    if not _INTERPRETED:
-        tl.inline_asm_elementwise(
-            "prefetch.global.L1 [$1]; mov.u32 $0, 0;", "=r,l", [at.to(tl.int64)],
-            dtype=tl.int32, is_pure=False, pack=1,
-        )  # fmt: skip
 
 
 @triton.jit

@@ -11,16 +11,16 @@ import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.kernels.project.triton_image import folded, spread
 from tomo_polysplat.kernels.project.triton_setup import GROUP_RECORD, ORDER, QUAD, SLACK
-from tomo_polysplat.kernels.triton_lanes import SUMS, ask_for, load_four, store_sums, widest
+from tomo_polysplat.kernels.triton_lanes import SUMS, load_four, store_sums, widest
 from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, SIZES, on_device
 from tomo_polysplat.kernels.views import DetectorViews
 
 __all__ = ["sum_moments"]
 
 _PROGRAMS = 1 << 14  # enough to fill the device: groups of neighbours are halved where there are fewer
-# From so many pixels on it pays to ask for the next row's gradient while one row is walked: 2 % off the adjoint of
-# footprints of 250 pixels, while those of 10 would take 6 % longer.
-_WIDE = tl.constexpr(10)
+# Of a lane. With fewer the compiler reads pixels one by one instead of four at a time, and every read is waited for;
+# with more there are fewer warps to wait beside each other.
+_REGISTERS = 88
 _TINY = tl.constexpr(1e-20)
 _TWO_LN2 = tl.constexpr(1 / HALF_LOG2E)
 
@@ -92,9 +92,6 @@ def _pixel_moments_kernel(
             x = (first - middle) + across.to(tl.float32)
             pixel = (tl.minimum(block, last_block) * columns + first.to(tl.int32) + across) * BLOCK_H + down
             pixel = grad + pixel.to(tl.int64) * SPREAD
-            if width > _WIDE:
-                # The next row's, of two lines of the cache: there is time until it is read.
-                ask_for(pixel + (columns * (BLOCK_H * SPREAD) + 32 * down))
             shift = r11 * (middle - column0) + r12 * y
             l0, l1 = 1.0 + u * (lu + luu * u), lt + ltu * u
             block += 1
@@ -177,5 +174,6 @@ def sum_moments(record, pixels: torch.Tensor, channels: int, views: DetectorView
         _pixel_moments_kernel[(groups * parts, many)](
             record, pixels, moments, views.rows, views.columns, parts, CHANNELS=channels, CONE=views.cone,
             BLOCK_H=folded(views), SPREAD=spread(channels), GROUP=GROUP, num_warps=1, num_stages=1,
+            maxnreg=_REGISTERS if channels > 1 else None,
         )  # fmt: skip
     return moments

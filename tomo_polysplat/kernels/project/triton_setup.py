@@ -3,7 +3,7 @@
 README.md has the formulas.
 
 ``record`` (views, groups, GROUP_RECORD) holds neighbours in the list in the order of their size, as those of like size
-are worked on together: by fours, side by side, the twenty numbers below, and then which one of the group each is. Beyond
+are worked on together: by fours, side by side, the twenty numbers below, and then which one of the group each is. After
 the last Gaussian there are some that miss the detector. Of one, with x and y counted from the projected centre:
 
 * 0, 1: column and row of the projected centre;
