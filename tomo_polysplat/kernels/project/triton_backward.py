@@ -10,17 +10,14 @@ import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.kernels.project.triton_image import folded, spread
-from tomo_polysplat.kernels.project.triton_setup import GROUP_RECORD, ORDER, QUAD, SLACK
-from tomo_polysplat.kernels.triton_lanes import SUMS, load_four, store_sums, widest
+from tomo_polysplat.kernels.project.triton_setup import QUAD, RECORD, SLACK
+from tomo_polysplat.kernels.triton_lanes import SUMS, by_size, from_lane, load_four, store_sums, widest
 from tomo_polysplat.kernels.triton_maths import GROUP, HALF_LOG2E, SIZES, on_device
 from tomo_polysplat.kernels.views import DetectorViews
 
 __all__ = ["sum_moments"]
 
 _PROGRAMS = 1 << 14  # enough to fill the device: groups of neighbours are halved where there are fewer
-# Of a lane. With fewer the compiler reads pixels one by one instead of four at a time, and every read is waited for;
-# with more there are fewer warps to wait beside each other.
-_REGISTERS = 88
 _TINY = tl.constexpr(1e-20)
 _TWO_LN2 = tl.constexpr(1 / HALF_LOG2E)
 
@@ -44,19 +41,20 @@ def _pixel_moments_kernel(
 ):  # fmt: skip
     view = tl.program_id(1).to(tl.int64)
     last_block = (rows - 1) // BLOCK_H
+    # What the warp does at a time takes as long as the largest footprint: like ones together.
     group, part = tl.program_id(0) // parts, tl.program_id(0) % parts
-    record += (view * (tl.num_programs(0) // parts) + group) * GROUP_RECORD
+    record += (view * (tl.num_programs(0) // parts) + group) * (GROUP * RECORD)
     moments += (view * (tl.num_programs(0) // parts) + group) * (GROUP * SUMS)
     grad += view * (last_block + 1) * columns * (BLOCK_H * SPREAD)
     lane = tl.arange(0, 32)
     BLOCK_W: tl.constexpr = 2 // BLOCK_H
     down, across = lane % 2 // BLOCK_W, lane % BLOCK_W
     zero = tl.zeros([32], tl.float32)
+    own = record + 4 * lane
+    order = by_size(tl.load(own + (4 * QUAD + 1)) * tl.load(own + (3 * QUAD + 3)), lane)
     for turn in range(part, 2, parts):
-        # What the warp does at a time takes as long as the largest footprint: like ones together, as they lie.
-        place = turn * 16 + lane // 2
-        at = record + 4 * place
-        n = tl.load(record + ORDER + place).to(tl.int32, bitcast=True)
+        n = from_lane(order, turn * 16 + lane // 2)
+        at = record + 4 * n
         column0, row0, r11, r12 = load_four(at)
         r22, lt, lu, ltt = load_four(at + QUAD)
         ltu, luu, w0, w1 = load_four(at + 2 * QUAD)
@@ -174,6 +172,5 @@ def sum_moments(record, pixels: torch.Tensor, channels: int, views: DetectorView
         _pixel_moments_kernel[(groups * parts, many)](
             record, pixels, moments, views.rows, views.columns, parts, CHANNELS=channels, CONE=views.cone,
             BLOCK_H=folded(views), SPREAD=spread(channels), GROUP=GROUP, num_warps=1, num_stages=1,
-            maxnreg=_REGISTERS if channels > 1 else None,
         )  # fmt: skip
     return moments

@@ -14,7 +14,7 @@ import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.kernels.project.triton_image import spread
-from tomo_polysplat.kernels.project.triton_setup import GROUP_RECORD, QUAD
+from tomo_polysplat.kernels.project.triton_setup import QUAD, RECORD
 from tomo_polysplat.kernels.triton_lanes import (
     add_four,
     add_within,
@@ -78,17 +78,9 @@ def _add_value(
 
 @triton.jit
 def _sum_tile(
-    record,
-    found,
-    odd,
-    upper,
-    column,
-    row,
-    cut,
-    CHANNELS: tl.constexpr,
-    CONE: tl.constexpr,
-    STEP: tl.constexpr,
-):
+    record, found, odd, upper, column, row, cut,
+    CHANNELS: tl.constexpr, CONE: tl.constexpr, STEP: tl.constexpr,
+):  # fmt: skip
     """Sums of the Gaussians ``found`` at a row of every lane, from ``column`` on and STEP columns apart.
 
     Both halves of the warp have the same four pixels and every other Gaussian, the lower one those of ``odd`` rank.
@@ -148,7 +140,7 @@ def _splat_pixels_kernel(
     shift = grain(largest, GRAINED)
     group, part = tl.program_id(0) // parts, tl.program_id(0) % parts
     view = tl.program_id(1).to(tl.int64)
-    record += (view * (tl.num_programs(0) // parts) + group) * GROUP_RECORD
+    record += (view * (tl.num_programs(0) // parts) + group) * (GROUP * RECORD)
     image += view * rows * columns * SPREAD
     lane = tl.arange(0, GROUP)
     yc, ry, xc, m, hx = _outlines(record, lane)
@@ -176,17 +168,8 @@ def _splat_pixels_kernel(
                 if odd != 0:
                     i, j = top + down, left + across
                     a0, a1, a2, a3, c0, c1, c2, c3 = _sum_tile(
-                        record,
-                        found,
-                        odd,
-                        upper,
-                        j.to(tl.float32),
-                        i.to(tl.float32),
-                        cut,
-                        CHANNELS,
-                        CONE,
-                        STEP,
-                    )
+                        record, found, odd, upper, j.to(tl.float32), i.to(tl.float32), cut, CHANNELS, CONE, STEP,
+                    )  # fmt: skip
                     j += tl.where(upper, STEP, 0)
                     _add_pixel(image, i, j, rows, columns, a0, a1, a2, a3, shift, CHANNELS, AT_ONCE, GRAINED)
                     j += 2 * STEP

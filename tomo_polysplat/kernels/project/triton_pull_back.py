@@ -26,9 +26,10 @@ from tomo_polysplat.kernels.views import DetectorViews
 __all__ = ["pull_back"]
 
 _BLOCK = 64
-# Of a lane. It would take 208, with which too few warps are at work to hide what each waits for: 58 us for 66 (194 000
-# Gaussians, four views). With 128 it spills too much.
-_REGISTERS = 232
+# Of a lane, of one view and of several. All is read at the head, which holds registers: 200 000 Gaussians in one view
+# take 16.4 us with 232 and 19.8 with 168. In several views more warps hide better what each waits for (194 000 in four:
+# 66 us with 208, 58 with 168); with 128 it spills too much.
+_REGISTERS = (232, 168)
 
 
 @triton.jit
@@ -178,6 +179,7 @@ def pull_back(
     with on_device(position):
         _pull_back_kernel[(triton.cdiv(len(position), _BLOCK),)](
             position, scale, rotation, table, moments, *grads, len(position), moments.shape[1], len(views),
-            CHANNELS=len(weight), CONE=views.cone, PLANAR=views.planar, BLOCK=_BLOCK, num_warps=2, maxnreg=_REGISTERS,
+            CHANNELS=len(weight), CONE=views.cone, PLANAR=views.planar, BLOCK=_BLOCK, num_warps=2,
+            maxnreg=_REGISTERS[len(views) > 1],
         )  # fmt: skip
     return grads

@@ -2,9 +2,8 @@
 
 README.md has the formulas.
 
-``record`` (views, groups, GROUP_RECORD) holds neighbours in the list in the order of their size, as those of like size
-are worked on together: by fours, side by side, the twenty numbers below, and then which one of the group each is. After
-the last Gaussian there are some that miss the detector. Of one, with x and y counted from the projected centre:
+``record`` (views, groups, 5, GROUP, 4) holds the twenty numbers below by fours, those of neighbours in the list side by
+side; after the last Gaussian come some that miss the detector. With x and y counted from the projected centre:
 
 * 0, 1: column and row of the projected centre;
 * 2-4: r11, r12, r22 of t = r11 x + r12 y and u = r22 y; q = (t^2 + u^2) / l is the squared distance times HALF_LOG2E;
@@ -23,7 +22,7 @@ import torch
 import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
-from tomo_polysplat.kernels.triton_lanes import by_size, from_lane, store_four
+from tomo_polysplat.kernels.triton_lanes import store_four
 from tomo_polysplat.kernels.triton_maths import (
     GROUP,
     HALF_LOG2E,
@@ -37,11 +36,10 @@ from tomo_polysplat.kernels.triton_maths import (
 )
 from tomo_polysplat.kernels.views import DetectorViews
 
-__all__ = ["GROUP_RECORD", "ORDER", "QUAD", "ROOT", "SLACK", "VIEW", "chain", "footprints", "whitening"]
+__all__ = ["QUAD", "RECORD", "ROOT", "SLACK", "VIEW", "chain", "footprints", "whitening"]
 
+RECORD = tl.constexpr(20)
 QUAD = tl.constexpr(4 * GROUP)  # from four numbers of a Gaussian to its next four
-ORDER = tl.constexpr(5 * 4 * GROUP)  # to who is who
-GROUP_RECORD = tl.constexpr(21 * GROUP)
 VIEW = tl.constexpr(21)  # origin, inverse and matrix of a view, row by row
 ROOT = tl.constexpr(HALF_LOG2E**0.5)
 SLACK = tl.constexpr(0.01)  # of a pixel, on the outline: rounding must not cut what q still includes
@@ -129,14 +127,8 @@ def _outline(cut, r11, r12, r22, lc, lx, ly, lxx, lxy, lyy, PLANAR: tl.constexpr
 
 
 @triton.jit
-def _in_order(value, order):
-    return from_lane(value.to(tl.float32).to(tl.int32, bitcast=True), order).to(tl.float32, bitcast=True)
-
-
-@triton.jit
-def _store(at, a, b, c, d, order):
-    a, b, c, d = _in_order(a, order), _in_order(b, order), _in_order(c, order), _in_order(d, order)
-    store_four(at, a, b, c, d, order >= 0)
+def _store(at, a, b, c, d, every):
+    store_four(at, a.to(tl.float32), b.to(tl.float32), c.to(tl.float32), d.to(tl.float32), every)
 
 
 @triton.jit
@@ -211,16 +203,13 @@ def _footprint_kernel(
         outlined & (yc + ry >= 0) & (yc - ry <= rows - 1) & (xc + reach >= 0) & (xc - reach <= columns - 1)
     )
     ry = tl.where(valid, ry, -1.0)
-    lane = tl.arange(0, GROUP)
-    order = by_size((ry * hx).to(tl.float32), lane)
-    group = record + (view * tl.num_programs(0) + tl.program_id(0)) * GROUP_RECORD
-    to = group + 4 * lane
-    _store(to, column, row, r11 * ROOT, r12 * ROOT, order)
-    _store(to + QUAD, r22 * ROOT, 2 * lt, 2 * lu, ltt, order)
-    _store(to + 2 * QUAD, 2 * ltu, luu, c0 * inverse, c1 * inverse, order)
-    _store(to + 3 * QUAD, c2 * inverse, c3 * inverse, inverse, hx, order)
-    _store(to + 4 * QUAD, yc, ry, xc, m, order)
-    tl.store(group + ORDER + lane, order.to(tl.float32, bitcast=True))
+    to = record + (view * tl.num_programs(0) + tl.program_id(0)) * (GROUP * RECORD) + 4 * tl.arange(0, GROUP)
+    every = n >= 0
+    _store(to, column, row, r11 * ROOT, r12 * ROOT, every)
+    _store(to + QUAD, r22 * ROOT, 2 * lt, 2 * lu, ltt, every)
+    _store(to + 2 * QUAD, 2 * ltu, luu, c0 * inverse, c1 * inverse, every)
+    _store(to + 3 * QUAD, c2 * inverse, c3 * inverse, inverse, hx, every)
+    _store(to + 4 * QUAD, yc, ry, xc, m, every)
 
 
 def footprints(
@@ -236,7 +225,7 @@ def footprints(
     """``record`` of the module docstring; the number of skipped pairs is added to ``skipped``, 0-dim int64."""
     count, many = len(position), len(views)
     groups = triton.cdiv(count, GROUP)
-    record = position.new_empty((many, groups, GROUP_RECORD.value))
+    record = position.new_empty((many, groups, RECORD.value // 4, GROUP, 4))
     if count and many:
         with on_device(position):
             _footprint_kernel[(groups, many)](

@@ -153,16 +153,8 @@ def _splat_voxels_kernel(
                 odd = odd_ranks(found)
                 if odd != 0:
                     a0, a1, a2, a3, c0, c1, c2, c3 = _sum_brick(
-                        record,
-                        found,
-                        odd,
-                        upper,
-                        left + 0.0,
-                        iy.to(tl.float32),
-                        iz.to(tl.float32),
-                        cut,
-                        CHANNELS,
-                    )
+                        record, found, odd, upper, left + 0.0, iy.to(tl.float32), iz.to(tl.float32), cut, CHANNELS,
+                    )  # fmt: skip
                     ix = left + upper.to(tl.int32)
                     inside = (ix < nx) & (iy < ny) & (iz < nz)
                     _add_voxel(line + ix, stride, inside, a0, a1, a2, a3, shift, CHANNELS, GRAINED)
