@@ -18,6 +18,7 @@ from tomo_polysplat.fit.preparation import PreparedFit, RunOptions
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.soft_matter import describe_soft
 from tomo_polysplat.fit.solver import Solver
+from tomo_polysplat.fit.surroundings import cut_out
 from tomo_polysplat.fit.unit_check import tell_impossible
 from tomo_polysplat.interrupts import postponed_interrupts
 from tomo_polysplat.kernels.device import one_torch_thread, usual_modes
@@ -138,7 +139,8 @@ def reconstruct(
     spectrum = require_spectrum("spectrum", spectrum)
     geometry, grid = from_astra(proj_geom, vol_geom)
     values, counts = usable_rays(projections, proj_geom, valid, water_correction, spectrum)
-    problem = Problem.of(values, geometry, grid, unit, spectrum, materials)
+    widest = run_options.settings.surroundings
+    problem = Problem.of(values, geometry, grid, unit, spectrum, materials, widest)
     # Sorted, they may be a copy: these would stay in memory beside it.
     del values
     wanted = Calibration.of(calibrate, soft_density, problem.spectrum)
@@ -202,7 +204,7 @@ def _result(
         number, tunables = float(gaussians.shared_material[0]), about["settings"]
         plan.reasons["soft_material"] = describe_soft(number, plan.soft_u, tunables["soft_gain"])
     with torch.no_grad():
-        own = to_host(scene.basis(gaussians) * plan.reference)
+        own = cut_out(to_host(scene.basis(gaussians) * plan.reference), problem.margin)
         heights = gaussians.weights(scene.reference_curve).sum(dim=0)
         parts = {
             "position": gaussians.position.cpu().numpy() * length + problem.centre,

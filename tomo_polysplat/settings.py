@@ -56,6 +56,9 @@ class Settings:
     """Smallest standard deviation in voxels, or in seed spacings where seeds are closer; 0 leaves it to the plan."""
     largest_scale: float = 8.0
     """Largest standard deviation in seed spacings."""
+    surroundings: float = 0.5
+    """Share of its edges that the volume is widened by at most on every side, while it is fitted, where the object
+    reaches beyond both the detector and the volume; 0: never."""
     bone_level: float = 2.2
     """Start attenuation, in soft references, above which matter is bone-like, and material numbers are free near it."""
     metal_level: float = 6.0

@@ -24,6 +24,7 @@ from tomo_polysplat.fit.plan_seeds import finest_spacing
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.spectral_model import OPAQUE, spectral_model
+from tomo_polysplat.fit.surroundings import widened_grid
 from tomo_polysplat.kernels import select
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.model.seed import seed_gaussians
@@ -83,6 +84,10 @@ class Problem:
         That the rays hold besides what passes.
     beam : float
         Brightness of the beam, in those of the open field that the rays are relative to.
+    margin : (y, x) int
+        Voxels that the grid has more on either side than the volume that is asked for; see `fit.surroundings`.
+    surroundings : str
+        Why, if so.
     """
 
     projections: np.ndarray
@@ -96,6 +101,8 @@ class Problem:
     materials: Materials | None = None
     scatter: Scatter = Scatter()
     beam: float = 1.0
+    margin: tuple[int, int] = (0, 0)
+    surroundings: str = ""
     _known: _Known = field(default_factory=_Known, init=False, repr=False)
 
     @classmethod
@@ -107,12 +114,17 @@ class Problem:
         unit: str,
         spectrum: Spectrum | None,
         materials: Materials | Sequence[Any] | None,
+        surroundings: float = 0.0,
     ) -> Problem:
-        """The problem of a scan in the caller's unit, its views sorted; one energy makes it monochromatic."""
+        """The problem of a scan in the caller's unit, its views sorted; one energy makes it monochromatic.
+
+        The grid may be wider by as much as the share ``surroundings`` on every side.
+        """
         require_choice("unit", unit, LENGTH_UNITS)
         if spectrum is not None and spectrum.is_monochromatic:
             spectrum = None
         curves = Materials.under(materials, None if spectrum is None else spectrum.effective_energy)
+        grid, margin, why = widened_grid(projections, geometry, grid, surroundings)
         planar = geometry.planar and grid.planar
         # A plane beside the slice is another plane.
         planar = planar and bool(grid.lower[2] <= geometry.corner[0, 2] <= grid.upper[2])
@@ -123,7 +135,10 @@ class Problem:
         order = view_order(outside, projections)
         if (np.diff(order) != 1).any():
             projections, outside = projections[order], outside.select(order)
-        return cls(projections, outside, inside, grid.centre, length, depth, planar, spectrum, curves)
+        return cls(
+            projections, outside, inside, grid.centre, length, depth, planar, spectrum, curves,
+            margin=margin, surroundings=why,
+        )  # fmt: skip
 
     @property
     def polychromatic(self) -> bool:
@@ -223,7 +238,11 @@ class Problem:
     def _closed(self, device: torch.device) -> tuple[bool, str]:
         """Whether no matter lies beside the volume, and words that say so."""
         if self._known.closed is None:
-            self._known.closed = matter_is_inside(self._copied(device), self.geometry, self.grid)
+            self._known.closed = (
+                (False, self.surroundings)
+                if self.surroundings
+                else matter_is_inside(self._copied(device), self.geometry, self.grid)
+            )
         return self._known.closed
 
     def scene(self, plan: Plan, settings: Settings, device: torch.device) -> FitScene:

@@ -21,6 +21,7 @@ from tomo_polysplat.fit.preparation import PreparedFit, RunOptions, calibrate, p
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.scatter_search import ScatterSearch, scatter_search
 from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.surroundings import cut_out
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.transfer import to_host
 
@@ -155,7 +156,7 @@ def _volume_of(
 
     def volume(gaussians: Gaussians) -> np.ndarray:
         with torch.no_grad():
-            whole = to_host(scene.volume(gaussians) * factor)
+            whole = cut_out(to_host(scene.volume(gaussians) * factor), problem.margin)
         return np.ascontiguousarray(whole[0, ::-1]) if flipped else whole
 
     return volume

@@ -11,8 +11,9 @@ import torch
 from tomo_polysplat.checks import fail, require_array, require_shape
 from tomo_polysplat.scan.defects import fill_invalid
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.start.continued import continued
 from tomo_polysplat.start.fdk import fdk, fits_fdk
-from tomo_polysplat.start.on_gpu import fdk_on_gpu
+from tomo_polysplat.start.on_gpu import fdk_on_gpu, fill_rows
 from tomo_polysplat.start.sirt import sirt
 from tomo_polysplat.start.source_planes import beyond_sources
 
@@ -43,7 +44,10 @@ def initial_volume_on(
     if projections.is_cuda:
         fits, reason = _method(geometry, grid)
         try:
-            volume = fdk_on_gpu(projections, geometry, grid) if fits else None
+            if fits:
+                wide, wider, longer = continued(fill_rows(projections), geometry)
+                volume = fdk_on_gpu(wide, wider, grid)
+                reason += longer
         except RuntimeError as problem:
             # Torch's, or ASTRA's, whose memory comes on top of torch's.
             _log.warning("The start is made on the CPU: %s", problem)
@@ -114,7 +118,10 @@ def initial_volume(
     invalid, volume = int((~usable).sum()), None
     if fits:
         # Smooth: the noise of a sharp filter would be seeded as if it were matter.
-        volume = fdk(fill_invalid(projections, usable), geometry, grid, filter_name="hann", device=device)
+        filled = torch.from_numpy(np.ascontiguousarray(fill_invalid(projections, usable), dtype=np.float32))
+        wide, wider, longer = continued(filled, geometry)
+        volume = fdk(wide.numpy(), wider, grid, filter_name="hann", device=device)
+        reason += longer
         if not np.isfinite(volume).all():
             fits, reason = False, f"filtered backprojection is not finite ({reason})"
             _log.warning("The start is made by SIRT: %s.", reason)

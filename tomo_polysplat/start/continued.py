@@ -1,0 +1,102 @@
+"""Rows of a detector that does not see all of the object, continued beyond both of its ends.
+
+Filtered backprojection takes what lies beyond the ends for nothing. The ramp makes a step at an end of that, which
+comes out as a bright rim of what is seen and as emptiness beyond.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+
+from tomo_polysplat.scan.geometry import Geometry
+
+__all__ = ["continued", "half_width"]
+
+# A row sees the object where its largest ray has this part of a typical one, and an end sees matter where it has that.
+# The object is cut where both ends do in this share of the rows that see it.
+_OBJECT, _NOTHING, _MOST = 0.5, 0.1, 0.5
+# Share of the columns whose mean an end is taken for, against noise.
+_END = 0.02
+# Rays through metal would tell of a smaller object than there is: what is more than this many typical rays counts as so
+# much. In six scans of 40^3 of which a third to a half was not seen the half-width is told within 1.2 columns so.
+_DENSE = 1.5
+# Views, and rows of each, that tell.
+_VIEWS, _ROWS = 48, 64
+# Columns that a row is continued by, as shares of those it has: even a square object ends, and a round one is never so
+# large that more would matter.
+_LEAST, _FARTHEST = 0.05, 0.75
+
+
+def half_width(projections: torch.Tensor) -> float | None:
+    """Columns from the detector's middle to where an object ends that is cut at both ends of its rows; else None.
+
+    It is cut where most rows that see the object see it at both of their ends. Where a homogeneous ellipse would end,
+    the square of line integrals falls to zero; it falls with the square of the distance from the middle, by as much as
+    the mean row of the object does over the columns there are.
+
+    Parameters
+    ----------
+    projections : (views, rows, columns) tensor
+        -log(I/I0); what is not finite sees nothing.
+    """
+    values = _some(projections).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
+    top = float(values.max()) if values.numel() else 0.0
+    if top <= 0:
+        return None
+    typical = float(values[values > _NOTHING * top].median())
+    rows = values[values.amax(dim=-1) > _OBJECT * typical].clamp(max=_DENSE * typical)
+    both = _ends(rows).amin(dim=-1) > _NOTHING * typical
+    if not len(rows) or both.float().mean() <= _MOST:
+        return None
+    columns = projections.shape[2]
+    half = 0.5 * (columns - 1)
+    square = rows.mean(dim=0).double() ** 2
+    x = torch.arange(columns, device=square.device, dtype=square.dtype) - half
+    place = x**2 - (x**2).mean()
+    slope = -float((square * place).sum() / (place**2).sum())
+    height = float(square.mean()) + slope * float((x**2).mean())
+    # A mean row that does not fall towards its ends tells of no end.
+    reach = math.sqrt(height / slope) if slope > 0 else math.inf
+    return min(max(reach, half + _LEAST * columns), half + _FARTHEST * columns)
+
+
+def continued(projections: torch.Tensor, geometry: Geometry) -> tuple[torch.Tensor, Geometry, str]:
+    """The projections and geometry with as many columns more at either end as it takes, and words that say so.
+
+    A row that ends in matter goes on as one of a homogeneous ellipse of that `half_width` would. Continuing rows as
+    those of a uniform object is the idea of Hsieh et al. (Med. Phys. 31, 2385, 2004, doi:10.1118/1.1776673). Where the
+    object is not cut at both ends all is returned as it is.
+
+    Parameters
+    ----------
+    projections : (views, rows, columns) tensor
+        -log(I/I0), finite.
+    geometry : Geometry
+    """
+    reach = half_width(projections)
+    if reach is None:
+        return projections, geometry, ""
+    columns = projections.shape[2]
+    half = 0.5 * (columns - 1)
+    more = math.ceil(reach - half)
+    beyond = half + torch.arange(1, more + 1, device=projections.device, dtype=projections.dtype)
+    share = ((reach**2 - beyond**2).clamp(min=0) / (reach**2 - half**2)).sqrt()
+    left, right = (end[..., None].clamp(min=0) * share for end in _ends(projections).unbind(-1))
+    wide = torch.cat([left.flip(2), projections, right], dim=2)
+    wider = replace(geometry, columns=columns + 2 * more, corner=geometry.corner - more * geometry.u)
+    return wide, wider, f"; rows continued by {more} columns at both ends, where the object reaches beyond"
+
+
+def _some(projections: torch.Tensor) -> torch.Tensor:
+    """Enough views and rows to tell by, evenly spread."""
+    views, rows, _ = projections.shape
+    return projections[:: max(1, views // _VIEWS), :: max(1, rows // _ROWS)]
+
+
+def _ends(values: torch.Tensor) -> torch.Tensor:
+    """(..., 2) means of the first and of the last few columns."""
+    few = max(1, round(_END * values.shape[-1]))
+    return torch.stack([values[..., :few].mean(dim=-1), values[..., -few:].mean(dim=-1)], dim=-1)
