@@ -35,7 +35,7 @@ def widened_grid(
     most : float
         Share of its edges that the volume is widened by at most on every side; 0: never.
     """
-    reach = half_width(torch.from_numpy(projections)) if most else None
+    reach = half_width(torch.from_numpy(projections), geometry, grid) if most else None
     orbit = find_orbit(geometry)[0] if reach is not None else None
     if reach is None or orbit is None:
         return grid, (0, 0), ""

@@ -9,9 +9,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import torch
 
-from tomo_polysplat.scan.geometry import Geometry
+from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.start.fdk import fits_fdk
+from tomo_polysplat.start.orbit import Orbit, find_orbit
+from tomo_polysplat.start.weights import object_radius, ray_offsets
 
 __all__ = ["continued", "half_width"]
 
@@ -23,6 +27,10 @@ _END = 0.02
 # Rays through metal would tell of a smaller object than there is: what is more than this many typical rays counts as so
 # much. In six scans of 40^3 of which a third to a half was not seen the half-width is told within 1.2 columns so.
 _DENSE = 1.5
+# The shorter side of a detector is at least this share of the longer one where its middle counts as the object's.
+_CENTRED = 0.8
+# A volume that reaches so many times as far as what is seen was made large enough for the object.
+_BEYOND = 1.1
 # Views, and rows of each, that tell.
 _VIEWS, _ROWS = 48, 64
 # Columns that a row is continued by, as shares of those it has: even a square object ends, and a round one is never so
@@ -30,17 +38,19 @@ _VIEWS, _ROWS = 48, 64
 _LEAST, _FARTHEST = 0.05, 0.75
 
 
-def half_width(projections: torch.Tensor) -> float | None:
+def half_width(projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid) -> float | None:
     """Columns from the detector's middle to where an object ends that is cut at both ends of its rows; else None.
 
-    It is cut where most rows that see the object see it at both of their ends. Where a homogeneous ellipse would end,
-    the square of line integrals falls to zero; it falls with the square of the distance from the middle, by as much as
-    the mean row of the object does over the columns there are.
+    It is cut where most rows that see the object see it at both of their ends. The detector has to be in the middle,
+    before the axis of an orbit: one that is beside it tells of one side alone. Where a homogeneous ellipse ends the
+    square of line integrals has fallen to zero; it falls with the square of the distance from the middle, by as much as
+    the mean row of the object does over the columns there are. A volume that reaches beyond what is seen holds it.
 
     Parameters
     ----------
     projections : (views, rows, columns) tensor
         -log(I/I0); what is not finite sees nothing.
+    geometry, grid : Geometry, VolumeGrid
     """
     values = _some(projections).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
     top = float(values.max()) if values.numel() else 0.0
@@ -51,6 +61,9 @@ def half_width(projections: torch.Tensor) -> float | None:
     both = _ends(rows).amin(dim=-1) > _NOTHING * typical
     if not len(rows) or both.float().mean() <= _MOST:
         return None
+    orbit, _ = find_orbit(geometry)
+    if orbit is None or not _centred(geometry, orbit):
+        return None
     columns = projections.shape[2]
     half = 0.5 * (columns - 1)
     square = rows.mean(dim=0).double() ** 2
@@ -60,34 +73,56 @@ def half_width(projections: torch.Tensor) -> float | None:
     height = float(square.mean()) + slope * float((x**2).mean())
     # A mean row that does not fall towards its ends tells of no end.
     reach = math.sqrt(height / slope) if slope > 0 else math.inf
-    return min(max(reach, half + _LEAST * columns), half + _FARTHEST * columns)
+    return min(max(reach, half + _LEAST * columns), _farthest(geometry, orbit, grid))
 
 
-def continued(projections: torch.Tensor, geometry: Geometry) -> tuple[torch.Tensor, Geometry, str]:
+def _farthest(geometry: Geometry, orbit: Orbit, grid: VolumeGrid) -> float:
+    """Columns from the middle to where an object ends at most, which a volume may tell that reaches beyond the view."""
+    half, columns = 0.5 * (geometry.columns - 1), geometry.columns
+    beyond = half + np.linspace(0.0, _FARTHEST * columns, 256)
+    offsets = np.abs(ray_offsets(geometry, orbit, tuple(half + beyond))).mean(axis=0)
+    radius = object_radius(grid, orbit)
+    if radius < _BEYOND * offsets[0]:
+        return float(beyond[-1])
+    return float(beyond[min(int(np.searchsorted(offsets, radius)), len(beyond) - 1)])
+
+
+def continued(
+    projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid
+) -> tuple[torch.Tensor, Geometry, str]:
     """The projections and geometry with as many columns more at either end as it takes, and words that say so.
 
     A row that ends in matter goes on as one of a homogeneous ellipse of that `half_width` would. Continuing rows as
     those of a uniform object is the idea of Hsieh et al. (Med. Phys. 31, 2385, 2004, doi:10.1118/1.1776673). Where the
-    object is not cut at both ends all is returned as it is.
+    object is not cut at both ends, or part of a turn is too short for a wider fan, all is returned as it is.
 
     Parameters
     ----------
     projections : (views, rows, columns) tensor
         -log(I/I0), finite.
-    geometry : Geometry
+    geometry, grid : Geometry, VolumeGrid
+        For which filtered backprojection fits.
     """
-    reach = half_width(projections)
+    reach = half_width(projections, geometry, grid)
     if reach is None:
         return projections, geometry, ""
     columns = projections.shape[2]
     half = 0.5 * (columns - 1)
     more = math.ceil(reach - half)
+    wider = replace(geometry, columns=columns + 2 * more, corner=geometry.corner - more * geometry.u)
+    if not fits_fdk(wider, grid)[0]:
+        return projections, geometry, ""
     beyond = half + torch.arange(1, more + 1, device=projections.device, dtype=projections.dtype)
     share = ((reach**2 - beyond**2).clamp(min=0) / (reach**2 - half**2)).sqrt()
     left, right = (end[..., None].clamp(min=0) * share for end in _ends(projections).unbind(-1))
     wide = torch.cat([left.flip(2), projections, right], dim=2)
-    wider = replace(geometry, columns=columns + 2 * more, corner=geometry.corner - more * geometry.u)
     return wide, wider, f"; rows continued by {more} columns at both ends, where the object reaches beyond"
+
+
+def _centred(geometry: Geometry, orbit: Orbit) -> bool:
+    """Whether the axis is before the middle of the detector."""
+    first, last = np.abs(ray_offsets(geometry, orbit, (0, geometry.columns - 1))).mean(axis=0)
+    return min(first, last) > _CENTRED * max(first, last)
 
 
 def _some(projections: torch.Tensor) -> torch.Tensor:

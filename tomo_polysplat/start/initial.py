@@ -45,7 +45,7 @@ def initial_volume_on(
         fits, reason = _method(geometry, grid)
         try:
             if fits:
-                wide, wider, longer = continued(fill_rows(projections), geometry)
+                wide, wider, longer = continued(fill_rows(projections), geometry, grid)
                 volume = fdk_on_gpu(wide, wider, grid)
                 reason += longer
         except RuntimeError as problem:
@@ -119,7 +119,7 @@ def initial_volume(
     if fits:
         # Smooth: the noise of a sharp filter would be seeded as if it were matter.
         filled = torch.from_numpy(np.ascontiguousarray(fill_invalid(projections, usable), dtype=np.float32))
-        wide, wider, longer = continued(filled, geometry)
+        wide, wider, longer = continued(filled, geometry, grid)
         volume = fdk(wide.numpy(), wider, grid, filter_name="hann", device=device)
         reason += longer
         if not np.isfinite(volume).all():
