@@ -35,12 +35,12 @@ def widened_grid(
     most : float
         Share of its edges that the volume is widened by at most on every side; 0: never.
     """
-    reach = half_width(torch.from_numpy(projections), geometry, grid) if most else None
+    reach = half_width(torch.from_numpy(projections), geometry) if most else None
     orbit = find_orbit(geometry)[0] if reach is not None else None
     if reach is None or orbit is None:
         return grid, (0, 0), ""
     middle = 0.5 * (geometry.columns - 1)
-    radius = float(np.abs(ray_offsets(geometry, orbit, (middle - reach, middle + reach))).mean())  # type: ignore[arg-type]
+    radius = float(np.abs(ray_offsets(geometry, orbit, (middle - reach, middle + reach))).mean())
     more = []
     for k in (1, 0):
         beyond = max(grid.lower[k] - orbit.axis[k], orbit.axis[k] - grid.upper[k]) + radius

@@ -15,7 +15,7 @@ import torch
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.fdk import fits_fdk
 from tomo_polysplat.start.orbit import Orbit, find_orbit
-from tomo_polysplat.start.weights import object_radius, ray_offsets
+from tomo_polysplat.start.weights import ray_offsets
 
 __all__ = ["continued", "half_width"]
 
@@ -29,8 +29,6 @@ _END = 0.02
 _DENSE = 1.5
 # The shorter side of a detector is at least this share of the longer one where its middle counts as the object's.
 _CENTRED = 0.8
-# A volume that reaches so many times as far as what is seen was made large enough for the object.
-_BEYOND = 1.1
 # Views, and rows of each, that tell.
 _VIEWS, _ROWS = 48, 64
 # Columns that a row is continued by, as shares of those it has: even a square object ends, and a round one is never so
@@ -38,19 +36,19 @@ _VIEWS, _ROWS = 48, 64
 _LEAST, _FARTHEST = 0.05, 0.75
 
 
-def half_width(projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid) -> float | None:
+def half_width(projections: torch.Tensor, geometry: Geometry) -> float | None:
     """Columns from the detector's middle to where an object ends that is cut at both ends of its rows; else None.
 
     It is cut where most rows that see the object see it at both of their ends. The detector has to be in the middle,
     before the axis of an orbit: one that is beside it tells of one side alone. Where a homogeneous ellipse ends the
     square of line integrals has fallen to zero; it falls with the square of the distance from the middle, by as much as
-    the mean row of the object does over the columns there are. A volume that reaches beyond what is seen holds it.
+    the mean row of the object does over the columns there are.
 
     Parameters
     ----------
     projections : (views, rows, columns) tensor
         -log(I/I0); what is not finite sees nothing.
-    geometry, grid : Geometry, VolumeGrid
+    geometry : Geometry
     """
     values = _some(projections).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
     top = float(values.max()) if values.numel() else 0.0
@@ -73,18 +71,7 @@ def half_width(projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid) 
     height = float(square.mean()) + slope * float((x**2).mean())
     # A mean row that does not fall towards its ends tells of no end.
     reach = math.sqrt(height / slope) if slope > 0 else math.inf
-    return min(max(reach, half + _LEAST * columns), _farthest(geometry, orbit, grid))
-
-
-def _farthest(geometry: Geometry, orbit: Orbit, grid: VolumeGrid) -> float:
-    """Columns from the middle to where an object ends at most, which a volume may tell that reaches beyond the view."""
-    half, columns = 0.5 * (geometry.columns - 1), geometry.columns
-    beyond = half + np.linspace(0.0, _FARTHEST * columns, 256)
-    offsets = np.abs(ray_offsets(geometry, orbit, tuple(half + beyond))).mean(axis=0)
-    radius = object_radius(grid, orbit)
-    if radius < _BEYOND * offsets[0]:
-        return float(beyond[-1])
-    return float(beyond[min(int(np.searchsorted(offsets, radius)), len(beyond) - 1)])
+    return min(max(reach, half + _LEAST * columns), half + _FARTHEST * columns)
 
 
 def continued(
@@ -103,7 +90,7 @@ def continued(
     geometry, grid : Geometry, VolumeGrid
         For which filtered backprojection fits.
     """
-    reach = half_width(projections, geometry, grid)
+    reach = half_width(projections, geometry)
     if reach is None:
         return projections, geometry, ""
     columns = projections.shape[2]

@@ -23,7 +23,7 @@ from tomo_polysplat.start.orbit import Orbit
 __all__ = ["object_fan", "object_radius", "pixel_weights", "ray_arcs", "ray_offsets"]
 
 
-def ray_offsets(geometry: Geometry, orbit: Orbit, columns: Sequence[int] | None = None) -> np.ndarray:
+def ray_offsets(geometry: Geometry, orbit: Orbit, columns: Sequence[float] | None = None) -> np.ndarray:
     """Signed distance from the axis to the rays of the middle row, (views, columns), all or those that are named.
 
     The same ray measured from its other end has the opposite sign. The offsets rise or fall from column to column.

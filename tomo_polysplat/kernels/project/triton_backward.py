@@ -41,7 +41,6 @@ def _pixel_moments_kernel(
 ):  # fmt: skip
     view = tl.program_id(1).to(tl.int64)
     last_block = (rows - 1) // BLOCK_H
-    # What the warp does at a time takes as long as the largest footprint: like ones together.
     group, part = tl.program_id(0) // parts, tl.program_id(0) % parts
     record += (view * (tl.num_programs(0) // parts) + group) * (GROUP * RECORD)
     moments += (view * (tl.num_programs(0) // parts) + group) * (GROUP * SUMS)
@@ -50,6 +49,7 @@ def _pixel_moments_kernel(
     BLOCK_W: tl.constexpr = 2 // BLOCK_H
     down, across = lane % 2 // BLOCK_W, lane % BLOCK_W
     zero = tl.zeros([32], tl.float32)
+    # What the warp does at a time takes as long as the largest footprint: like ones together.
     own = record + 4 * lane
     order = by_size(tl.load(own + (4 * QUAD + 1)) * tl.load(own + (3 * QUAD + 3)), lane)
     for turn in range(part, 2, parts):
