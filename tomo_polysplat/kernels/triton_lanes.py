@@ -149,11 +149,47 @@ def store_sums(
         store_four(at + 8 * (lane % 2) + 4, s4, s5, s6, s7, live)
 
 
+def _sort() -> str:
+    """PTX that sorts 64 non-negative integers, two to a lane: a bitonic network, the second 32 after the first."""
+    lines = [
+        "{ .reg .pred p, q; .reg .b32 lane, bit, c, d, x, y; mov.u32 lane, %laneid; mov.b32 c, $2; mov.b32 d, $3;"
+    ]
+    size = 2
+    while size <= 64:
+        step = size // 2
+        while step:
+            if step == 32:
+                lines.append("min.s32 x, c, d; max.s32 d, c, d; mov.b32 c, x;")
+            else:
+                # The lower lane of two keeps the smaller one, or the larger in every second run of ``size``.
+                lines.append(f"and.b32 bit, lane, {step}; setp.eq.u32 p, bit, 0;")
+                if size < 32:
+                    lines.append(f"and.b32 bit, lane, {size}; setp.ne.u32 q, bit, 0; xor.pred p, p, q;")
+                for v in "cd":
+                    lines.append(f"shfl.sync.bfly.b32 x, {v}, {step}, 31, -1;")
+                    lines.append(f"min.s32 y, {v}, x; max.s32 x, {v}, x; selp.b32 {v}, y, x, p;")
+                    if size == 32:  # the second 32 descend, so that with the first they make one bitonic run
+                        lines.append("not.pred p, p;")
+            step //= 2
+        size *= 2
+    return " ".join([*lines, "mov.b32 $0, c; mov.b32 $1, d; }"])
+
+
+_SORT = tl.constexpr(_sort())
+
+
 @triton.jit
-def by_size(key, lane):
-    """The lanes of a one-warp program in the order of their ``key``, a float of which 19 bits count."""
-    bits = (key.to(tl.int32, bitcast=True) & -32) | lane
-    return tl.sort(bits) & 31
+def by_size(a, b, lane):
+    """Which of 64 numbers come in order, the first 32 and the last, by ``a`` and ``b``: not negative, 18 bits count."""
+    a, b = (a.to(tl.int32, bitcast=True) & -64) | lane, (b.to(tl.int32, bitcast=True) & -64) | (lane + 32)
+    if _INTERPRETED:
+        both = tl.sort(tl.reshape(tl.permute(tl.join(a, b), (1, 0)), (64,)))
+        a, b = tl.split(tl.permute(tl.reshape(both, (2, 32)), (1, 0)))
+    else:
+        a, b = tl.inline_asm_elementwise(
+            _SORT, "=&r,=&r,r,r", [a, b], dtype=(tl.int32, tl.int32), is_pure=False, pack=1
+        )
+    return a & 63, b & 63
 
 
 @triton.jit

@@ -17,21 +17,34 @@ from tomo_polysplat.kernels.views import DetectorViews
 
 __all__ = ["sum_moments"]
 
-_PROGRAMS = 1 << 14  # enough to fill the device: groups of neighbours are halved where there are fewer
+_TEAM = tl.constexpr(2 * GROUP)  # neighbours in the list among whom those of like size are found
+_AT_ONCE = tl.constexpr(16)  # of these, two lanes each
+_PROGRAMS = 1 << 14  # enough to fill the device: teams are shared out where there are fewer
+# Of a lane, where a pixel has several channels. With fewer the compiler reads some of four pixels only when the ones
+# before are done with, and every read is waited for (0.169 ms for the 200 000 footprints of the benchmark's first
+# line with 92, 0.180 with 88, 0.199 with the 80 it would take); with more there are fewer warps to wait side by side.
+_REGISTERS = 92
 _TINY = tl.constexpr(1e-20)
 _TWO_LN2 = tl.constexpr(1 / HALF_LOG2E)
 
 
 @triton.jit
-def _row_ends(offset, last, by_ry, xc, m, hx, columns):
-    """First and last column of rows at ``offset`` from their outlines' middles, up to ``last``; or last < first."""
+def _row_ends(offset, between, reach, by_ry, xc, m, hx, columns):
+    """First and last column of rows at ``offset`` from their outlines' middles; last < first beyond ``reach``."""
     u = offset * by_ry
     rest = 1.0 - u * u
     half, middle = hx * tl.sqrt(tl.maximum(rest, 0.0)), xc + m * offset
-    there = (rest > 0) & (offset <= last)
+    there = (rest > 0) & (tl.abs(offset - between) <= reach)
     start = tl.math.ceil(tl.minimum(tl.maximum(middle - half, 0.0), columns + 0.0))
     stop = tl.math.floor(tl.minimum(middle + half, columns - 1.0))
     return tl.where(there, start, columns + 0.0), tl.where(there, stop, -1.0)
+
+
+@triton.jit
+def _reach(own):
+    """Half the height or the width of a group's footprints, whichever is more; 0 where there is none."""
+    ry, hx = tl.load(own + (4 * QUAD + 1)), tl.load(own + (3 * QUAD + 3))
+    return tl.where(ry > 0, tl.maximum(ry, hx), 0.0)
 
 
 @triton.jit(do_not_specialize=SIZES)
@@ -41,9 +54,10 @@ def _pixel_moments_kernel(
 ):  # fmt: skip
     view = tl.program_id(1).to(tl.int64)
     last_block = (rows - 1) // BLOCK_H
-    group, part = tl.program_id(0) // parts, tl.program_id(0) % parts
-    record += (view * (tl.num_programs(0) // parts) + group) * (GROUP * RECORD)
-    moments += (view * (tl.num_programs(0) // parts) + group) * (GROUP * SUMS)
+    team, part = tl.program_id(0) // parts, tl.program_id(0) % parts
+    first_one = (view * (tl.num_programs(0) // parts) + team) * _TEAM
+    record += first_one * RECORD
+    moments += first_one * SUMS
     grad += view * (last_block + 1) * columns * (BLOCK_H * SPREAD)
     lane = tl.arange(0, 32)
     BLOCK_W: tl.constexpr = 2 // BLOCK_H
@@ -51,10 +65,11 @@ def _pixel_moments_kernel(
     zero = tl.zeros([32], tl.float32)
     # What the warp does at a time takes as long as the largest footprint: like ones together.
     own = record + 4 * lane
-    order = by_size(tl.load(own + (4 * QUAD + 1)) * tl.load(own + (3 * QUAD + 3)), lane)
-    for turn in range(part, 2, parts):
-        n = from_lane(order, turn * 16 + lane // 2)
-        at = record + 4 * n
+    lower, upper = by_size(_reach(own), _reach(own + GROUP * RECORD), lane)
+    for turn in range(part, _TEAM // _AT_ONCE, parts):
+        ordered = tl.where(turn < GROUP // _AT_ONCE, lower, upper)
+        n = from_lane(ordered, turn * _AT_ONCE % GROUP + lane // 2)
+        at = record + (n // GROUP * (GROUP * RECORD) + n % GROUP * 4)
         column0, row0, r11, r12 = load_four(at)
         r22, lt, lu, ltt = load_four(at + QUAD)
         ltu, luu, w0, w1 = load_four(at + 2 * QUAD)
@@ -65,18 +80,20 @@ def _pixel_moments_kernel(
         c0, c1, c2, c3 = zero, zero, zero, zero
         # The outlines' slack is for finding tiles; a pixel counts here where it counts in the image.
         hx -= SLACK
-        # A Gaussian off the detector has no rows, from a pixel that exists all the same.
+        # A Gaussian off the detector has no rows, by pixels that exist all the same.
         low = tl.math.ceil(tl.minimum(tl.maximum(yc - ry, 0.0), rows - 1.0))
         high = tl.math.floor(tl.minimum(tl.maximum(yc + ry, -1.0), rows - 1.0))
-        high = tl.where(ry > 0, high, -1.0)
-        # From where rows that lie interleaved begin.
-        low = tl.math.floor(low / BLOCK_H) * BLOCK_H
+        between, reach = 0.5 * (low + high) - yc, 0.5 * (high - low) + 0.25
+        reach = tl.where(ry > 0, reach, -1.0)
         by_ry = 1.0 / tl.maximum(ry - SLACK, _TINY)
-        block = low.to(tl.int32) // BLOCK_H
-        offset = (low - yc) + down.to(tl.float32)
-        last = high - yc + 0.5
-        for _first in range(0, tl.max((high - low + 1.0).to(tl.int32), 0), BLOCK_H):
-            start, stop = _row_ends(offset, last, by_ry, xc, m, hx, columns)
+        # The warp walks from the middles outwards in step: where all are widest they are wide together.
+        block = tl.math.floor(tl.minimum(tl.maximum(yc + 0.5, low), high) / BLOCK_H).to(tl.int32)
+        above = tl.max(tl.where(ry > 0, block - low.to(tl.int32) // BLOCK_H, 0), 0)
+        below = tl.max(tl.where(ry > 0, high.to(tl.int32) // BLOCK_H - block, -1), 0)
+        block -= above
+        offset = (block * BLOCK_H + down).to(tl.float32) - yc
+        for _pair in range(above + below + 1):
+            start, stop = _row_ends(offset, between, reach, by_ry, xc, m, hx, columns)
             first, end = start, stop
             if BLOCK_H == 2:
                 first, end = widest(start, stop)
@@ -88,7 +105,8 @@ def _pixel_moments_kernel(
             middle = 0.5 * (start + stop)
             half = stop - middle + 0.25
             x = (first - middle) + across.to(tl.float32)
-            pixel = (tl.minimum(block, last_block) * columns + first.to(tl.int32) + across) * BLOCK_H + down
+            line = tl.minimum(tl.maximum(block, 0), last_block) * columns
+            pixel = (line + first.to(tl.int32) + across) * BLOCK_H + down
             pixel = grad + pixel.to(tl.int64) * SPREAD
             shift = r11 * (middle - column0) + r12 * y
             l0, l1 = 1.0 + u * (lu + luu * u), lt + ltu * u
@@ -167,10 +185,12 @@ def sum_moments(record, pixels: torch.Tensor, channels: int, views: DetectorView
     """
     many, groups = record.shape[:2]
     moments = record.new_empty((many, groups * GROUP, SUMS.value))
-    parts = 2 if groups * many < _PROGRAMS else 1
+    teams = groups * GROUP // _TEAM.value
+    parts = next((p for p in (4, 2) if p * teams * many <= _PROGRAMS), 1)
     with on_device(record):
-        _pixel_moments_kernel[(groups * parts, many)](
+        _pixel_moments_kernel[(teams * parts, many)](
             record, pixels, moments, views.rows, views.columns, parts, CHANNELS=channels, CONE=views.cone,
             BLOCK_H=folded(views), SPREAD=spread(channels), GROUP=GROUP, num_warps=1, num_stages=1,
+            maxnreg=_REGISTERS if channels > 1 else None,
         )  # fmt: skip
     return moments

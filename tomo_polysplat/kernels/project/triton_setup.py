@@ -2,8 +2,9 @@
 
 README.md has the formulas.
 
-``record`` (views, groups, 5, GROUP, 4) holds the twenty numbers below by fours, those of neighbours in the list side by
-side; after the last Gaussian come some that miss the detector. With x and y counted from the projected centre:
+``record`` (views, groups, 5, GROUP, 4), of an even number of groups, holds the twenty numbers below by fours, those of
+neighbours in the list side by side; after the last Gaussian come some that miss the detector. With x and y counted from
+the projected centre:
 
 * 0, 1: column and row of the projected centre;
 * 2-4: r11, r12, r22 of t = r11 x + r12 y and u = r22 y; q = (t^2 + u^2) / l is the squared distance times HALF_LOG2E;
@@ -224,7 +225,7 @@ def footprints(
 ) -> torch.Tensor:
     """``record`` of the module docstring; the number of skipped pairs is added to ``skipped``, 0-dim int64."""
     count, many = len(position), len(views)
-    groups = triton.cdiv(count, GROUP)
+    groups = 2 * triton.cdiv(count, 2 * GROUP)  # the adjoint takes two together
     record = position.new_empty((many, groups, RECORD.value // 4, GROUP, 4))
     if count and many:
         with on_device(position):
