@@ -54,8 +54,10 @@ def _pixel_moments_kernel(
 ):  # fmt: skip
     view = tl.program_id(1).to(tl.int64)
     last_block = (rows - 1) // BLOCK_H
-    team, part = tl.program_id(0) // parts, tl.program_id(0) % parts
-    first_one = (view * (tl.num_programs(0) // parts) + team) * _TEAM
+    # The largest footprints of all teams first: what runs last should not run long.
+    teams = tl.num_programs(0) // parts
+    team, part = tl.program_id(0) % teams, parts - 1 - tl.program_id(0) // teams
+    first_one = (view * teams + team) * _TEAM
     record += first_one * RECORD
     moments += first_one * SUMS
     grad += view * (last_block + 1) * columns * (BLOCK_H * SPREAD)
