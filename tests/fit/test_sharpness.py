@@ -8,6 +8,7 @@ from scipy import ndimage
 from tomo_polysplat import reconstruct
 from tomo_polysplat.fit.first_volume import first_volume
 from tomo_polysplat.fit.plan import make_plan
+from tomo_polysplat.fit.plan_seeds import closer_spacing
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.sharpness import seeds_for_edges
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, to_astra
@@ -55,6 +56,8 @@ def told(scan, budget=None, **settings):
 def test_two_short_fits_tell_sharp_edges_from_blurred_ones(blur):
     plan, seeds = told(walls(blur))
     assert plan.sharp == (blur == 0) and "after a short fit" in plan.reasons["edges"]
+    # Thin seeds of a small cloud lie closer.
+    assert plan.spacing == (1.15 if plan.sharp else 1.3)
     # As they were before the short fits, and thin where that was chosen.
     _, same = told(walls(blur), edges="sharp" if plan.sharp else "blurred")
     torch.testing.assert_close(seeds.parameters(), same.parameters(), rtol=0, atol=0)
@@ -91,6 +94,15 @@ def test_sharp_edges_come_out_sharper():
 def test_nobody_asks_the_rays_where_it_is_known(changed, because):
     plan, _ = told(walls(0.0, views=41), **changed)
     assert plan.sharp == (changed == {"edges": "sharp"}) and because in plan.reasons["edges"]
+
+
+@pytest.mark.parametrize(
+    "spacing, seeds, asked, closer",
+    [(1.3, 6000, 0.0, True), (1.3, 6001, 0.0, False), (1.7, 500, 0.0, False), (1.3, 500, 1.3, False)],
+)
+def test_only_a_small_cloud_at_the_usual_distance_lies_closer(spacing, seeds, asked, closer):
+    found, why = closer_spacing(spacing, seeds, Settings(seed_spacing=asked))
+    assert found == (1.15 if closer else spacing) and bool(why) == closer
 
 
 def test_an_empty_scan_has_no_edges(caplog):

@@ -17,7 +17,7 @@ import torch
 
 from tomo_polysplat.fit.loss import misfit
 from tomo_polysplat.fit.plan import Plan
-from tomo_polysplat.fit.plan_seeds import finest_spacing
+from tomo_polysplat.fit.plan_seeds import closer_spacing, finest_spacing
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays, batches_around
 from tomo_polysplat.fit.scene import FitScene
@@ -85,9 +85,19 @@ def seeds_for_edges(
         own = replace(plan, sharp=sharp, reasons=dict(plan.reasons))
         return own, problem.seeds(start, own, settings, device)
 
-    if settings.edges != "auto":
-        return _because(*of_kind(settings.edges == "sharp"), "asked for")
+    def closer(sharp: Plan, seeds: Gaussians) -> tuple[Plan, Gaussians]:
+        spacing, why = closer_spacing(sharp.spacing, len(seeds), settings)
+        if not why:
+            return sharp, seeds
+        reasons = sharp.reasons | {"seed_spacing_voxels": f"{spacing:.2f}: {why}"}
+        own = replace(sharp, spacing=spacing, reasons=reasons)
+        return own, problem.seeds(start, own, settings, device)
+
+    if settings.edges == "sharp":
+        return _because(*closer(*of_kind(True)), "asked for")
     plain = of_kind(False)
+    if settings.edges == "blurred":
+        return _because(*plain, "asked for")
     why_not = _why_not(plan, problem, settings)
     if why_not or not len(plain[1]):
         return _because(*plain, why_not or "there are no seeds: the start volume is empty")
@@ -103,7 +113,7 @@ def seeds_for_edges(
             return _because(*plain, f"round seeds: {TOO_SHORT} how sharp edges are")
         misfits.append(_misfit(outcome.gaussians, scene, rays, short))
     sharp, reason = _judged(*misfits)
-    return _because(*kinds[sharp], reason)
+    return _because(*(closer(*kinds[True]) if sharp else plain), reason)
 
 
 def _because(plan: Plan, seeds: Gaussians, reason: str) -> tuple[Plan, Gaussians]:
