@@ -118,3 +118,10 @@ def test_an_object_that_reaches_beyond_both_ends_of_the_detector_is_told(ends, t
     values[:, :, 0], values[:, :, -1] = ends
     closed, why = matter_is_inside(values, geometry, wide)
     assert not closed and ("beyond the detector" in why) == told == ("large enough" in caplog.text)
+
+
+def test_a_flat_object_that_reaches_beyond_the_detector_is_told_by_the_rows_that_see_it():
+    geometry = scanner("cone", columns=5)
+    values = torch.zeros(geometry.shape)
+    values[:, 5:8] = 1.0
+    assert "beyond the detector" in matter_is_inside(values, geometry, VolumeGrid((5, 7, 9), [-9] * 3, [9] * 3))[1]

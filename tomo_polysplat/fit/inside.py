@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.start.continued import cut_rows
 
 __all__ = ["matter_is_inside"]
 
@@ -20,8 +21,7 @@ _RAYS_AT_ONCE = 1 << 17
 _FEWEST = 0.01
 # Rays beside the volume see nothing when all but this share of them stay below this part of a typical ray.
 _SHARE, _NOTHING = 0.01, 0.1
-# Of the views and rows, the share in which matter reaches both ends of the detector if the object is truncated, or is
-# seen next to the volume if that is too small.
+# Of the views and rows, the share in which matter is seen next to the volume if that is too small.
 _MOST = 0.5
 
 
@@ -41,7 +41,7 @@ def matter_is_inside(projections: torch.Tensor, geometry: Geometry, grid: Volume
     through = values[~beside & np.isfinite(values)]
     typical = _typical(through)
     if beside.sum() < max(_FEWEST * values.size, 1) or not len(through):
-        if _truncated(projections, some, rows, typical):
+        if cut_rows(projections[some.tolist()][:, rows.tolist()]) is not None:
             logger.warning(
                 "The object reaches beyond the detector on both sides, and few rays pass beside the volume: what lies"
                 " there ends up in the volume, which is too dense towards its border. Make the volume large enough for"
@@ -78,12 +78,6 @@ def _typical(values: np.ndarray) -> float:
 def _missed(geometry: Geometry, grid: VolumeGrid) -> bool:
     """Whether no ray meets the volume, which those that were looked at may have missed alone."""
     return not _crosses(geometry, grid, np.arange(geometry.rows), np.arange(geometry.columns)).any()
-
-
-def _truncated(projections: torch.Tensor, views: np.ndarray, rows: np.ndarray, typical: float) -> bool:
-    """Whether rays at both ends of the detector's rows see matter in most views."""
-    ends = projections[:, :, [0, -1]].cpu().numpy()[np.ix_(views, rows)]
-    return bool((np.nan_to_num(ends).min(axis=-1) > _NOTHING * typical).mean() > _MOST) if typical else False
 
 
 def _cut(values: np.ndarray, beside: np.ndarray, typical: float) -> bool:

@@ -17,7 +17,7 @@ from tomo_polysplat.start.fdk import fits_fdk
 from tomo_polysplat.start.orbit import Orbit, find_orbit
 from tomo_polysplat.start.weights import ray_offsets
 
-__all__ = ["continued", "half_width"]
+__all__ = ["continued", "cut_rows", "half_width"]
 
 # A row sees the object where its largest ray has this part of a typical one, and an end sees matter where it has that.
 # The object is cut where both ends do in this share of the rows that see it.
@@ -36,13 +36,32 @@ _VIEWS, _ROWS = 48, 64
 _LEAST, _FARTHEST = 0.05, 0.75
 
 
+def cut_rows(projections: torch.Tensor) -> torch.Tensor | None:
+    """(n, columns) rows of an object that is cut at both ends of its rows; else None.
+
+    It is cut where most rows that see the object see it at both of their ends. What would tell of metal is taken off.
+
+    Parameters
+    ----------
+    projections : (views, rows, columns) tensor
+        -log(I/I0); what is not finite sees nothing.
+    """
+    values = projections.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
+    top = float(values.max()) if values.numel() else 0.0
+    if top <= 0:
+        return None
+    typical = float(values[values > _NOTHING * top].median())
+    rows = values[values.amax(dim=-1) > _OBJECT * typical].clamp(max=_DENSE * typical)
+    both = _ends(rows).amin(dim=-1) > _NOTHING * typical
+    return rows if len(rows) and both.float().mean() > _MOST else None
+
+
 def half_width(projections: torch.Tensor, geometry: Geometry) -> float | None:
     """Columns from the detector's middle to where an object ends that is cut at both ends of its rows; else None.
 
-    It is cut where most rows that see the object see it at both of their ends. The detector has to be in the middle,
-    before the axis of an orbit: one that is beside it tells of one side alone. Where a homogeneous ellipse ends the
-    square of line integrals has fallen to zero; it falls with the square of the distance from the middle, by as much as
-    the mean row of the object does over the columns there are.
+    The detector has to be in the middle, before the axis of an orbit: one that is beside it tells of one side alone.
+    Where a homogeneous ellipse ends the square of line integrals has fallen to zero; it falls with the square of the
+    distance from the middle, by as much as the mean row of the object does over the columns there are.
 
     Parameters
     ----------
@@ -50,14 +69,8 @@ def half_width(projections: torch.Tensor, geometry: Geometry) -> float | None:
         -log(I/I0); what is not finite sees nothing.
     geometry : Geometry
     """
-    values = _some(projections).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
-    top = float(values.max()) if values.numel() else 0.0
-    if top <= 0:
-        return None
-    typical = float(values[values > _NOTHING * top].median())
-    rows = values[values.amax(dim=-1) > _OBJECT * typical].clamp(max=_DENSE * typical)
-    both = _ends(rows).amin(dim=-1) > _NOTHING * typical
-    if not len(rows) or both.float().mean() <= _MOST:
+    rows = cut_rows(_some(projections))
+    if rows is None:
         return None
     orbit, _ = find_orbit(geometry)
     if orbit is None or not _centred(geometry, orbit):
