@@ -124,4 +124,7 @@ def test_a_flat_object_that_reaches_beyond_the_detector_is_told_by_the_rows_that
     geometry = scanner("cone", columns=5)
     values = torch.zeros(geometry.shape)
     values[:, 5:8] = 1.0
-    assert "beyond the detector" in matter_is_inside(values, geometry, VolumeGrid((5, 7, 9), [-9] * 3, [9] * 3))[1]
+    assert (
+        "beyond the detector"
+        in matter_is_inside(values, geometry, VolumeGrid((5, 7, 9), [-9] * 3, [9] * 3))[1]
+    )

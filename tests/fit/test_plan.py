@@ -1,62 +1,22 @@
 """What is decided from the data, in any unit."""
 
 import logging
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from planned import ball, plan, problem
 
 from tomo_polysplat.fit.first_volume import first_volume
 from tomo_polysplat.fit.plan import make_plan
 from tomo_polysplat.fit.problem import Problem
-from tomo_polysplat.physics.base_materials import Materials
-from tomo_polysplat.physics.spectrum import Spectrum
-from tomo_polysplat.render.renderer import project_gaussians
-from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, from_astra
+from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.scan.usable import usable_rays
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.simulate.scenes import simulate_scan
 
 WATER = 0.2  # 1/cm, for monochromatic problems
-
-
-def problem(
-    size=12,
-    factor=1.0,
-    unit="cm",
-    polychromatic=False,
-    planar=False,
-    stretch=(1, 1, 1),
-    pixel=1.0,
-    height=0.0,
-    views=20,
-):
-    """A parallel scan of a window of 2 x 2 x 2 ``unit`` times ``factor``; ``pixel`` is in voxels."""
-    angles = np.linspace(0, np.pi, views, endpoint=False)
-    shape = (1 if planar else size, size, size)
-    half = np.ones(3) if not planar else np.array([1, 1, 1 / size])
-    half = half * np.array(stretch)
-    step = pixel * 2 / size
-    rows, columns = (1 if planar else size), size
-    u = step * np.stack([np.cos(angles), np.sin(angles), 0 * angles], 1)
-    v = step * np.tile([0.0, 0, 1], (views, 1))
-    origin = np.stack([-np.sin(angles), np.cos(angles), 0 * angles], 1)
-    corner = -0.5 * (columns - 1) * u - 0.5 * (rows - 1) * v + [0, 0, height]
-    geometry = Geometry("parallel", origin, corner * factor, u * factor, v * factor, rows, columns)
-    grid = VolumeGrid(shape, -half * factor, half * factor)
-    spectrum = Spectrum.from_tube(90, filters={}) if polychromatic else None
-    values = np.ones((views, rows, columns), np.float32)
-    return Problem.of(values, geometry, grid, unit, spectrum, Materials() if polychromatic else None)
-
-
-def ball(of, density):
-    z, y, x = np.meshgrid(*(np.linspace(-1, 1, n) if n > 1 else [0.0] for n in of.grid.shape), indexing="ij")
-    return np.where(x**2 + y**2 + z**2 < 0.8, np.float32(density * of.depth), np.float32(0))
-
-
-def plan(of, start, device="cpu", **settings):
-    return make_plan(start, of, Settings(**settings), device)
 
 
 @pytest.mark.parametrize("density", [0.015, 0.05, 0.3, 1.0, 2.0, 20.0, 280.0])
@@ -113,73 +73,6 @@ def test_one_row_and_one_slice_in_one_plane_are_planar():
     assert not problem(planar=True, height=1.0).planar, "the rays pass beside the slice"
 
 
-def test_seeds_are_no_closer_than_voxels_or_pixels_can_tell():
-    fine = problem()
-    assert plan(fine, ball(fine, 1)).spacing == pytest.approx(1.3)
-    coarse = problem(pixel=2.0)
-    assert plan(coarse, ball(coarse, 1)).spacing == pytest.approx(2.6)
-
-
-@pytest.mark.parametrize("stretch", [(1, 1, 1), (1, 1, 5), (4, 1, 1)])
-def test_the_number_of_seeds_keeps_its_bound_for_any_voxels(stretch):
-    of = problem(stretch=stretch)
-    start = np.full(of.grid.shape, of.depth, np.float32)
-    chosen = plan(of, start, max_gaussians=100)
-    volume = float(np.prod(of.grid.extent))
-    assert volume / (chosen.spacing * of.voxel) ** 3 == pytest.approx(100)
-    assert "100 Gaussians" in chosen.reasons["seed_spacing_voxels"]
-
-
-def test_gaussians_may_be_thinner_where_they_are_few():
-    of, flat = problem(32), problem(32, planar=True)
-    assert plan(of, ball(of, 0.2)).smallest_scale == 0.2
-    few = plan(of, ball(of, 0.2), max_gaussians=500)
-    assert few.smallest_scale == 0.1 and "few" in few.reasons["smallest_scale"]
-    assert plan(flat, ball(flat, 0.2), max_gaussians=50).smallest_scale == 0.2
-    assert plan(of, ball(of, 0.2), max_gaussians=500, smallest_scale=0.35).smallest_scale == 0.35
-
-
-def test_seeds_are_uneven_only_where_they_are_too_few():
-    of = problem(32)
-    start = ball(of, 0.2)
-    assert plan(of, start).finer == 0.0
-    assert plan(of, start, seed_spacing=2.5).finer == 0.0
-    few = plan(of, start, max_gaussians=500)
-    assert few.finer == Settings().finer_seeds and "50%" in few.reasons["seed_spacing_voxels"]
-    assert plan(of, start, max_gaussians=500, finer_seeds=0.0).finer == 0.0
-
-
-def most_gaussians(of, start, **settings):
-    told = plan(of, start, "cuda", **settings).reasons["seed_spacing_voxels"]
-    return int(told.split("at most ")[1].split()[0])
-
-
-def test_a_gpu_seeds_by_the_surfaces_there_are():
-    """Those of a ball grow by the square of its size; noise has none, and small volumes are seeded as ever."""
-    small, large = problem(81), problem(121)
-    few, many = (most_gaussians(of, ball(of, 1.0)) for of in (small, large))
-    assert few == 60_000 < many
-    half = 0.9**0.5 * 60  # radius in voxels
-    noise = np.random.default_rng(0).normal(0, 0.4 * large.depth, large.grid.shape).astype(np.float32)
-    noisy = ball(large, 1.0)
-    noisy[noisy > 0] += noise[noisy > 0]
-    assert most_gaussians(large, noisy) == pytest.approx(many, rel=0.1)
-    layer = many / 1.7 / (4 * np.pi * half**2)
-    assert 0.8 < layer < 2.0
-    assert most_gaussians(large, ball(large, 1.0), max_gaussians=5000) == 5000
-    assert "surfaces" not in plan(large, ball(large, 1.0)).reasons["seed_spacing_voxels"]
-    tiny = problem(33)
-    assert plan(tiny, ball(tiny, 1.0), "cuda").spacing == pytest.approx(1.3)
-
-
-@pytest.mark.parametrize("share", [0.3, 0.5])
-def test_uneven_seeds_are_as_many_as_even_ones(share):
-    of = problem(32)
-    start = ball(of, 0.2)
-    even, uneven = (seeded(of, start, max_gaussians=1500, finer_seeds=s) for s in (0.0, share))
-    assert len(even) * 0.8 < len(uneven) < 1.1 * len(even)
-
-
 def test_what_is_asked_for_is_taken_as_it_is():
     of = problem(planar=True)
     chosen = plan(of, ball(of, 1), seed_spacing=3.0, views_per_step=7)
@@ -194,43 +87,6 @@ def test_every_decision_has_a_reason(polychromatic):
     assert {"curves", "support", "seed_spacing_voxels", "views_per_step", "passes"} <= reasons.keys()
     for decision, words in reasons.items():
         assert len(words.split()) > 3, decision
-
-
-def seeded(of, start, **settings):
-    """The reasons of a plan, with what its Gaussians cost."""
-    chosen = make_plan(start, of, Settings(**settings), "cpu")
-    count = len(of.seeds(start, chosen, Settings(**settings), torch.device("cpu")))
-    return chosen.reasons, count
-
-
-@pytest.mark.parametrize("planar", [True, False])
-def test_alternatives_are_settings_by_name_and_say_what_they_cost(planar):
-    of = problem(size=24, planar=planar, polychromatic=True)
-    reasons, count = seeded(of, ball(of, 1))
-    told = reasons["alternatives"]
-    names = {field.name for field in fields(Settings)}
-    assert {"curves", "seed_spacing", "support_level", "passes"} <= told.keys() <= names
-    halved = seeded(of, ball(of, 1), seed_spacing=float(told["seed_spacing"].split(":")[0]))[1]
-    times = float(told["seed_spacing"].split()[1])
-    # The support has a rim of whole cells, which is thinner for smaller ones.
-    assert 0.5 * times < halved / count < 1.2 * times
-
-
-def test_pairs_are_those_that_the_kernels_draw():
-    """Counted pixel by pixel: where one Gaussian's image is not zero."""
-    of = problem(size=24, polychromatic=True)
-    start = ball(of, 1)
-    reasons, count = seeded(of, start)
-    settings = Settings()
-    chosen = make_plan(start, of, settings, "cpu")
-    seeds = of.seeds(start, chosen, settings, torch.device("cpu"))
-    scene = of.scene(chosen, settings, torch.device("cpu"))
-    middle = seeds.select(seeds.position.norm(dim=1).argmin()[None])
-    views = of.rays(chosen, settings, torch.device("cpu")).views.select([0])
-    image = project_gaussians(middle, middle.attenuation[None], views, scene.kernel, settings.cutoff)[0]
-    told = reasons["work"].split()
-    assert float(told[0]) == count
-    assert float(told[3]) == pytest.approx(int((image > 0).sum()), rel=0.35)
 
 
 def test_dense_matter_that_only_the_fit_shows_is_told(caplog):
@@ -249,15 +105,6 @@ def test_an_empty_start_can_be_planned():
         of = problem(polychromatic=polychromatic)
         chosen = plan(of, np.zeros(of.grid.shape, np.float32))
         assert chosen.reference == 1.0 and chosen.spacing > 0
-
-
-@pytest.mark.parametrize("planar", [True, False])
-def test_few_voxels_get_more_seeds_than_voxels(planar):
-    for pixel, spacing in ((0.1, 6 / 12), (0.5, 0.65), (1.0, 1.3)):
-        of = problem(6, planar=planar, pixel=pixel)
-        chosen = plan(of, ball(of, 1))
-        assert chosen.spacing == pytest.approx(spacing)
-        assert ("few voxels" in chosen.reasons["seed_spacing_voxels"]) == (pixel < 1)
 
 
 def test_the_larger_a_volume_the_less_often_it_is_smoothed():
@@ -341,18 +188,6 @@ def test_curves_can_be_asked_for():
 def test_curves_that_make_no_sense_are_refused(wrong):
     with pytest.raises(ValueError, match="curves"):
         Settings(**wrong)
-
-
-def test_seeds_of_one_curve_have_no_material_of_their_own():
-    of = problem(polychromatic=True)
-    start = ball(of, 1)
-    start[5:7, 5:7, 5:7] *= 8
-    for curves, free in ((1, False), (3, True)):
-        settings = Settings(curves=curves)
-        chosen = make_plan(start, of, settings, "cpu")
-        seeds = of.seeds(start, chosen, settings, torch.device("cpu"))
-        assert bool((seeds.group != 0).any()) == free == (len(seeds.shared_material) > 1)
-        assert not seeds.own_material.any() or free
 
 
 def test_no_hardening_leaves_one_energy():

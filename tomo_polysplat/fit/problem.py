@@ -7,7 +7,6 @@ the first reconstruction on happens in them, so that no choice, and not even rou
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -17,17 +16,13 @@ import torch
 
 from tomo_polysplat.checks import require_choice
 from tomo_polysplat.fit.inside import matter_is_inside
-from tomo_polysplat.fit.memory import projections_stay, require_room
-from tomo_polysplat.fit.plan import AVERAGED_RAYS, Plan
-from tomo_polysplat.fit.plan_costs import alternatives, work
-from tomo_polysplat.fit.plan_seeds import finest_spacing
+from tomo_polysplat.fit.memory import projections_stay
+from tomo_polysplat.fit.plan import Plan
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.spectral_model import OPAQUE, spectral_model
 from tomo_polysplat.fit.surroundings import widened_grid
 from tomo_polysplat.kernels import select
-from tomo_polysplat.model.gaussians import Gaussians
-from tomo_polysplat.model.seed import seed_gaussians
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.scatter import Scatter, made_level, without_scatter
 from tomo_polysplat.physics.solids import number_of_solid
@@ -285,50 +280,6 @@ class Problem:
             return None
         energy = self.spectrum.effective_energy
         return lambda levels: number_of_solid(plan.reference * levels, energy)
-
-    def seeds(
-        self, start: np.ndarray | torch.Tensor, plan: Plan, settings: Settings, device: torch.device
-    ) -> Gaussians:
-        """Gaussians to start from."""
-        relative = start / (self.depth * plan.reference)
-        spacing = plan.spacing * self.voxel
-        # A spacing that was asked for is nobody's lack of Gaussians, which thin ones make up for.
-        finest = math.inf if settings.seed_spacing else finest_spacing(self)[0] * self.voxel
-        finest = 0.0 if plan.sharp else finest
-        several = plan.curves > 1
-        gaussians = seed_gaussians(
-            relative,
-            self.grid,
-            spacing,
-            plan.adapted(settings),
-            several,
-            self.planar,
-            device,
-            plan.finer,
-            finest,
-        )
-        free = int((gaussians.group < 0).sum())
-        plan.reasons["gaussians"] = f"{len(gaussians)}" + (
-            f", the material number free for {free} and for {len(gaussians.shared_material) - 1} pieces of metal"
-            if several
-            else ", none with a material number of its own"
-        )
-        plan.reasons["work"] = work(plan, self, settings, len(gaussians))
-        plan.reasons["alternatives"] = alternatives(plan, self, settings, len(gaussians))
-        values = self.measured(device)
-        # While it is asked whether pixels average light there are two runs at once, of thin rays and of averaged ones;
-        # while it is asked whether light matter is fat, two of the same.
-        runs = 1 if plan.pixel_rays and plan.fat is not None else 2
-        rays = runs * plan.pixel_rays**2 if plan.pixel_rays else 1 + AVERAGED_RAYS**2
-        plan.reasons["memory"] = require_room(
-            device,
-            gaussians=runs * len(gaussians),
-            views=plan.views_per_step,
-            pixels=rays * self.geometry.rows * self.geometry.columns,
-            voxels=math.prod(self.grid.shape),
-            projections=values.nbytes if values.device.type == device.type else 0,
-        )
-        return gaussians
 
     def all_curves(self, basis: np.ndarray, plan: Plan, dense: float) -> np.ndarray:
         """(3, nz, ny, nx) densities of the material curves from those of the model, which may lack two.

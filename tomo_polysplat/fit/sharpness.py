@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from tomo_polysplat.fit.first_gaussians import first_gaussians
 from tomo_polysplat.fit.loss import misfit
 from tomo_polysplat.fit.plan import Plan
 from tomo_polysplat.fit.plan_seeds import closer_spacing, finest_spacing
@@ -83,7 +84,7 @@ def seeds_for_edges(
     def of_kind(sharp: bool) -> tuple[Plan, Gaussians]:
         # Plans of their own, as the seeds are written down there.
         own = replace(plan, sharp=sharp, reasons=dict(plan.reasons))
-        return own, problem.seeds(start, own, settings, device)
+        return own, first_gaussians(start, own, problem, settings, device)
 
     def closer(sharp: Plan, seeds: Gaussians) -> tuple[Plan, Gaussians]:
         spacing, why = closer_spacing(sharp.spacing, len(seeds), settings)
@@ -91,7 +92,7 @@ def seeds_for_edges(
             return sharp, seeds
         reasons = sharp.reasons | {"seed_spacing_voxels": f"{spacing:.2f}: {why}"}
         own = replace(sharp, spacing=spacing, reasons=reasons)
-        return own, problem.seeds(start, own, settings, device)
+        return own, first_gaussians(start, own, problem, settings, device)
 
     if settings.edges == "sharp":
         return _because(*closer(*of_kind(True)), "asked for")

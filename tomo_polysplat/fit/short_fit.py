@@ -11,6 +11,7 @@ import torch
 from scipy import ndimage
 
 from tomo_polysplat.fit.depth import weights_by_depth
+from tomo_polysplat.fit.first_gaussians import first_gaussians
 from tomo_polysplat.fit.loss import misfit
 from tomo_polysplat.fit.optimise import FitOutcome, fit
 from tomo_polysplat.fit.plan import Plan, make_plan
@@ -181,7 +182,7 @@ def short_fit(
     # The soft matter stays what it was said to be: calibration asks what else could explain the rays.
     short = replace(settings, passes=min(passes, plan.passes), soft_gain=0.0)
     scene, rays = problem.scene(plan, short, device), problem.rays(plan, short, device)
-    seeds = problem.seeds(start, plan, short, device)
+    seeds = first_gaussians(start, plan, problem, short, device)
     short = replace(short, tv_weight=weights_by_depth(plan.depth, rays)[0] * settings.tv_weight)
     outcome = fitted_shortly(seeds, plan, problem, scene, rays, short, seed, time_budget)
     main = None

@@ -21,6 +21,7 @@ from tomo_polysplat.bench.hard_cases.easy import (
 )
 from tomo_polysplat.bench.hard_cases.gaussians import compare_precisions
 from tomo_polysplat.bench.hard_cases.same import relative_rms
+from tomo_polysplat.fit.first_gaussians import first_gaussians
 from tomo_polysplat.fit.first_volume import first_volume
 from tomo_polysplat.fit.optimise import fit as optimise
 from tomo_polysplat.fit.plan import make_plan
@@ -82,7 +83,7 @@ def _fit_in(scan: Scan, dtype: torch.dtype) -> np.ndarray:
     start, _ = first_volume(problem, target, settings)
     plan = make_plan(start, problem, settings, "cpu")
     scene, rays = problem.scene(plan, settings, target), problem.rays(plan, settings, target)
-    seeds = problem.seeds(start, plan, settings, target)
+    seeds = first_gaussians(start, plan, problem, settings, target)
     curves = {name: getattr(scene, name).to(dtype) for name in ("reference_curve", "output_curve")}
     scene, rays = replace(scene, **curves), replace(rays, projections=rays.projections.to(dtype))
     parts = {field.name: getattr(seeds, field.name) for field in fields(seeds)}
