@@ -143,9 +143,9 @@ def test_views_of_a_step_leave_enough_steps(passes):
     ("size", "views", "planar", "passes", "together"),
     [
         (12, 150, False, 20.0, 4),
-        (45, 150, False, 15.0, 6),
-        (45, 30, False, 22.5, 2),
-        (45, 8, False, 45.0, 1),
+        (49, 150, False, 15.0, 6),
+        (49, 30, False, 22.5, 2),
+        (49, 8, False, 45.0, 1),
         (30, 150, True, 20.0, 5),
         (400, 150, True, 10.0, 5),
         (30, 30, True, 30.0, 3),

@@ -20,9 +20,9 @@ __all__ = ["cells", "closer_spacing", "finest_spacing", "seed_spacing", "smalles
 # in a handful of Gaussians would leave its mass wrong.
 _FEWEST_SEEDS = 12
 # Voxels between seeds where the detector would tell closer ones apart; and between those of a cloud of at most so many,
-# whose run is twice as long as others' (``fit.plan``), where they are thin across edges. Fourteen scans of 30^3 to 72^3
-# with such small clouds gain 0.3 dB in the mean by it (-0.3 to +1.3) and take a tenth more time; 1 voxel apart a pepper
-# loses 0.7 dB. Eight with more seeds came to -0.5 to +0.4 dB.
+# where they are thin across edges. Fourteen scans of 30^3 to 72^3 with such small clouds gain 0.3 dB in the mean by it
+# (-0.3 to +1.3) and take a tenth more time; 1 voxel apart a pepper loses 0.7 dB. Eight with more seeds came to -0.5 to
+# +0.4 dB.
 _APART, _CLOSER, _SMALL_CLOUD = 1.3, 1.15, 6000
 # Smallest deviation of a Gaussian in voxels. Where a volume has fewer Gaussians than the detector could tell apart,
 # each shows more of an edge: half as thick (H200, six scenes of 128^3 to 256^3) 0.8 dB more everywhere in the mean,
