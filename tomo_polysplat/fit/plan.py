@@ -44,7 +44,7 @@ _MANY_VIEWS, _MOST_TIMES = 45, 3.0
 # Steps of a small cloud cost little: with fewer seeds in matter than the second number a run makes more of them, by up
 # to the first, and a third as many more passes. Ten volumes of 26^3 to 34^3, steps of two views: 33.3 / 39.4 dB in 15
 # passes, 33.5 / 39.8 in 20, for a fifth more time; steps of one view in 15 passes 33.4 / 39.7, for a third more. Of
-# 36^3 to 40^3, four with 10 000 to 11 000 seeds gain 0.3 / 1.6 dB for a third more time, two with 13 000 and 15 500 none.
+# 36^3 to 40^3, four with 10 000 to 11 000 seeds gain 0.3 / 1.6 dB for a third more time, two with more seeds nothing.
 # Slices, of which larger ones gain, too, are made longer in passes as much (128^2, twice the passes: steel wires 26.4
 # to 28.3, soft tissue 44.2 to 45.4), but not the fan-beam slices (22 000 seeds, 1.5 times the passes: 39.6 to 39.6,
 # 37.7 to 37.5): theirs go with the root.
