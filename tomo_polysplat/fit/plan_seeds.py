@@ -19,10 +19,10 @@ __all__ = ["cells", "closer_spacing", "finest_spacing", "seed_spacing", "smalles
 # Seeds along the longest edge: a ray through few large voxels tells what is inside them, and an object's outline
 # in a handful of Gaussians would leave its mass wrong.
 _FEWEST_SEEDS = 12
-# Voxels between seeds where the detector would tell closer ones apart; and between those of a cloud of at most so many,
-# where they are thin across edges. Fourteen scans of 30^3 to 72^3 with such small clouds gain 0.3 dB in the mean by it
-# (-0.3 to +1.3) and take a tenth more time; 1 voxel apart a pepper loses 0.7 dB. Eight with more seeds came to -0.5 to
-# +0.4 dB.
+# Voxels between seeds, or detector pixels where these are larger or voxels are few; and voxels between those of a cloud
+# of at most so many, thin across edges. Fourteen scans of 30^3 to 72^3 with such small clouds gain 0.3 dB in the
+# mean by it (-0.3 to +1.3) and take a tenth more time; 1 voxel apart a pepper loses 0.7 dB. Eight with more seeds came
+# to -0.5 to +0.4 dB.
 _APART, _CLOSER, _SMALL_CLOUD = 1.3, 1.15, 6000
 # Smallest deviation of a Gaussian in voxels. Where a volume has fewer Gaussians than the detector could tell apart,
 # each shows more of an edge: half as thick (H200, six scenes of 128^3 to 256^3) 0.8 dB more everywhere in the mean,
@@ -108,8 +108,8 @@ def finest_spacing(problem: Problem) -> tuple[float, str]:
     pixel = (width if problem.planar else math.sqrt(width * height)) / problem.voxel
     edge = float((problem.grid.extent / problem.voxel)[: problem.dimensions].max())
     if pixel > 1.0:
-        return 1.3 * pixel, "1.3 detector pixels at the object"
-    few = max(1.3 * pixel, edge / _FEWEST_SEEDS)
+        return _APART * pixel, f"{_APART} detector pixels at the object"
+    few = max(_APART * pixel, edge / _FEWEST_SEEDS)
     if few < _APART - 1e-6:
-        return few, f"a volume of few voxels: {_FEWEST_SEEDS} seeds along it, or 1.3 detector pixels"
+        return few, f"a volume of few voxels: {_FEWEST_SEEDS} seeds along it, or {_APART} detector pixels"
     return _APART, f"{_APART} voxels"
