@@ -3,12 +3,15 @@
 import astra
 import numpy as np
 import pytest
+import torch
 from small_scans import disc
 
 import tomo_polysplat as tps
 from tomo_polysplat.fit.surroundings import cut_out, widened_grid
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.scan.geometry import from_astra, projections_from_astra
+
+HOST = torch.device("cpu")
 
 SPECTRUM = tps.Spectrum.from_tube(90, filters={"Al": 0.1})
 WATER = 0.9 * 0.25  # radius of the disc in cm
@@ -59,22 +62,22 @@ def test_the_volume_is_widened_to_where_a_round_object_ends(region):
     values, proj_geom, vol_geom = region
     geometry, grid = from_astra(proj_geom, vol_geom)
     rays = projections_from_astra(values, proj_geom)
-    wider, margin, why = widened_grid(rays, geometry, grid, 0.5)
+    wider, margin, why = widened_grid(rays, geometry, grid, 0.5, HOST)
     assert wider.upper[0] == pytest.approx(WATER, rel=0.1) and wider.lower[1] == -wider.upper[1]
     assert np.allclose(wider.voxel_size, grid.voxel_size) and wider.shape[0] == 1
     assert "0.2" in why and margin[0] == margin[1] == (wider.shape[1] - 27) // 2
-    assert widened_grid(rays, geometry, grid, 0.1)[1] == (3, 3)
-    assert widened_grid(rays, geometry, grid, 0.0)[0] is grid
+    assert widened_grid(rays, geometry, grid, 0.1, HOST)[1] == (3, 3)
+    assert widened_grid(rays, geometry, grid, 0.0, HOST)[0] is grid
 
 
 def test_a_volume_that_holds_all_is_not_widened(region):
     values, proj_geom, _ = region
     large = astra.create_vol_geom(45, 45, -0.25, 0.25, -0.25, 0.25)
     geometry, grid = from_astra(proj_geom, large)
-    assert widened_grid(projections_from_astra(values, proj_geom), geometry, grid, 0.5)[0] is grid
+    assert widened_grid(projections_from_astra(values, proj_geom), geometry, grid, 0.5, HOST)[0] is grid
     whole = disc("pmma", SPECTRUM)
     small = from_astra(whole[1], region[2])
-    assert widened_grid(projections_from_astra(*whole[:2]), *small, 0.5)[1] == (0, 0)
+    assert widened_grid(projections_from_astra(*whole[:2]), *small, 0.5, HOST)[1] == (0, 0)
 
 
 def test_cut_out_is_the_middle():

@@ -139,8 +139,8 @@ def reconstruct(
     spectrum = require_spectrum("spectrum", spectrum)
     geometry, grid = from_astra(proj_geom, vol_geom)
     values, counts = usable_rays(projections, proj_geom, valid, water_correction, spectrum)
-    widest = run_options.settings.surroundings
-    problem = Problem.of(values, geometry, grid, unit, spectrum, materials, widest)
+    widest, on = run_options.settings.surroundings, run_options.device
+    problem = Problem.of(values, geometry, grid, unit, spectrum, materials, widest, on)
     # Sorted, they may be a copy: these would stay in memory beside it.
     del values
     wanted = Calibration.of(calibrate, soft_density, problem.spectrum)

@@ -23,14 +23,15 @@ def scanner(beam, views=11, rows=13, columns=17):
     return Geometry(beam, 4.0 * out if beam == "cone" else -out, corner, u, v, rows, columns)
 
 
-def lines(geometry):
-    return np.arange(geometry.rows), np.arange(geometry.columns)
+def crosses(geometry):
+    rows, columns = np.arange(geometry.rows), np.arange(geometry.columns)
+    return _crosses(geometry, GRID, rows, columns, torch.device("cpu"))
 
 
 @pytest.mark.parametrize("beam", ["cone", "parallel"])
 def test_rays_that_cross_are_those_with_a_point_inside(beam):
     geometry = scanner(beam)
-    crossed = _crosses(geometry, GRID, *lines(geometry))
+    crossed = crosses(geometry)
     row, column = np.mgrid[: geometry.rows, : geometry.columns][..., None]
     for view in range(geometry.views):
         pixel = geometry.corner[view] + row * geometry.v[view] + column * geometry.u[view]
@@ -45,13 +46,22 @@ def test_rays_that_cross_are_those_with_a_point_inside(beam):
 @pytest.mark.parametrize("beside, inside", [(0.0, True), (0.02, True), (1.0, False), (np.nan, False)])
 def test_the_rays_beside_the_volume_decide(beside, inside):
     geometry = scanner("cone")
-    values = np.where(_crosses(geometry, GRID, *lines(geometry)), 1.0, beside).astype(np.float32)
+    values = np.where(crosses(geometry), 1.0, beside).astype(np.float32)
     assert matter_is_inside(torch.from_numpy(values), geometry, GRID)[0] == inside
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("beside", [0.02, 1.0, np.nan])
+def test_a_gpu_says_the_same(beside):
+    geometry = scanner("cone")
+    values = torch.from_numpy(np.where(crosses(geometry), 1.0, beside).astype(np.float32))
+    expected = matter_is_inside(values, geometry, GRID)
+    assert matter_is_inside(values.cuda(), geometry, GRID) == expected
 
 
 def test_a_holder_on_few_rays_is_matter_beside():
     geometry = scanner("cone")
-    values = np.where(_crosses(geometry, GRID, *lines(geometry)), 1.0, 0.0).astype(np.float32)
+    values = np.where(crosses(geometry), 1.0, 0.0).astype(np.float32)
     values[:, :, 0] = 0.5
     assert not matter_is_inside(torch.from_numpy(values), geometry, GRID)[0]
 

@@ -5,6 +5,7 @@ import pytest
 from start_phantoms import SPHERES, chords, distance, relative_error
 
 from tomo_polysplat.scan.geometry import from_astra, to_astra
+from tomo_polysplat.start.astra_fdk import _in_short
 from tomo_polysplat.start.fdk import fdk, fits_fdk
 from tomo_polysplat.start.filters import FILTERS
 from tomo_polysplat.start.orbit import find_orbit
@@ -271,6 +272,48 @@ def test_astras_fdk_on_a_gpu_agrees(monkeypatch):
     for other in (cone(columns=60, offset=(14.0, 0.0)), cone(np.linspace(0, 4, 90)), parallel()):
         scanner, voxels = from_astra(other, VOLUME)
         assert not suits_fdk_cuda(scanner, voxels, find_orbit(scanner)[0])[0]
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("filter_name", FILTERS)
+def test_rows_are_filtered_as_astra_filters_them(filter_name):
+    from tomo_polysplat.start.astra_fdk import fdk_cuda
+
+    geometry, grid = from_astra(cone(), VOLUME)
+    projections = chords(geometry, SPHERES)
+    data = (
+        astra.data3d.create("-sino", cone(), projections.swapaxes(0, 1)),
+        astra.data3d.create("-vol", VOLUME),
+    )
+    config = astra.astra_dict("FDK_CUDA")
+    config["ProjectionDataId"], config["ReconstructionDataId"] = data
+    config["option"] = {"FilterType": filter_name}
+    algorithm = astra.algorithm.create(config)
+    astra.algorithm.run(algorithm)
+    expected = astra.data3d.get(data[1])
+    astra.algorithm.delete(algorithm)
+    astra.data3d.delete(data)
+    volume = fdk_cuda(projections, geometry, grid, find_orbit(geometry)[0], filter_name=filter_name)
+    assert np.abs(volume - expected).max() < 1e-4 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize(
+    ("scanner", "kind"),
+    [
+        (cone(), "cone"),
+        (cone(-TURN[::-1], rows=31, pixel=(1.3, 1.7)), "cone"),
+        (cone(offset=(0.001, 0.0)), "cone_vec"),
+        (cone(offset=(0.0, 0.5)), "cone_vec"),
+    ],
+)
+def test_an_even_orbit_is_told_by_its_angles(scanner, kind):
+    geometry, grid = from_astra(scanner, VOLUME)
+    short, vol_geom = _in_short(geometry, grid)
+    assert short["type"] == kind
+    again, voxels = from_astra(short, vol_geom)
+    for name in ("origin", "corner", "u", "v"):
+        np.testing.assert_allclose(getattr(again, name), getattr(geometry, name), atol=1e-10)
+    np.testing.assert_array_equal(voxels.lower, grid.lower)
 
 
 def test_our_geometry_in_astras_terms_reconstructs_the_same():

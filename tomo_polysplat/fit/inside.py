@@ -36,8 +36,10 @@ def matter_is_inside(projections: torch.Tensor, geometry: Geometry, grid: Volume
     """
     some = np.unique(np.linspace(0, geometry.views - 1, min(_VIEWS, geometry.views)).astype(int))
     rows, columns = (np.arange(0, count, -(-count // _LINES)) for count in (geometry.rows, geometry.columns))
-    values = np.stack([projections[int(view)].cpu().numpy()[np.ix_(rows, columns)] for view in some])
-    beside = ~_crosses(geometry.select(some), grid, rows, columns) & np.isfinite(values)
+    device = projections.device
+    chosen = (torch.from_numpy(index).to(device) for index in np.ix_(some, rows, columns))
+    values = projections[tuple(chosen)].cpu().numpy()
+    beside = ~_crosses(geometry.select(some), grid, rows, columns, device) & np.isfinite(values)
     through = values[~beside & np.isfinite(values)]
     typical = _typical(through)
     if beside.sum() < max(_FEWEST * values.size, 1) or not len(through):
@@ -48,7 +50,7 @@ def matter_is_inside(projections: torch.Tensor, geometry: Geometry, grid: Volume
                 " all of the object, if it is not."
             )
             return False, "not kept within the volume: the object reaches beyond the detector on both sides"
-        if not len(through) and _missed(geometry.select(some), grid):
+        if not len(through) and _missed(geometry.select(some), grid, device):
             logger.warning(
                 "No ray meets the volume: check its window, the unit of length and the geometry, which may differ by a"
                 " large factor."
@@ -75,9 +77,9 @@ def _typical(values: np.ndarray) -> float:
     return float(np.median(values[values >= 0.1 * top])) if top > 0 else 0.0
 
 
-def _missed(geometry: Geometry, grid: VolumeGrid) -> bool:
+def _missed(geometry: Geometry, grid: VolumeGrid, device: torch.device) -> bool:
     """Whether no ray meets the volume, which those that were looked at may have missed alone."""
-    return not _crosses(geometry, grid, np.arange(geometry.rows), np.arange(geometry.columns)).any()
+    return not _crosses(geometry, grid, np.arange(geometry.rows), np.arange(geometry.columns), device).any()
 
 
 def _cut(values: np.ndarray, beside: np.ndarray, typical: float) -> bool:
@@ -96,11 +98,16 @@ def _cut(values: np.ndarray, beside: np.ndarray, typical: float) -> bool:
     return bool(told.any() and seen[told].mean() > _MOST)
 
 
-def _crosses(geometry: Geometry, grid: VolumeGrid, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """(views, rows, columns) bool: rays that meet the window (its slabs: Kay and Kajiya 1986, SIGGRAPH)."""
+def _crosses(
+    geometry: Geometry, grid: VolumeGrid, rows: np.ndarray, columns: np.ndarray, device: torch.device
+) -> np.ndarray:
+    """(views, rows, columns) bool: rays that meet the window (its slabs: Kay and Kajiya 1986, SIGGRAPH).
+
+    Found where the projections are: a GPU takes no time, and a host's threads may take tens of milliseconds to wake up.
+    """
     arrays = (geometry.corner, geometry.u, geometry.v, geometry.origin, grid.lower, grid.upper, rows, columns)
     corner, u, v, origin, lower, upper, row, column = (
-        torch.tensor(array, dtype=torch.float64) for array in arrays
+        torch.tensor(array, dtype=torch.float64, device=device) for array in arrays
     )
     crossed = np.empty((geometry.views, len(rows), len(columns)), bool)
     many = max(1, _RAYS_AT_ONCE // max(1, len(rows) * len(columns)))
@@ -113,5 +120,5 @@ def _crosses(geometry: Geometry, grid: VolumeGrid, rows: np.ndarray, columns: np
         ray = torch.where(ray.abs() < 1e-30, 1e-30, ray)
         ends = (lower - pixel) / ray, (upper - pixel) / ray
         enters, leaves = torch.minimum(*ends).amax(dim=-1), torch.maximum(*ends).amin(dim=-1)
-        crossed[some] = (enters < leaves).numpy()
+        crossed[some] = (enters < leaves).cpu().numpy()
     return crossed

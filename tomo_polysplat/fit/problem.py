@@ -41,6 +41,8 @@ __all__ = ["Problem"]
 
 logger = logging.getLogger(__name__)
 
+_HOST = torch.device("cpu")
+
 
 @dataclass
 class _Known:
@@ -110,16 +112,17 @@ class Problem:
         spectrum: Spectrum | None,
         materials: Materials | Sequence[Any] | None,
         surroundings: float = 0.0,
+        device: torch.device = _HOST,
     ) -> Problem:
         """The problem of a scan in the caller's unit, its views sorted; one energy makes it monochromatic.
 
-        The grid may be wider by as much as the share ``surroundings`` on every side.
+        The grid may be wider by as much as the share ``surroundings`` on every side, which a ``device`` finds out.
         """
         require_choice("unit", unit, LENGTH_UNITS)
         if spectrum is not None and spectrum.is_monochromatic:
             spectrum = None
         curves = Materials.under(materials, None if spectrum is None else spectrum.effective_energy)
-        grid, margin, why = widened_grid(projections, geometry, grid, surroundings)
+        grid, margin, why = widened_grid(projections, geometry, grid, surroundings, device)
         planar = geometry.planar and grid.planar
         # A plane beside the slice is another plane.
         planar = planar and bool(grid.lower[2] <= geometry.corner[0, 2] <= grid.upper[2])

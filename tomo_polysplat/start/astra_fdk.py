@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, to_astra
+from tomo_polysplat.start.filters import ramp_response
 from tomo_polysplat.start.orbit import Orbit
 
 if TYPE_CHECKING:
@@ -16,6 +17,10 @@ __all__ = ["fdk_cuda", "fdk_cuda_tensor", "suits_fdk_cuda"]
 
 # Columns that ASTRA's weighting takes at once, without asking where a row ends.
 _COLUMNS_AT_ONCE = 32
+# Of a pixel: what views may be off an even orbit by that is told by angles. ASTRA computes in float32.
+_EXACT = 1e-5
+# Numbers, with what rows are padded by, that are filtered at once.
+_FILTERED_AT_ONCE = 1 << 26
 
 
 def suits_fdk_cuda(
@@ -84,14 +89,15 @@ def fdk_cuda_tensor(
     index = projections.device.index
     # ASTRA takes the origin for the centre of the orbit.
     shift = -np.array([*orbit.axis, geometry.origin[:, 2].mean()])
-    proj_geom, vol_geom = to_astra(geometry.shifted(shift), grid.shifted(shift))
-    # ASTRA filters its input in place, and where a row is no multiple of its blocks it weights what lies beyond the
-    # row's end as well (devFDK_preweight of ASTRA 2.5). Without a margin that is the next view: every voxel was off by
-    # some percent, each time by others.
+    proj_geom, vol_geom = _in_short(geometry.shifted(shift), grid.shifted(shift))
+    # ASTRA weights its input in place, and where a row is no multiple of its blocks what lies beyond the row's end as
+    # well (devFDK_preweight of ASTRA 2.5). Without a margin that is the next view: every voxel was off by some percent,
+    # each time by others.
     views, rows, columns = projections.shape
     width = -(-columns // _COLUMNS_AT_ONCE) * _COLUMNS_AT_ONCE
     sinogram = projections.new_zeros((rows, views, width))
     sinogram[..., :columns] = projections.transpose(0, 1)
+    _filter(sinogram[..., :columns], geometry, filter_name)
     linked = astra.data3d.GPULink(sinogram.data_ptr(), columns, views, rows, width * sinogram.element_size())
     volume = torch.full(grid.shape, torch.nan, dtype=torch.float32, device=sinogram.device)
     # ASTRA works on streams of its own and asks for none of torch's.
@@ -102,7 +108,7 @@ def fdk_cuda_tensor(
         data.append(astra.data3d.link("-vol", vol_geom, volume))
         config = astra.astra_dict("FDK_CUDA")
         config["ProjectionDataId"], config["ReconstructionDataId"] = data
-        config["option"] = {"FilterType": filter_name, "GPUindex": index}
+        config["option"] = {"FilterType": "none", "GPUindex": index}
         algorithm = astra.algorithm.create(config)
         astra.algorithm.run(algorithm)
     finally:
@@ -114,3 +120,45 @@ def fdk_cuda_tensor(
     if not bool(torch.isfinite(volume).all()):
         raise RuntimeError("ASTRA's FDK_CUDA left voxels unwritten; is its GPU out of memory?")
     return volume
+
+
+def _filter(sinogram: torch.Tensor, geometry: Geometry, filter_name: str) -> None:
+    """Filter all rows of a circular cone beam (rows, views, columns), in place, as ASTRA would between its weights.
+
+    ASTRA filters row by row, eight calls of CUDA each, which for small scans takes longer than all the rest. On an H200
+    360 views of 192^2 pixels into 128^3 voxels took 20 ms, and take 11 so; 720 of 768^2 into 512^3 take 0.26 s as well.
+    """
+    import torch
+
+    rows, views, columns = sinogram.shape
+    length = 1 << (2 * columns - 1).bit_length()
+    response = torch.from_numpy(2 * ramp_response(length, filter_name)).to(sinogram)
+    # ASTRA weights rays by their obliquity before it filters: what it finds has been, and is divided by as much.
+    first, row, column = geometry.corner[0] - geometry.origin[0], np.arange(rows), np.arange(columns)
+    rays = first + row[:, None, None] * geometry.v[0] + column[:, None] * geometry.u[0]
+    weights = torch.from_numpy(np.linalg.norm(first) / np.linalg.norm(rays, axis=2))[:, None].to(sinogram)
+    at_once = max(1, _FILTERED_AT_ONCE // (views * length))
+    for some, weight in zip(sinogram.split(at_once), weights.split(at_once)):
+        filtered = torch.fft.irfft(torch.fft.rfft(some * weight, length) * response, length)
+        some.copy_(filtered[..., :columns] / weight)
+
+
+def _in_short(geometry: Geometry, grid: VolumeGrid) -> tuple[dict[str, Any], dict[str, Any]]:
+    """ASTRA's geometries, that of the projections by angles where these tell all of it.
+
+    ASTRA gets numbers as text: twelve for each of 360 views took 5 ms, one takes 1.
+    """
+    import astra
+
+    exact, volume = to_astra(geometry, grid)
+    angles = np.arctan2(geometry.origin[:, 0], -geometry.origin[:, 1])
+    source, detector = (np.linalg.norm(ends, axis=1).mean() for ends in (geometry.origin, geometry.centre))
+    width, height = (np.linalg.norm(edges, axis=1).mean() for edges in (geometry.u, geometry.v))
+    out = np.column_stack([np.sin(angles), -np.cos(angles), 0 * angles])
+    across = np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
+    up = np.broadcast_to([0.0, 0.0, height], out.shape)
+    even = np.hstack([source * out, -detector * out, width * across, up])
+    if np.abs(even - exact["Vectors"]).max() > _EXACT * min(width, height):
+        return exact, volume
+    pixels = width, height, geometry.rows, geometry.columns
+    return astra.create_proj_geom("cone", *pixels, angles, source, detector), volume

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -17,7 +18,9 @@ from tomo_polysplat.start.fdk import fits_fdk
 from tomo_polysplat.start.orbit import Orbit, find_orbit
 from tomo_polysplat.start.weights import ray_offsets
 
-__all__ = ["continued", "cut_rows", "half_width"]
+__all__ = ["continued", "cut_rows", "few_rows", "half_width"]
+
+_Array = TypeVar("_Array", np.ndarray, torch.Tensor)
 
 # A row sees the object where its largest ray has this part of a typical one, and an end sees matter where it has that.
 # The object is cut where both ends do in this share of the rows that see it.
@@ -69,7 +72,7 @@ def half_width(projections: torch.Tensor, geometry: Geometry) -> float | None:
         -log(I/I0); what is not finite sees nothing.
     geometry : Geometry
     """
-    rows = cut_rows(_some(projections))
+    rows = cut_rows(few_rows(projections))
     if rows is None:
         return None
     orbit, _ = find_orbit(geometry)
@@ -125,8 +128,8 @@ def _centred(geometry: Geometry, orbit: Orbit) -> bool:
     return min(first, last) > _CENTRED * max(first, last)
 
 
-def _some(projections: torch.Tensor) -> torch.Tensor:
-    """Enough views and rows to tell by, evenly spread."""
+def few_rows(projections: _Array) -> _Array:
+    """Enough views and rows of (views, rows, columns) to tell by, evenly spread."""
     views, rows, _ = projections.shape
     return projections[:: max(1, views // _VIEWS), :: max(1, rows // _ROWS)]
 

@@ -9,8 +9,8 @@ from tomo_polysplat.start.orbit import find_orbit
 
 __all__ = ["fdk_on_gpu", "fill_rows"]
 
-# Views filled at once: the intermediate results are several times as large.
-_CHUNK = 32
+# Pixels filled at once: the intermediate results are several times as large.
+_AT_ONCE = 1 << 24
 
 
 def fdk_on_gpu(
@@ -43,7 +43,7 @@ def fill_rows(projections: torch.Tensor) -> torch.Tensor:
     if not len(spoiled):
         return projections
     filled = projections.clone()
-    for views in spoiled.split(_CHUNK):
+    for views in spoiled.split(max(1, _AT_ONCE // projections[0].numel())):
         filled[views] = _filled(projections[views])
     return filled
 
