@@ -134,9 +134,11 @@ def _filter(sinogram: torch.Tensor, geometry: Geometry, filter_name: str) -> Non
     length = 1 << (2 * columns - 1).bit_length()
     response = torch.from_numpy(2 * ramp_response(length, filter_name)).to(sinogram)
     # ASTRA weights rays by their obliquity before it filters: what it finds has been, and is divided by as much.
-    first, row, column = geometry.corner[0] - geometry.origin[0], np.arange(rows), np.arange(columns)
-    rays = first + row[:, None, None] * geometry.v[0] + column[:, None] * geometry.u[0]
-    weights = torch.from_numpy(np.linalg.norm(first) / np.linalg.norm(rays, axis=2))[:, None].to(sinogram)
+    ends = np.stack([geometry.corner[0] - geometry.origin[0], geometry.v[0], geometry.u[0]])
+    first, v, u = torch.from_numpy(ends).to(sinogram.device)
+    row, column = (torch.arange(count, device=sinogram.device)[:, None] for count in (rows, columns))
+    rays = first + (row * v)[:, None] + column * u
+    weights = (first.norm() / rays.norm(dim=2))[:, None].to(sinogram.dtype)
     at_once = max(1, _FILTERED_AT_ONCE // (views * length))
     for some, weight in zip(sinogram.split(at_once), weights.split(at_once)):
         filtered = torch.fft.irfft(torch.fft.rfft(some * weight, length) * response, length)
