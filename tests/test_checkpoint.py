@@ -1,6 +1,7 @@
 """A run that was interrupted and resumed is the run that was not; a checkpoint of anything else is refused."""
 
 import json
+import math
 import os
 import zipfile
 
@@ -59,6 +60,18 @@ def test_a_run_resumed_at_every_pass_is_the_uninterrupted_one(tmp_path):
     assert np.array_equal(resumed.volume, whole.volume) and len(resumed.history) == 5
     seconds = [record["seconds"] for record in resumed.history]
     assert seconds == sorted(seconds) and resumed.seconds > seconds[-1], "the clock goes on too"
+
+
+def test_a_cloud_that_has_grown_goes_on_growing(tmp_path):
+    scan, path, growing = cone(), tmp_path / "fit.npz", LONG | {"growth": 2.5}
+    whole = reconstruct(scan, settings=growing)
+    counts = [record["gaussians"] for record in whole.history]
+    assert counts[1] == counts[0] + math.ceil(0.5 * counts[0])
+    assert counts[1] < counts[2] < counts[3] == counts[4] == math.floor(2.5 * counts[0])
+    killed_after(2, scan, path, settings=growing)
+    resumed = reconstruct(scan, settings=growing, checkpoint=path, resume=True)
+    assert np.array_equal(resumed.volume, whole.volume)
+    assert without_seconds(resumed.history) == without_seconds(whole.history)
 
 
 def test_the_start_volume_is_made_once(tmp_path, monkeypatch):

@@ -49,7 +49,7 @@ def told(scan, budget=None, **settings):
     plan = make_plan(start, problem, chosen, "cpu")
     scene, rays = problem.scene(plan, chosen, device), problem.rays(plan, chosen, device)
     options = OPTIONS | {"time_budget": budget}
-    return seeds_for_edges(start, plan, problem, scene, rays, chosen, device, options)
+    return seeds_for_edges(start, plan, problem, scene, rays, chosen, device, options)[:2]
 
 
 @pytest.mark.parametrize("blur", [0.0, 1.2])

@@ -1,4 +1,4 @@
-"""Relocation: what moves, and that nothing of the object is lost by it."""
+"""Relocation and growth: what moves or is split, and that nothing of the object is lost by it."""
 
 import math
 
@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
-from tomo_polysplat.model.density_control import relocate
+from tomo_polysplat.model.density_control import grow, relocate
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.render.renderer import voxelise_gaussians
 
@@ -72,3 +72,23 @@ def test_no_more_move_than_are_worth_splitting():
     assert bool(torch.isfinite(gaussians.position).all())
     assert int((gaussians.attenuation > 0).sum()) == 2
     assert math.isfinite(float(gaussians.attenuation.sum()))
+
+
+def test_a_cloud_grows_by_halves_of_the_hardest_pulled():
+    gaussians = cloud([1.0, 0.0, 2.0, 0.5])
+    before, mass = gaussians.copy(), float(volume(gaussians).sum())
+    grown, changed = grow(gaussians, torch.tensor([3.0, 9.0, 5.0, 0.2]), 2)
+    assert len(grown) == 6 and sorted(changed.tolist()) == [0, 2, 4, 5]
+    for index in (1, 3):
+        assert torch.equal(grown.position[index], before.position[index])
+    # Halves follow in the order of the pull.
+    for index, half in ((2, 4), (0, 5)):
+        middle = 0.5 * (grown.position[index] + grown.position[half])
+        assert torch.allclose(middle, before.position[index], atol=1e-6)
+        assert grown.own_material[half] == before.own_material[index]
+    assert float(volume(grown).sum()) == pytest.approx(mass, rel=0.01)
+
+
+def test_no_more_are_split_than_hold_something():
+    grown, changed = grow(cloud([1.0, 0.0, 0.0]), torch.ones(3), 3)
+    assert len(grown) == 4 and sorted(changed.tolist()) == [0, 3]

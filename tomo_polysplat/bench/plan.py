@@ -127,6 +127,8 @@ def variants(scan: PlanScan, views_per_step: int) -> list[Variant]:
         Variant("no blur" if scan.metal else "a blur", blur),
         Variant("edges taken for blurred", {"edges": "blurred"}),
         Variant("edges taken for sharp", {"edges": "sharp"}),
+        Variant("no more Gaussians than seeds", {"growth": 1.0}),
+        Variant("four times as many as seeds", {"growth": 4.0}),
         Variant("usual smoothing, not asked", {"tv_factor": 1.0}),
         Variant("smoothed at every step", {"tv_every": 1}),
         Variant("thin rays, not asked", {"pixel_rays": 1}),

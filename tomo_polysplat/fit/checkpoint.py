@@ -32,7 +32,7 @@ __all__ = ["Checkpoint", "Snapshot"]
 
 logger = logging.getLogger(__name__)
 
-FORMAT = 16
+FORMAT = 17
 # Writing takes at most this share of the time.
 _LARGEST_SHARE = 0.05
 _PARTS = tuple(field.name for field in fields(Gaussians))
@@ -211,7 +211,7 @@ def _content(about: np.ndarray) -> dict[str, Any]:
 def _plan(parts: dict[str, Any]) -> Plan:
     plan = Plan(**parts)
     counts = (plan.views_per_step, plan.tv_every)
-    amounts = (plan.reference, plan.first, plan.spacing, plan.smallest_scale, plan.tv_factor)
+    amounts = (plan.reference, plan.first, plan.spacing, plan.smallest_scale, plan.tv_factor, plan.growth)
     above_zero = min(*amounts, *counts) > 0 and plan.pixel_rays >= 0
     whole = all(isinstance(n, int) for n in (*counts, plan.pixel_rays))
     corners = len(plan.tv_corners) == 2 and all(
@@ -239,7 +239,8 @@ def _require_calibration(plan: Plan, asked: Any) -> None:
 def _snapshot(arrays: dict[str, np.ndarray], numbers: dict[str, Any], views: int) -> Snapshot:
     """The snapshot of a file, its parts checked against each other."""
     gaussians = _cloud(arrays, "gaussians", arrays["gaussians/attenuation"].shape)
-    best = _cloud(arrays, "best", gaussians.attenuation.shape) if "best/position" in arrays else None
+    # The best state may be of before the cloud has grown.
+    best = _cloud(arrays, "best", arrays["best/attenuation"].shape) if "best/position" in arrays else None
     shapes = {name: tuple(tensor.shape) for name, tensor in gaussians.parameters().items()}
     first, second = (
         {name: _tensor(arrays[f"{kind}/{name}"], shape) for name, shape in shapes.items()}
@@ -254,7 +255,7 @@ def _snapshot(arrays: dict[str, np.ndarray], numbers: dict[str, Any], views: int
 
 
 def _require_numbers(numbers: dict[str, Any]) -> None:
-    counts = ("steps", "steps_made", "pace", "skipped_pairs", "relocated")
+    counts = ("steps", "steps_made", "pace", "skipped_pairs", "relocated", "most")
     if any(not isinstance(numbers[name], int) or numbers[name] < 0 for name in counts):
         raise TypeError(f"whole numbers for {', '.join(counts)}")
     if any(not math.isfinite(numbers[name]) for name in ("seconds", "begun")):

@@ -70,7 +70,7 @@ def first_gaussians(
     rays = runs * plan.pixel_rays**2 if plan.pixel_rays else 1 + AVERAGED_RAYS**2
     plan.reasons["memory"] = require_room(
         device,
-        gaussians=runs * len(gaussians),
+        gaussians=math.ceil(runs * max(settings.growth, 1.0) * len(gaussians)),
         views=plan.views_per_step,
         pixels=rays * problem.geometry.rows * problem.geometry.columns,
         voxels=math.prod(problem.grid.shape),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -23,14 +24,18 @@ from tomo_polysplat.fit.soft_matter import flatten
 from tomo_polysplat.fit.step import step_rates
 from tomo_polysplat.fit.stopping import Clock
 from tomo_polysplat.kernels.spatial_order import spatial_order
-from tomo_polysplat.model.density_control import relocate
-from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.model.density_control import grow, relocate
+from tomo_polysplat.model.gaussians import OF_ALL, Gaussians
 from tomo_polysplat.settings import Settings
 
 __all__ = ["Fitter", "views_of_a_pass"]
 
 # A pass over fewer views than this makes the steps of one over as many.
 _FEWEST_VIEWS = 10
+# Where a cloud grows, this share of it is split between passes, from so early in the run on: before, seeds are pulled
+# to where they belong. Broccoli of 44^3 and, in twice the room, of 36^3 voxels, four times as many Gaussians: +1.61 and
+# +0.81 dB, a pass earlier +1.59 and +0.72, a third at a time to three times as many +1.27 and +0.56.
+_SPLIT, _SPLIT_FROM = 0.5, 0.14
 
 
 class Fitter:
@@ -69,6 +74,7 @@ class Fitter:
         self.steps_of_a_pass = max(1, round(views_of_a_pass(rays) / batch))
         self.relocated = 0
         self.relocation_due = False
+        self.most = math.floor(max(settings.growth, 1.0) * len(gaussians))
 
     def passes(self, clock: Clock) -> Iterator[tuple[float, float, int]]:
         """Step until the clock runs out; what each pass over the views gave, the last perhaps a part of one.
@@ -77,7 +83,9 @@ class Fitter:
         """
         made, begun = 0, 0.0
         while (share := clock.share()) < 1:
-            if self.relocation_due:
+            if self.relocation_due and share >= _SPLIT_FROM and len(self.gaussians) < self.most:
+                self._grow()
+            elif self.relocation_due:
                 self._relocate()
             views = self._next_views(self.batch)
             self.step(views, share)
@@ -132,6 +140,7 @@ class Fitter:
             "largest": self.step.largest,
             "relocated": self.relocated,
             "relocation_due": self.relocation_due,
+            "most": self.most,
             "random": self.rng.bit_generator.state,
         }
         first, second = ({k: pair[j] for k, pair in self.step.moments.items()} for j in (0, 1))
@@ -150,6 +159,7 @@ class Fitter:
         self.step.largest = kept.numbers["largest"]
         self.relocated = int(kept.numbers["relocated"])
         self.relocation_due = bool(kept.numbers["relocation_due"])
+        self.most = int(kept.numbers["most"])
         self.rng.bit_generator.state = kept.numbers["random"]
 
     @torch.no_grad()
@@ -170,6 +180,26 @@ class Fitter:
         order = spatial_order(self.gaussians.position)
         for tensor in (*own.values(), *memory):
             tensor.copy_(tensor[order])
+
+    @torch.no_grad()
+    def _grow(self) -> None:
+        """Split Gaussians where the rays ask for more detail, with a fresh memory of the optimiser."""
+        self.relocation_due = False
+        before, old = len(self.gaussians), self.step
+        grown, changed = grow(self.gaussians, old.pull, min(math.ceil(_SPLIT * before), self.most - before))
+        order = spatial_order(grown.position)
+        self.gaussians = grown.select(order)
+        hurry = hurried(self.settings, self.steps)
+        self.step = make_step(self.gaussians, self.spacing, self.rays, self.scene, hurry, batch=self.batch)
+        for name, moments in self.step.moments.items():
+            for moment, kept in zip(moments, old.moments[name]):
+                if name in OF_ALL:
+                    moment.copy_(kept)
+                    continue
+                wider = torch.cat([kept, kept.new_zeros((len(grown) - before, *kept.shape[1:]))])
+                wider[changed] = 0.0
+                moment.copy_(wider[order])
+        self.step.done, self.step.largest = old.done, old.largest
 
     def _next_views(self, batch: int) -> np.ndarray:
         """The next views of an order that uses each once before any again."""

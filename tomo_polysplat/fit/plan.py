@@ -95,6 +95,8 @@ class Plan:
         Whether light soft matter is fat; None until `fit.fat` has told.
     sharp : bool
         Whether seeds are thin across edges however close they are; `fit.sharpness` tells it by short fits.
+    growth : float
+        So many times as many Gaussians as seeds there may be in the end; `fit.detail` tells it after a short fit.
     blurred : bool
         Whether rays are seen through the detector's blur; see ``physics.detector_blur``.
     tv_factor : float
@@ -120,6 +122,7 @@ class Plan:
     pixel_rays: int = 0
     fat: bool | None = None
     sharp: bool = False
+    growth: float = 1.0
     tv_factor: float = 1.0
     reasons: dict[str, Any] = field(default_factory=dict)
 
@@ -127,7 +130,7 @@ class Plan:
         """The settings for this object: levels and material numbers (``fit.reference``), and how much is smoothed."""
         settings = SoftReference(self.reference, self.first, self.soft_u).adapted(settings)
         weight = self.tv_factor * settings.tv_weight
-        return replace(settings, tv_weight=weight, support_level=self.support_level)
+        return replace(settings, tv_weight=weight, support_level=self.support_level, growth=self.growth)
 
 
 def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Settings, device: str) -> Plan:

@@ -13,6 +13,7 @@ from tomo_polysplat.fit.agent import settings_for_agent
 from tomo_polysplat.fit.calibrated_physics import describe_scatter, with_fitted
 from tomo_polysplat.fit.calibration import Calibration, calibrated
 from tomo_polysplat.fit.checkpoint import Checkpoint
+from tomo_polysplat.fit.detail import choose_growth
 from tomo_polysplat.fit.first_volume import first_volume
 from tomo_polysplat.fit.plan import Plan, make_plan
 from tomo_polysplat.fit.problem import Problem
@@ -130,7 +131,8 @@ def prepare(
         report(0.0, "seeds")
         settings, agent = settings_for_agent(start, plan.first, problem, settings, device, options)
         plan.reasons |= {"start": why, **agent}
-        plan, gaussians = seeds_for_edges(start, plan, problem, scene, rays, settings, device, options)
+        plan, gaussians, tried = seeds_for_edges(start, plan, problem, scene, rays, settings, device, options)
+        choose_growth(gaussians, tried, plan, scene, rays, settings)
         choose_smoothing(gaussians, plan, problem, scene, rays, settings, options)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("interrupted before the fit had begun: there is no result yet") from None

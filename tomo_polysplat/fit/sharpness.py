@@ -15,8 +15,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from tomo_polysplat.fit.detail import why_not_asked
 from tomo_polysplat.fit.first_gaussians import first_gaussians
 from tomo_polysplat.fit.loss import misfit
+from tomo_polysplat.fit.optimise import FitOutcome
 from tomo_polysplat.fit.plan import Plan
 from tomo_polysplat.fit.plan_seeds import closer_spacing, finest_spacing
 from tomo_polysplat.fit.problem import Problem
@@ -57,8 +59,10 @@ def seeds_for_edges(
     settings: Settings,
     device: torch.device,
     options: Mapping[str, Any],
-) -> tuple[Plan, Gaussians]:
+) -> tuple[Plan, Gaussians, Gaussians | None]:
     """Seeds of a start volume, thin across sharp edges however close they are, and the plan with what was told.
+
+    And what seeds of that kind, no closer than the others, came to in a short fit, if there was one.
 
     Parameters
     ----------
@@ -94,27 +98,34 @@ def seeds_for_edges(
         own = replace(sharp, spacing=spacing, reasons=reasons)
         return own, first_gaussians(start, own, problem, settings, device)
 
-    if settings.edges == "sharp":
-        return _because(*closer(*of_kind(True)), "asked for")
-    plain = of_kind(False)
-    if settings.edges == "blurred":
-        return _because(*plain, "asked for")
-    why_not = _why_not(plan, problem, settings)
-    if why_not or not len(plain[1]):
-        return _because(*plain, why_not or "there are no seeds: the start volume is empty")
     views = problem.geometry.views
     passes = max(_FEWEST_VIEWS, min(views, _STEPS * views_of_short_steps(plan, problem))) / views
     short = replace(settings, passes=passes, soft_gain=0.0, tv_weight=0.0)
-    kinds, misfits = (plain, of_kind(True)), []
-    for own, seeds in kinds:
-        outcome = fitted_shortly(
+
+    def tried(own: Plan, seeds: Gaussians) -> FitOutcome:
+        return fitted_shortly(
             seeds.copy(), own, problem, scene, rays, short, options["seed"], options["time_budget"]
         )
+
+    if settings.edges != "auto":
+        kind = of_kind(settings.edges == "sharp")
+        shown = None
+        if len(kind[1]) and not (why_not_asked(kind[1], plan, settings) or _why_not(plan, problem, settings)):
+            shown = None if cut_short(outcome := tried(*kind)) else outcome.gaussians
+        return *_because(*(closer(*kind) if kind[0].sharp else kind), "asked for"), shown
+    plain = of_kind(False)
+    why_not = _why_not(plan, problem, settings)
+    if why_not or not len(plain[1]):
+        return *_because(*plain, why_not or "there are no seeds: the start volume is empty"), None
+    kinds, misfits, fitted = (plain, of_kind(True)), [], []
+    for kind in kinds:
+        outcome = tried(*kind)
         if cut_short(outcome):
-            return _because(*plain, f"round seeds: {TOO_SHORT} how sharp edges are")
+            return *_because(*plain, f"round seeds: {TOO_SHORT} how sharp edges are"), None
         misfits.append(_misfit(outcome.gaussians, scene, rays, short))
+        fitted.append(outcome.gaussians)
     sharp, reason = _judged(*misfits)
-    return _because(*(closer(*kinds[True]) if sharp else plain), reason)
+    return *_because(*(closer(*kinds[True]) if sharp else plain), reason), fitted[sharp]
 
 
 def _because(plan: Plan, seeds: Gaussians, reason: str) -> tuple[Plan, Gaussians]:

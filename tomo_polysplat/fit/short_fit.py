@@ -225,7 +225,7 @@ def fitted_shortly(
         plan.spacing * problem.voxel,
         rays,
         scene,
-        settings,
+        replace(settings, growth=1.0),
         views_per_step=views_of_short_steps(plan, problem),
         rng=np.random.default_rng(seed),
         started=started,

@@ -30,7 +30,7 @@ __all__ = ["Solver"]
 logger = logging.getLogger(__name__)
 
 # Seconds that are kept for what comes after the fit besides the volume, where there is a time budget.
-_FINISHING = 0.02
+_FINISHING = 0.03
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,8 @@ class Solver:
         # A volume that takes most of the budget still needs a fit: then the end is late.
         end = self.started + budget
         left = max(end - time.perf_counter(), 0.0)
-        return end - min(prepared.scene.seconds_of_basis(prepared.gaussians) + _FINISHING, 0.5 * left)
+        volume = prepared.plan.growth * prepared.scene.seconds_of_basis(prepared.gaussians)
+        return end - min(volume + _FINISHING, 0.5 * left)
 
     def _scatter_search(self, prepared: PreparedFit, problem: Problem) -> ScatterSearch | None:
         def scatter() -> dict[str, Any]:

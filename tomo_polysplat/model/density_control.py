@@ -1,4 +1,4 @@
-"""Gaussians that hold nothing are put where the rays ask for more detail."""
+"""Gaussians are split where the rays ask for more detail, into places of others that hold nothing, or to be more."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 
 from tomo_polysplat.model.gaussians import Gaussians
 
-__all__ = ["relocate"]
+__all__ = ["grow", "relocate"]
 
 # Attenuation, in soft references, below which a Gaussian holds nothing.
 _DEAD = 1e-3
@@ -18,8 +18,7 @@ _DEAD = 1e-3
 def relocate(gaussians: Gaussians, pull: torch.Tensor, share: float) -> torch.Tensor:
     """Split the Gaussians that are pulled hardest, into the places of those that hold nothing.
 
-    A Gaussian that is pulled both ways at once covers something finer than itself. It becomes two along its
-    longest axis, half a deviation to either side, 0.7 times as long; their mass together is the old one's.
+    A Gaussian that is pulled both ways at once covers something finer than itself. It becomes two; see `_halve`.
 
     Parameters
     ----------
@@ -41,16 +40,60 @@ def relocate(gaussians: Gaussians, pull: torch.Tensor, share: float) -> torch.Te
     if count == 0:
         return dead.new_zeros(0, dtype=torch.int64)
     target = dead.nonzero()[:count, 0]
-    source = torch.where(alive, pull, -torch.ones_like(pull)).topk(count).indices
-    axis = gaussians.log_scale[source].argmax(dim=1)
-    half = 0.5 * gaussians.log_scale[source, axis].exp()[:, None] * _axis(gaussians.rotation[source], axis)
-    gaussians.log_scale[source, axis] += math.log(0.7)
-    gaussians.attenuation[source] *= 0.5 / 0.7
+    source = _hardest(pull, alive, count)
+    half = _halve(gaussians, source)
     for tensor in gaussians.each().values():
         tensor[target] = tensor[source]
     gaussians.position[source] -= half
     gaussians.position[target] += half
     return torch.cat([source, target])
+
+
+@torch.no_grad()
+def grow(gaussians: Gaussians, pull: torch.Tensor, count: int) -> tuple[Gaussians, torch.Tensor]:
+    """Split so many of the Gaussians that are pulled hardest, or all that hold something.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        Changed in place; halves of theirs follow them in what is returned.
+    pull : (n,) tensor
+        As for `relocate`.
+    count : int
+
+    Returns
+    -------
+    gaussians : Gaussians
+    changed : (2 m,) int64 tensor
+        Indices of the m that were split, and of their new halves.
+    """
+    alive = gaussians.attenuation >= _DEAD
+    source = _hardest(pull, alive, min(count, int(alive.sum())))
+    half = _halve(gaussians, source)
+    everyone = torch.arange(len(gaussians), device=source.device)
+    grown = gaussians.select(torch.cat([everyone, source]))
+    target = len(gaussians) + torch.arange(len(source), device=source.device)
+    grown.position[source] -= half
+    grown.position[target] += half
+    return grown, torch.cat([source, target])
+
+
+def _hardest(pull: torch.Tensor, alive: torch.Tensor, count: int) -> torch.Tensor:
+    """(count,) indices of the Gaussians that hold something and are pulled hardest."""
+    return torch.where(alive, pull, -torch.ones_like(pull)).topk(count).indices
+
+
+def _halve(gaussians: Gaussians, source: torch.Tensor) -> torch.Tensor:
+    """(m, 3) how far from the middle the halves of some Gaussians lie, to either side; what each holds is set in place.
+
+    Along the longest axis they lie half a deviation from the middle, and are 0.7 times as long; their mass together is
+    the old one's.
+    """
+    axis = gaussians.log_scale[source].argmax(dim=1)
+    half = 0.5 * gaussians.log_scale[source, axis].exp()[:, None] * _axis(gaussians.rotation[source], axis)
+    gaussians.log_scale[source, axis] += math.log(0.7)
+    gaussians.attenuation[source] *= 0.5 / 0.7
+    return half
 
 
 def _axis(rotation: torch.Tensor, axis: torch.Tensor) -> torch.Tensor:

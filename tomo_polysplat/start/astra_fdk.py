@@ -20,7 +20,7 @@ _COLUMNS_AT_ONCE = 32
 # Of a pixel: what views may be off an even orbit by that is told by angles. ASTRA computes in float32.
 _EXACT = 1e-5
 # Numbers, with what rows are padded by, that are filtered at once.
-_FILTERED_AT_ONCE = 1 << 26
+_FILTERED_AT_ONCE = 1 << 24
 
 
 def suits_fdk_cuda(
