@@ -76,12 +76,17 @@ class Clock:
         return self.deadline is not None and time.perf_counter() >= self.deadline
 
     def share(self) -> float:
-        """From 0 to 1."""
+        """From 0 to 1.
+
+        Time counts where it is a step ahead: with time to spare a run is the one without a deadline, bit for bit.
+        """
+        by_steps = self.done / self.steps
         if self.deadline is None:
-            return self.done / self.steps
+            return by_steps
         if self.late:
             return 1.0
-        return max(self.done / self.steps, (time.perf_counter() - self.begun) / (self.deadline - self.begun))
+        by_time = (time.perf_counter() - self.begun) / (self.deadline - self.begun)
+        return by_time if by_time > by_steps + 1 / self.steps else by_steps
 
     def expected_steps(self, seconds: float) -> int:
         """How many steps the run comes to where each of those left takes so many seconds."""
