@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from tomo_polysplat.fit.detail import choose_growth, unexplained
+from tomo_polysplat.fit.detail import Tried, choose_growth, unexplained
 from tomo_polysplat.fit.fitter import Fitter
 from tomo_polysplat.fit.plan import Plan
 from tomo_polysplat.fit.stopping import Clock
@@ -54,32 +54,59 @@ def plan(curves=1):
     )
 
 
+def tried(gaussians, closer=lambda factor: None):
+    return Tried(gaussians, closer)
+
+
+def dimmer(gaussians):
+    """Gaussians that leave a third of the rays."""
+    other = gaussians.copy()
+    other.attenuation *= 2 / 3
+    return other
+
+
 @pytest.mark.parametrize(
-    "more, changed, curves, growth, because",
+    "detail, changed, curves, growth, because",
     [
-        (0.3, {}, 1, 4.0, "unexplained"),
-        (0.0, {}, 1, 1.0, "unexplained"),
-        (0.3, {}, 3, 1.0, "dense matter"),
-        (0.3, {"bone_level": 1e-3}, 1, 1.0, "dense matter"),
-        (0.3, {"growth": 2.0}, 3, 2.0, "asked for"),
-        (0.3, {"growth": 0.5}, 1, 1.0, "asked for"),
-        (0.3, {"max_gaussians": 1}, 1, 1.0, "not asked for"),
+        (True, {}, 1, 4.0, "closer seeds 0."),
+        (False, {}, 1, 1.0, "is the geometry right"),
+        (True, {"bone_level": 1e-3}, 1, 1.0, "dense matter"),
+        (True, {}, 3, 1.0, "dense matter"),
+        (True, {"growth": 2.0}, 3, 2.0, "asked for"),
+        (True, {"growth": 0.5}, 1, 1.0, "asked for"),
+        (True, {"max_gaussians": 1}, 1, 1.0, "not asked for"),
     ],
 )
-def test_a_cloud_grows_where_the_rays_show_detail(more, changed, curves, growth, because):
-    gaussians, scene, rays = scan(more)
+def test_a_cloud_grows_where_more_gaussians_show_more(detail, changed, curves, growth, because):
+    gaussians, scene, rays = scan()
+    short = dimmer(gaussians)
+    shown = tried(short, lambda factor: gaussians if detail else short)
     chosen, settings = plan(curves), Settings(**{"bone_level": 1e3} | changed)
-    choose_growth(gaussians, gaussians, chosen, scene, rays, settings)
+    choose_growth(gaussians, shown, chosen, scene, rays, settings)
     assert chosen.growth == growth and because in chosen.reasons["growth"]
 
 
+def test_what_is_explained_asks_no_more():
+    gaussians, scene, rays = scan()
+
+    def nobody(factor):
+        raise AssertionError("a short fit for nothing")
+
+    chosen = plan()
+    choose_growth(gaussians, tried(gaussians, nobody), chosen, scene, rays, Settings(bone_level=1e3))
+    assert chosen.growth == 1.0 and "unexplained" in chosen.reasons["growth"]
+    choose_growth(gaussians, tried(dimmer(gaussians)), chosen, scene, rays, Settings(bone_level=1e3))
+    assert chosen.growth == 1.0 and "no time" in chosen.reasons["growth"]
+
+
 def test_a_budget_of_gaussians_limits_it_and_many_are_not_asked():
-    gaussians, scene, rays = scan(0.3)
+    gaussians, scene, rays = scan()
+    shown = tried(dimmer(gaussians), lambda factor: gaussians)
     chosen, settings = plan(), Settings(bone_level=1e3, max_gaussians=2 * len(gaussians))
-    choose_growth(gaussians, gaussians, chosen, scene, rays, settings)
+    choose_growth(gaussians, shown, chosen, scene, rays, settings)
     assert chosen.growth == 2.0
     many = gaussians.select(torch.zeros(15_001, dtype=torch.int64))
-    choose_growth(many, gaussians, chosen, scene, rays, settings)
+    choose_growth(many, shown, chosen, scene, rays, settings)
     assert chosen.growth == 1.0 and "15000" in chosen.reasons["growth"]
     choose_growth(gaussians, None, chosen, scene, rays, settings)
     assert chosen.growth == 1.0 and "no short fit" in chosen.reasons["growth"]

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.detail import why_not_asked
+from tomo_polysplat.fit.detail import Tried, why_not_asked
 from tomo_polysplat.fit.first_gaussians import first_gaussians
 from tomo_polysplat.fit.loss import misfit
 from tomo_polysplat.fit.optimise import FitOutcome
@@ -59,10 +59,10 @@ def seeds_for_edges(
     settings: Settings,
     device: torch.device,
     options: Mapping[str, Any],
-) -> tuple[Plan, Gaussians, Gaussians | None]:
+) -> tuple[Plan, Gaussians, Tried | None]:
     """Seeds of a start volume, thin across sharp edges however close they are, and the plan with what was told.
 
-    And what seeds of that kind, no closer than the others, came to in a short fit, if there was one.
+    And the short fit of seeds of that kind, no closer than the others, if there was one.
 
     Parameters
     ----------
@@ -102,30 +102,39 @@ def seeds_for_edges(
     passes = max(_FEWEST_VIEWS, min(views, _STEPS * views_of_short_steps(plan, problem))) / views
     short = replace(settings, passes=passes, soft_gain=0.0, tv_weight=0.0)
 
-    def tried(own: Plan, seeds: Gaussians) -> FitOutcome:
+    def fitted(own: Plan, seeds: Gaussians) -> FitOutcome:
         return fitted_shortly(
             seeds.copy(), own, problem, scene, rays, short, options["seed"], options["time_budget"]
         )
+
+    def tried(own: Plan, outcome: FitOutcome) -> Tried | None:
+        def closer(factor: float) -> Gaussians | None:
+            many = replace(own, spacing=factor * own.spacing, reasons=dict(own.reasons))
+            found = fitted(many, first_gaussians(start, many, problem, settings, device))
+            return None if cut_short(found) else found.gaussians
+
+        return None if cut_short(outcome) else Tried(outcome.gaussians, closer)
 
     if settings.edges != "auto":
         kind = of_kind(settings.edges == "sharp")
         shown = None
         if len(kind[1]) and not (why_not_asked(kind[1], plan, settings) or _why_not(plan, problem, settings)):
-            shown = None if cut_short(outcome := tried(*kind)) else outcome.gaussians
+            shown = tried(kind[0], fitted(*kind))
         return *_because(*(closer(*kind) if kind[0].sharp else kind), "asked for"), shown
     plain = of_kind(False)
     why_not = _why_not(plan, problem, settings)
     if why_not or not len(plain[1]):
         return *_because(*plain, why_not or "there are no seeds: the start volume is empty"), None
-    kinds, misfits, fitted = (plain, of_kind(True)), [], []
+    kinds, misfits, outcomes = (plain, of_kind(True)), [], []
     for kind in kinds:
-        outcome = tried(*kind)
+        outcome = fitted(*kind)
         if cut_short(outcome):
             return *_because(*plain, f"round seeds: {TOO_SHORT} how sharp edges are"), None
         misfits.append(_misfit(outcome.gaussians, scene, rays, short))
-        fitted.append(outcome.gaussians)
+        outcomes.append(outcome)
     sharp, reason = _judged(*misfits)
-    return *_because(*(closer(*kinds[True]) if sharp else plain), reason), fitted[sharp]
+    shown = tried(kinds[sharp][0], outcomes[sharp])
+    return *_because(*(closer(*kinds[True]) if sharp else plain), reason), shown
 
 
 def _because(plan: Plan, seeds: Gaussians, reason: str) -> tuple[Plan, Gaussians]:
