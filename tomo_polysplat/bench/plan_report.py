@@ -34,7 +34,7 @@ def as_markdown(record: Mapping[str, Any]) -> str:
 
 def _table(runs: Runs) -> str:
     """The first run is that of the plan, to which the others are compared."""
-    headings = ["", "Gaussians", "s", "CPU s", "CPU time", "PSNR", "PSNR all"]
+    headings = ["", "Seeds", "s", "CPU s", "CPU time", "PSNR", "PSNR all"]
     return markdown_table(headings, [_row(run, runs[0]) for run in runs])
 
 
@@ -42,13 +42,13 @@ def _row(run: Mapping[str, Any], plan: Mapping[str, Any]) -> list[str]:
     label = "the plan" if run is plan else run["method"]
     if run["seconds"] is None or plan["seconds"] is None:
         return [f"{label}: {without_figures(run) if run['seconds'] is None else 'no plan'}", *["–"] * 6]
-    gaussians = str(run["about"]["plan"]["gaussians"]).partition(",")[0]
+    seeds = str(run["about"]["plan"]["gaussians"]).partition(",")[0]
     figures = [f"{run['seconds']:.1f}", f"{run['cpu_seconds']:.1f}"]
     figures.append(f"x {run['cpu_seconds'] / plan['cpu_seconds']:.2f}")
     for key in ("psnr", "psnr_all"):
         change = "" if run is plan else f" ({run[key] - plan[key]:+.2f})"
         figures.append(f"{run[key]:.2f}{change}")
-    return [label, gaussians, *figures]
+    return [label, seeds, *figures]
 
 
 def _stopping_table(entries: Sequence[Mapping[str, Any]]) -> str:
