@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from tomo_polysplat.fit.detail import Tried, choose_growth, unexplained
+from tomo_polysplat.fit.detail import Tried, choose_growth, smooth_less, unexplained
 from tomo_polysplat.fit.fitter import Fitter
 from tomo_polysplat.fit.plan import Plan
 from tomo_polysplat.fit.stopping import Clock
@@ -110,6 +110,15 @@ def test_a_budget_of_gaussians_limits_it_and_many_are_not_asked():
     assert chosen.growth == 1.0 and "15000" in chosen.reasons["growth"]
     choose_growth(gaussians, None, chosen, scene, rays, settings)
     assert chosen.growth == 1.0 and "no short fit" in chosen.reasons["growth"]
+
+
+@pytest.mark.parametrize("growth, asked, factor", [(4.0, 0.0, 0.2), (1.0, 0.0, 0.5), (4.0, 0.5, 0.5)])
+def test_a_cloud_that_grows_is_smoothed_less_unless_asked_for(growth, asked, factor):
+    chosen = plan()
+    chosen.growth, chosen.tv_factor, chosen.reasons["smoothing"] = growth, 0.5, "half"
+    smooth_less(chosen, Settings(tv_factor=asked))
+    assert chosen.tv_factor == pytest.approx(factor)
+    assert ("grows" in chosen.reasons["smoothing"]) == (factor == 0.2)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from tomo_polysplat.fit.agent import settings_for_agent
 from tomo_polysplat.fit.calibrated_physics import describe_scatter, with_fitted
 from tomo_polysplat.fit.calibration import Calibration, calibrated
 from tomo_polysplat.fit.checkpoint import Checkpoint
-from tomo_polysplat.fit.detail import choose_growth
+from tomo_polysplat.fit.detail import choose_growth, smooth_less
 from tomo_polysplat.fit.first_volume import first_volume
 from tomo_polysplat.fit.plan import Plan, make_plan
 from tomo_polysplat.fit.problem import Problem
@@ -134,6 +134,7 @@ def prepare(
         plan, gaussians, tried = seeds_for_edges(start, plan, problem, scene, rays, settings, device, options)
         choose_growth(gaussians, tried, plan, scene, rays, settings)
         choose_smoothing(gaussians, plan, problem, scene, rays, settings, options)
+        smooth_less(plan, settings)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("interrupted before the fit had begun: there is no result yet") from None
     if saved is not None:

@@ -52,10 +52,6 @@ _MOST_RAYS = 3.0
 _HELD_OUT, _FEWEST_HELD_OUT, _VIEWS, _VIEWS_PLANAR = 0.1, 100, 48, 1000
 # A run of fewer passes, as of the fast preset, is in a hurry.
 _FEWEST_PASSES = 10.0
-# A cloud that is to grow (`fit.detail`) takes this share of the weight: broccoli of 30^3, 34^3, 36^3 and 44^3 voxels,
-# grown fourfold, gains -0.5, -0.3, 0.7 and 1.7 dB with all of it, 0.6, 0.4, 1.3 and 2.2 with 0.3 of it; in twice the
-# room, and grains, it makes no difference.
-_GROWN = 0.4
 
 
 def choose_smoothing(
@@ -92,23 +88,6 @@ def choose_smoothing(
         plan.tv_factor = settings.tv_factor
         plan.reasons["smoothing"] = f"{plan.tv_factor:g} times the usual weight: asked for"
         return
-    _choose(seeds, plan, problem, scene, rays, settings, options)
-    if plan.growth > 1:
-        plan.tv_factor *= _GROWN
-        plan.reasons["smoothing"] += f"; of that {_GROWN:g}, as the cloud grows to show detail"
-    logger.info("The volume is smoothed with %s", plan.reasons["smoothing"])
-
-
-def _choose(
-    seeds: Gaussians,
-    plan: Plan,
-    problem: Problem,
-    scene: FitScene,
-    rays: Rays,
-    settings: Settings,
-    options: Mapping[str, Any],
-) -> None:
-    """What `choose_smoothing` sets and says for a cloud that stays as it is."""
     by_depth, by_noise = weights_by_depth(plan.depth, rays)
     plan.tv_factor, thin = by_depth, by_depth < 1
     usual = "the usual weight"
@@ -147,6 +126,7 @@ def _choose(
         return
     weight = "the usual weight" if plan.tv_factor == 1 else f"{plan.tv_factor:.2g} times the usual weight"
     plan.reasons["smoothing"] = f"{weight}: after a short fit {told} of the misfit of the held-out rays"
+    logger.info("The volume is smoothed with %s", plan.reasons["smoothing"])
 
 
 def _asked(left_by: Callable[[float], float], less: list[float], more: bool) -> tuple[float, str]:
