@@ -126,7 +126,7 @@ class Settings:
     """In every how many steps it is taken, and counts as many times; 0 leaves it to the plan."""
     growth: float = 0.0
     """So many times as many Gaussians as seeds may be there in the end, by splitting; 1: no more of them; 0 leaves it
-    to the plan, which asks the rays of small clouds."""
+    to the plan, which asks the rays."""
     relocated: float = 0.03
     """Largest share of the Gaussians that, once a pass, moves from where it holds nothing to where it is wanted."""
     relocate_until: float = 0.5

@@ -38,7 +38,7 @@ def test_scans_are_what_their_names_say():
 
 
 def test_unknown_scans_are_refused():
-    for wrong in ({"scans": ("no such",)}, {"size": 0}):
+    for wrong in ({"scans": ("no such",)}, {"size": 0}, {"again": -1}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             PlanBench(**wrong)
 
@@ -48,12 +48,20 @@ def test_the_command_leaves_a_record(tmp_path, monkeypatch, capsys):
         "tomo_polysplat.bench.plan.variants", lambda scan, together: [variants(scan, together)[1]]
     )
     monkeypatch.setitem(PRESETS, "balanced", {"passes": 2.0})
-    chosen = ["--scans", "narrow spectrum", "--size", "7", "--views", "12", "--device", "cpu"]
+    # All that beats the plan, or is a hundred decibels behind, is tried again.
+    monkeypatch.setattr("tomo_polysplat.bench.plan._AHEAD", -100.0)
+    chosen = ["--again", "2", "--scans", "narrow spectrum", "--size", "7", "--views", "12", "--device", "cpu"]
     assert main(["bench", "plan", *chosen, "--record", str(tmp_path)]) == 0
     record = json.loads((tmp_path / "plan.json").read_text())
     assert [run["method"] for run in record["runs"]] == ["default", "3 curves"]
     assert len(record["stopping"][0]["history"]) == record["stopping"][0]["rule"]["passes"] == 2
+    again = [(run["seed"], run["method"]) for run in record["again"]]
+    assert again == [(1, "default"), (1, "3 curves"), (2, "default"), (2, "3 curves")]
+    gains = [
+        one["psnr"] - plan["psnr"] for plan, one in (record["runs"], record["again"][:2], record["again"][2:])
+    ]
     table = (tmp_path / "plan.md").read_text()
+    assert f"| 3 curves | 3 | {np.mean(gains):+.2f} ({min(gains):+.2f} to {max(gains):+.2f}) |" in table
     assert table == as_markdown(record) and "the plan" in table and "| 3 curves |" in table
     assert table.strip() in capsys.readouterr().out
     assert (tmp_path / "plan-stopping.png").read_bytes()[1:4] == b"PNG"

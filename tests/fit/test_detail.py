@@ -99,17 +99,36 @@ def test_what_is_explained_asks_no_more():
     assert chosen.growth == 1.0 and "no time" in chosen.reasons["growth"]
 
 
-def test_a_budget_of_gaussians_limits_it_and_many_are_not_asked():
+def test_gaussians_and_memory_limit_it():
     gaussians, scene, rays = scan()
     shown = tried(dimmer(gaussians), lambda factor: gaussians)
     chosen, settings = plan(), Settings(bone_level=1e3, max_gaussians=2 * len(gaussians))
     choose_growth(gaussians, shown, chosen, scene, rays, settings)
     assert chosen.growth == 2.0
-    many = gaussians.select(torch.zeros(15_001, dtype=torch.int64))
-    choose_growth(many, shown, chosen, scene, rays, settings)
-    assert chosen.growth == 1.0 and "15000" in chosen.reasons["growth"]
+    choose_growth(gaussians, replace(shown, room=3.0), chosen, scene, rays, Settings(bone_level=1e3))
+    assert chosen.growth == 3.0
+
+    def nobody(factor):
+        raise AssertionError("a short fit that there is no memory for")
+
+    choose_growth(gaussians, Tried(dimmer(gaussians), nobody, 1.5), chosen, scene, rays, settings)
+    assert chosen.growth == 1.0 and "memory for 1.5 times" in chosen.reasons["growth"]
     choose_growth(gaussians, None, chosen, scene, rays, settings)
     assert chosen.growth == 1.0 and "no short fit" in chosen.reasons["growth"]
+
+
+def test_what_is_left_by_many_is_detail_sooner():
+    # Plain surfaces leave less of the rays the more voxels, and so Gaussians, there are.
+    gaussians, scene, rays = scan()
+    one = gaussians.copy()
+    one.attenuation *= 0.8
+    several = one.select(torch.arange(len(one)).repeat(40))
+    several.attenuation /= 40
+    assert unexplained(several, scene, rays) == pytest.approx(unexplained(one, scene, rays), rel=1e-3)
+    for short, growth in ((one, 1.0), (several, 4.0)):
+        chosen, settings = plan(), Settings(bone_level=1e3)
+        choose_growth(gaussians, tried(short, lambda factor: gaussians), chosen, scene, rays, settings)
+        assert chosen.growth == growth
 
 
 @pytest.mark.parametrize("growth, asked, factor", [(4.0, 0.0, 0.2), (1.0, 0.0, 0.5), (4.0, 0.5, 0.5)])

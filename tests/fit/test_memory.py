@@ -51,6 +51,20 @@ def test_more_of_anything_needs_more(monkeypatch):
             memory.require_room(GPU, **(SCENE | {name: SCENE[name] * 20}))
 
 
+def test_room_for_gaussians_is_what_would_not_be_refused(monkeypatch):
+    with_free(monkeypatch, 5e9)
+    all_else = {name: SCENE[name] for name in ("views", "pixels", "voxels")}
+    most = memory.room_for_gaussians(GPU, **all_else)
+    memory.require_room(GPU, **(SCENE | {"gaussians": int(most)}))
+    with pytest.raises(ValueError, match="GPU"):
+        memory.require_room(GPU, **(SCENE | {"gaussians": int(most) + 1}))
+    assert memory.room_for_gaussians(GPU, **(all_else | {"voxels": 4096**3})) == 0.0
+    monkeypatch.setattr(memory, "available_memory", lambda: int(5e9))
+    assert memory.room_for_gaussians(CPU, **all_else) == most
+    monkeypatch.setattr(memory, "available_memory", lambda: None)
+    assert memory.room_for_gaussians(CPU, **all_else) == np.inf
+
+
 def test_counts_beyond_32_bits_are_counted(monkeypatch):
     with_free(monkeypatch, 1e13)
     said = memory.require_room(GPU, **(SCENE | {"voxels": 4096**3, "projections": 2**33}))

@@ -20,13 +20,16 @@ Runs = Sequence[Mapping[str, Any]]
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
-    """A table a scan, one of the stopping rule, and the machine above."""
+    """A table a scan, one of what is ahead of the plan, one of the stopping rule, and the machine above."""
     about = "{size} voxels along the scene, {views} views, seed {seed}".format(**record["bench"])
     parts = [f"{machine(record)}; {about}."]
     for name in record["bench"]["scans"]:
         runs = [run for run in record["runs"] if run["scan"] == name]
         if runs:
             parts.append(f"**{name}**\n\n{_table(runs)}")
+        again = [run for run in record["again"] if run["scan"] == name]
+        if again:
+            parts.append(f"Ahead of the plan, on scans of other noise:\n\n{_again_table(runs, again)}")
     if record["stopping"]:
         parts.append(f"**Held-out rays**\n\n{_stopping_table(record['stopping'])}")
     return "\n\n".join(parts) + "\n"
@@ -36,6 +39,23 @@ def _table(runs: Runs) -> str:
     """The first run is that of the plan, to which the others are compared."""
     headings = ["", "Seeds", "s", "CPU s", "CPU time", "PSNR", "PSNR all"]
     return markdown_table(headings, [_row(run, runs[0]) for run in runs])
+
+
+def _again_table(runs: Runs, again: Runs) -> str:
+    """What those ahead of the plan gain with the first scan's noise and with other noise."""
+    first = again[0]["method"]
+    plans = {run["seed"]: run for run in again if run["method"] == first}
+    rows = []
+    for method in dict.fromkeys(run["method"] for run in again if run["method"] != first):
+        mine = [(run, plans[run["seed"]]) for run in again if run["method"] == method]
+        pairs = [(next(run for run in runs if run["method"] == method), runs[0]), *mine]
+        pairs = [(one, plan) for one, plan in pairs if None not in (one["seconds"], plan["seconds"])]
+        row = [method, str(len(pairs))]
+        for key in ("psnr", "psnr_all"):
+            gains = [one[key] - plan[key] for one, plan in pairs]
+            row.append(f"{np.mean(gains):+.2f} ({min(gains):+.2f} to {max(gains):+.2f})")
+        rows.append(row)
+    return markdown_table(["", "Scans", "PSNR, mean", "PSNR all, mean"], rows)
 
 
 def _row(run: Mapping[str, Any], plan: Mapping[str, Any]) -> list[str]:

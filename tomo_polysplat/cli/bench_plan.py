@@ -18,6 +18,13 @@ def add_parser(what: Any) -> argparse.ArgumentParser:
     parser.add_argument("--size", type=int, default=36, help="voxels along the scene (default: 36)")
     parser.add_argument("--views", type=int, default=72, help="projection images (default: 72)")
     parser.add_argument("--seed", type=int, default=0, help="of noise and solver (default: 0)")
+    parser.add_argument(
+        "--again",
+        type=int,
+        default=4,
+        metavar="N",
+        help="scans of other noise for variants that are ahead of the plan (default: 4)",
+    )
     return parser
 
 
@@ -31,7 +38,7 @@ def plan(
     from tomo_polysplat.bench.plan import PlanBench, run_plan_bench
     from tomo_polysplat.bench.plan_report import as_markdown, write_figure
 
-    chosen = {name: getattr(arguments, name) for name in ("size", "views", "device", "seed")}
+    chosen = {name: getattr(arguments, name) for name in ("size", "views", "device", "seed", "again")}
     if arguments.scans:
         chosen["scans"] = tuple(arguments.scans)
     record = run_plan_bench(

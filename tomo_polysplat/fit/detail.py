@@ -24,20 +24,22 @@ __all__ = ["Tried", "choose_growth", "smooth_less", "unexplained", "why_not_aske
 
 logger = logging.getLogger(__name__)
 
-# A cloud grows where a short fit leaves more than this share of the variance of the rays unexplained. Scans of 24^3 to
-# 52^3 voxels without metal came to: broccoli 0.09 to 0.16 (1e4 and 1e5 photons, alone and in twice the room), packed
-# grains 0.09, beads 0.03, lungs 0.025 to 0.035, a sponge 0.024, peppers 0.018 to 0.026 (1e5 and 1e6 photons), foam,
-# pancreas, teeth, pebbles and plastic 0.004 to 0.014. Grown fourfold broccoli gains 0.5 to 2.2 dB and grains 1.5 in a
-# third to half as much time again, beads 0.9, a sponge 0.3; peppers lose 0.6 to 1.0, inclusions in plastic 1.7.
-_UNEXPLAINED = 0.045
+# A cloud grows where a short fit of n Gaussians leaves more than this over sqrt(n) of the variance of the rays
+# unexplained. What plain surfaces leave falls with the voxels across, or with n, in about that way: of a pepper of
+# 26^3 to 128^3 voxels, 3e3 to 1e6 photons and 40 to 180 views it came to 0.8 to 2.15, of foam, pebbles, inclusions in
+# plastic and a few spheres to 0.8 to 2.3, of a sponge and of beads (32^3 to 64^3) to 1.9 to 5.5, of broccoli and
+# packed grains (30^3 to 128^3) to 5.5 to 11. Grown fourfold broccoli gains 0.5 to 3.0 dB, beads 1.4 to 1.8, grains and
+# a sponge 0.8; small peppers lose 0.8 to 2.0, few spheres and inclusions up to 2.4, large peppers gain up to 1.
+_UNEXPLAINED = 2.35
 # And where seeds so many times as far apart leave less than this share of it. What is unexplained because the geometry
-# is wrong stays so: a pepper and broccoli whose axis is off by 0.25 to 1 pixel, and a pepper whose views are by 0.7 at
-# random, came to 0.93 to 0.99, broccoli that is right to 0.74 to 0.85. Growth would cost the former 0.5 to 0.7 dB.
+# is wrong stays so: peppers and broccoli of 36^3 to 96^3 whose axis is off by 0.25 to 1 pixel, or whose views are by
+# 0.7 at random, came to 0.85 (which loses nothing) and 0.90 to 1.14, broccoli that is right to 0.61 to 0.85, beads,
+# sponges and grains to 0.50 to 0.76. Growth would cost the former up to 2.4 dB.
 _CLOSER, _DETAIL = 0.8, 0.88
-# So many times as many Gaussians as seeds, and seeds of which so many are still fitted in a time that people wait for.
-_GROWTH, _SMALL_CLOUD = 4.0, 15_000
-# Less growth is none.
-_LEAST = 1.2
+# So many times as many Gaussians as seeds.
+_GROWTH = 4.0
+# Less growth is none, and closer seeds, (1/0.8)^3 times as many, need memory for so many.
+_LEAST, _ROOM = 1.2, 2.5
 # A cloud that grows takes this share of the weight of smoothing: broccoli of 30^3, 34^3, 36^3 and 44^3 voxels, grown
 # fourfold, gains -0.5, -0.3, 0.7 and 1.7 dB with all of it, 0.6, 0.4, 1.3 and 2.2 with 0.3 of it; in twice the room,
 # and for grains, it makes no difference.
@@ -57,10 +59,13 @@ class Tried:
     gaussians : Gaussians
     closer : callable
         What seeds of their kind that are so many times as far apart come to; None where there is no time for them.
+    room : float
+        How many times as many Gaussians there is memory for.
     """
 
     gaussians: Gaussians
     closer: Callable[[float], Gaussians | None]
+    room: float = math.inf
 
 
 def choose_growth(
@@ -103,8 +108,6 @@ def why_not_asked(seeds: Gaussians, plan: Plan, settings: Settings) -> str:
         return "asked for"
     if plan.curves > 1 or bool((seeds.attenuation > settings.bone_level).any()):
         return "with dense matter it is that which a short fit leaves unexplained"
-    if len(seeds) > _SMALL_CLOUD:
-        return f"not asked of more than {_SMALL_CLOUD} seeds"
     return "" if _most(seeds, settings) >= _LEAST else "more were not asked for"
 
 
@@ -119,9 +122,12 @@ def _asked(
     why_not = why_not_asked(seeds, plan, settings)
     if why_not or tried is None:
         return 1.0, why_not or "no short fit told of more detail"
+    if tried.room < _ROOM:
+        return 1.0, f"there is memory for {tried.room:.2g} times as many"
     left = unexplained(tried.gaussians, scene, rays)
-    why = f"a short fit leaves {left:.1%} of what the rays vary by unexplained"
-    if left <= _UNEXPLAINED:
+    usual = _UNEXPLAINED / math.sqrt(max(len(tried.gaussians), 1))
+    why = f"a short fit leaves {left:.2%} of what the rays vary by unexplained, plain surfaces up to {usual:.2%}"
+    if left <= usual:
         return 1.0, why
     closer = tried.closer(_CLOSER)
     if closer is None:
@@ -131,7 +137,7 @@ def _asked(
     logger.info("Detail: %s", why)
     if share >= _DETAIL:
         return 1.0, f"{why}, so that it is no detail; is the geometry right?"
-    return _most(seeds, settings), why
+    return min(_most(seeds, settings), tried.room), why
 
 
 @torch.no_grad()

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.memory import require_room
+from tomo_polysplat.fit.memory import require_room, room_for_gaussians
 from tomo_polysplat.fit.plan import AVERAGED_RAYS, Plan
 from tomo_polysplat.fit.plan_costs import alternatives, work
 from tomo_polysplat.fit.plan_seeds import finest_spacing
@@ -16,7 +16,7 @@ from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.model.seed import seed_gaussians
 from tomo_polysplat.settings import Settings
 
-__all__ = ["first_gaussians"]
+__all__ = ["first_gaussians", "room_to_grow"]
 
 
 def first_gaussians(
@@ -64,16 +64,42 @@ def first_gaussians(
     plan.reasons["work"] = work(plan, problem, settings, len(gaussians))
     plan.reasons["alternatives"] = alternatives(plan, problem, settings, len(gaussians))
     values = problem.measured(device)
-    # While it is asked whether pixels average light there are two runs at once, of thin rays and of averaged ones;
-    # while it is asked whether light matter is fat, two of the same.
-    runs = 1 if plan.pixel_rays and plan.fat is not None else 2
-    rays = runs * plan.pixel_rays**2 if plan.pixel_rays else 1 + AVERAGED_RAYS**2
     plan.reasons["memory"] = require_room(
         device,
-        gaussians=math.ceil(runs * max(settings.growth, 1.0) * len(gaussians)),
-        views=plan.views_per_step,
-        pixels=rays * problem.geometry.rows * problem.geometry.columns,
-        voxels=math.prod(problem.grid.shape),
+        gaussians=math.ceil(_runs(plan) * max(settings.growth, 1.0) * len(gaussians)),
+        **_all_else(plan, problem),
         projections=values.nbytes if values.device.type == device.type else 0,
     )
     return gaussians
+
+
+def room_to_grow(gaussians: int, plan: Plan, problem: Problem, device: torch.device) -> float:
+    """How many times as many Gaussians there would be memory for.
+
+    Parameters
+    ----------
+    gaussians : int
+    plan : Plan
+    problem : Problem
+    device : torch.device
+    """
+    return room_for_gaussians(device, **_all_else(plan, problem)) / max(_runs(plan) * gaussians, 1)
+
+
+def _runs(plan: Plan) -> int:
+    """How many runs there are at once.
+
+    While it is asked whether pixels average light there are two, of thin rays and of averaged ones; while it is asked
+    whether light matter is fat, two of the same.
+    """
+    return 1 if plan.pixel_rays and plan.fat is not None else 2
+
+
+def _all_else(plan: Plan, problem: Problem) -> dict[str, int]:
+    """What memory is needed for besides Gaussians, as `fit.memory` asks."""
+    rays = _runs(plan) * plan.pixel_rays**2 if plan.pixel_rays else 1 + AVERAGED_RAYS**2
+    return {
+        "views": plan.views_per_step,
+        "pixels": rays * problem.geometry.rows * problem.geometry.columns,
+        "voxels": math.prod(problem.grid.shape),
+    }

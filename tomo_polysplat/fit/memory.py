@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import logging
+import math
 
 import torch
 
 from tomo_polysplat.checks import fail
 from tomo_polysplat.files import available_memory
 
-__all__ = ["free_bytes", "projections_stay", "require_room"]
+__all__ = ["free_bytes", "projections_stay", "require_room", "room_for_gaussians"]
 
 logger = logging.getLogger(__name__)
 
@@ -57,11 +58,7 @@ def require_room(
     ValueError
         If a CUDA device has too little memory left.
     """
-    parts = {
-        "Gaussians": gaussians * (_GAUSSIAN + _FOOTPRINT * views),
-        "images of a step": views * pixels * _PIXEL,
-        "volumes": voxels * _VOXEL + min(_SAMPLES, 27 * 12 * voxels),
-    }
+    parts = {"Gaussians": gaussians * _of_a_gaussian(views)} | _of_all(views, pixels, voxels)
     need = sum(parts.values())
     words = ", ".join(f"{name} {_gigabytes(size)}" for name, size in parts.items())
     words = f"about {_gigabytes(need)} ({words})"
@@ -78,6 +75,33 @@ def require_room(
     words = f"{words} of {_gigabytes(free)} free; projections {where}"
     logger.info("Memory: %s.", words)
     return words
+
+
+def room_for_gaussians(device: torch.device, *, views: int, pixels: int, voxels: int) -> float:
+    """How many Gaussians there is memory for, on a CPU too; infinity where nobody tells how much is free.
+
+    Parameters
+    ----------
+    views, pixels, voxels : int
+        As for `require_room`.
+    """
+    free = available_memory() if device.type == "cpu" else free_bytes(device)
+    if free is None:
+        return math.inf
+    left = _SHARE * free - sum(_of_all(views, pixels, voxels).values())
+    return max(left, 0.0) / _of_a_gaussian(views)
+
+
+def _of_a_gaussian(views: int) -> int:
+    return _GAUSSIAN + _FOOTPRINT * views
+
+
+def _of_all(views: int, pixels: int, voxels: int) -> dict[str, int]:
+    """Bytes that a fit takes whatever the number of Gaussians."""
+    return {
+        "images of a step": views * pixels * _PIXEL,
+        "volumes": voxels * _VOXEL + min(_SAMPLES, 27 * 12 * voxels),
+    }
 
 
 def _gigabytes(size: int) -> str:

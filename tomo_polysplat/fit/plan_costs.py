@@ -51,7 +51,7 @@ def alternatives(plan: Plan, problem: Problem, settings: Settings, gaussians: in
         "passes": f"{2 * plan.passes:g} for {plan.passes:g}: twice the pairs",
         "patience": f"{patience_of(settings, plan.passes)} passes without improvement end it sooner",
         "edges": "sharp or blurred: without two short fits, of about a pass over the views each, that tell which",
-        "growth": "4: four times the Gaussians in the end, by splitting, and half as much time again; 1: none",
+        "growth": "4: four times the Gaussians in the end, by splitting, and half to all of the time again; 1: none",
         "tv_factor": "1: without the short fits that tell how strongly thin objects and slices are smoothed",
         "tv_weight": "0: nothing is smoothed, which on a CPU takes about half of the time",
     }

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.fit.detail import Tried, why_not_asked
-from tomo_polysplat.fit.first_gaussians import first_gaussians
+from tomo_polysplat.fit.first_gaussians import first_gaussians, room_to_grow
 from tomo_polysplat.fit.loss import misfit
 from tomo_polysplat.fit.optimise import FitOutcome
 from tomo_polysplat.fit.plan import Plan
@@ -113,7 +113,9 @@ def seeds_for_edges(
             found = fitted(many, first_gaussians(start, many, problem, settings, device))
             return None if cut_short(found) else found.gaussians
 
-        return None if cut_short(outcome) else Tried(outcome.gaussians, closer)
+        if cut_short(outcome):
+            return None
+        return Tried(outcome.gaussians, closer, room_to_grow(len(outcome.gaussians), own, problem, device))
 
     if settings.edges != "auto":
         kind = of_kind(settings.edges == "sharp")

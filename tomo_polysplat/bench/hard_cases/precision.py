@@ -48,7 +48,8 @@ def _fitted_kernels(device: str) -> Findings:
     density = np.asarray(gaussians["density"], np.float32)
     scene = [torch.from_numpy(part).double() for part in (*parts, np.stack([density] * 3))]
     findings = Findings()
-    compare_precisions(findings, scene, views, device)
+    # Cut where the step is small: a pixel that float32 puts on its other side is no error of the kernel.
+    compare_precisions(findings, scene, views, device, cutoff=4.5)
     return findings
 
 
