@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
-from tomo_polysplat.model.density_control import grow, relocate
+from tomo_polysplat.model.density_control import grow, held_materials, relocate
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.render.renderer import voxelise_gaussians
 
 
-def cloud(attenuation):
+def cloud(attenuation, group=-1):
     count = len(attenuation)
     generator = torch.Generator().manual_seed(3)
     return Gaussians(
@@ -22,7 +22,7 @@ def cloud(attenuation):
         attenuation=torch.as_tensor(attenuation, dtype=torch.float32),
         own_material=torch.linspace(0, 0.5, count),
         shared_material=torch.zeros(1),
-        group=torch.full((count,), -1),
+        group=torch.full((count,), group),
         blur=torch.zeros(1),
     )
 
@@ -75,7 +75,7 @@ def test_no_more_move_than_are_worth_splitting():
 
 
 def test_a_cloud_grows_by_halves_of_the_hardest_pulled():
-    gaussians = cloud([1.0, 0.0, 2.0, 0.5])
+    gaussians = cloud([1.0, 0.0, 2.0, 0.5], group=0)
     before, mass = gaussians.copy(), float(volume(gaussians).sum())
     grown, changed = grow(gaussians, torch.tensor([3.0, 9.0, 5.0, 0.2]), 2)
     assert len(grown) == 6 and sorted(changed.tolist()) == [0, 2, 4, 5]
@@ -90,5 +90,13 @@ def test_a_cloud_grows_by_halves_of_the_hardest_pulled():
 
 
 def test_no_more_are_split_than_hold_something():
-    grown, changed = grow(cloud([1.0, 0.0, 0.0]), torch.ones(3), 3)
+    grown, changed = grow(cloud([1.0, 0.0, 0.0], group=0), torch.ones(3), 3)
     assert len(grown) == 4 and sorted(changed.tolist()) == [0, 3]
+
+
+def test_what_has_its_material_free_is_not_split():
+    gaussians = cloud([1.0, 1.0, 1.0, 1.0])
+    gaussians.group = torch.tensor([0, -1, 1, 0])
+    assert held_materials(gaussians) == 2
+    grown, changed = grow(gaussians, torch.tensor([1.0, 9.0, 8.0, 2.0]), 3)
+    assert len(grown) == 6 and sorted(changed.tolist()) == [0, 3, 4, 5]

@@ -8,7 +8,7 @@ import torch
 
 from tomo_polysplat.model.gaussians import Gaussians
 
-__all__ = ["grow", "relocate"]
+__all__ = ["grow", "held_materials", "relocate"]
 
 # Attenuation, in soft references, below which a Gaussian holds nothing.
 _DEAD = 1e-3
@@ -51,7 +51,10 @@ def relocate(gaussians: Gaussians, pull: torch.Tensor, share: float) -> torch.Te
 
 @torch.no_grad()
 def grow(gaussians: Gaussians, pull: torch.Tensor, count: int) -> tuple[Gaussians, torch.Tensor]:
-    """Split so many of the Gaussians that are pulled hardest, or all that hold something.
+    """Split so many of the Gaussians of held material that are pulled hardest, or all of those that hold something.
+
+    What is dense, and what lies at it, has its material free. Rays pull hardest there, at its edges, and it would come
+    out worse: pins of 64^3 voxels by 3 dB, and the iron in broccoli of that size by 6.
 
     Parameters
     ----------
@@ -67,7 +70,7 @@ def grow(gaussians: Gaussians, pull: torch.Tensor, count: int) -> tuple[Gaussian
     changed : (2 m,) int64 tensor
         Indices of the m that were split, and of their new halves.
     """
-    alive = gaussians.attenuation >= _DEAD
+    alive = (gaussians.attenuation >= _DEAD) & (gaussians.group == 0)
     source = _hardest(pull, alive, min(count, int(alive.sum())))
     half = _halve(gaussians, source)
     everyone = torch.arange(len(gaussians), device=source.device)
@@ -76,6 +79,11 @@ def grow(gaussians: Gaussians, pull: torch.Tensor, count: int) -> tuple[Gaussian
     grown.position[source] -= half
     grown.position[target] += half
     return grown, torch.cat([source, target])
+
+
+def held_materials(gaussians: Gaussians) -> int:
+    """How many Gaussians have their material number held, which are those that a cloud grows by."""
+    return int((gaussians.group == 0).sum())
 
 
 def _hardest(pull: torch.Tensor, alive: torch.Tensor, count: int) -> torch.Tensor:
