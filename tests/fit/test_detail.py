@@ -110,6 +110,15 @@ def test_a_cloud_grows_where_more_gaussians_show_more(detail, changed, curves, g
     assert chosen.growth == growth and because in chosen.reasons["growth"]
 
 
+def test_a_cloud_whose_materials_are_all_free_does_not_grow():
+    gaussians, scene, rays, _ = scan()
+    gaussians.group[:] = -1
+    chosen = plan(3)
+    shown = tried(dimmer(gaussians), lambda factor: gaussians)
+    choose_growth(gaussians, shown, chosen, scene, rays, Settings(bone_level=DENSE))
+    assert chosen.growth == 1.0 and "free" in chosen.reasons["growth"]
+
+
 def test_what_is_explained_asks_no_more():
     gaussians, scene, rays, _ = scan()
 
