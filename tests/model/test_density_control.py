@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
-from tomo_polysplat.model.density_control import grow, held_materials, relocate
+from tomo_polysplat.model.density_control import grow, relocate, splittable
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.render.renderer import voxelise_gaussians
 
@@ -77,7 +77,7 @@ def test_no_more_move_than_are_worth_splitting():
 def test_a_cloud_grows_by_halves_of_the_hardest_pulled():
     gaussians = cloud([1.0, 0.0, 2.0, 0.5], group=0)
     before, mass = gaussians.copy(), float(volume(gaussians).sum())
-    grown, changed = grow(gaussians, torch.tensor([3.0, 9.0, 5.0, 0.2]), 2)
+    grown, changed = grow(gaussians, torch.tensor([3.0, 9.0, 5.0, 0.2]), 2, 9.0)
     assert len(grown) == 6 and sorted(changed.tolist()) == [0, 2, 4, 5]
     for index in (1, 3):
         assert torch.equal(grown.position[index], before.position[index])
@@ -90,13 +90,13 @@ def test_a_cloud_grows_by_halves_of_the_hardest_pulled():
 
 
 def test_no_more_are_split_than_hold_something():
-    grown, changed = grow(cloud([1.0, 0.0, 0.0], group=0), torch.ones(3), 3)
+    grown, changed = grow(cloud([1.0, 0.0, 0.0], group=0), torch.ones(3), 3, 9.0)
     assert len(grown) == 4 and sorted(changed.tolist()) == [0, 3]
 
 
-def test_what_has_its_material_free_is_not_split():
-    gaussians = cloud([1.0, 1.0, 1.0, 1.0])
-    gaussians.group = torch.tensor([0, -1, 1, 0])
-    assert held_materials(gaussians) == 2
-    grown, changed = grow(gaussians, torch.tensor([1.0, 9.0, 8.0, 2.0]), 3)
+def test_what_is_dense_is_not_split():
+    gaussians = cloud([3.0, 3.0, 1.0, 1.0])
+    gaussians.group = torch.tensor([0, -1, 1, -1])
+    assert splittable(gaussians, 2.0).tolist() == [True, False, False, True]
+    grown, changed = grow(gaussians, torch.tensor([1.0, 9.0, 8.0, 2.0]), 3, 2.0)
     assert len(grown) == 6 and sorted(changed.tolist()) == [0, 3, 4, 5]

@@ -17,7 +17,7 @@ import torch
 from tomo_polysplat.fit.plan import Plan
 from tomo_polysplat.fit.rays import Rays, batches_around
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.model.density_control import held_materials
+from tomo_polysplat.model.density_control import splittable
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 
@@ -115,8 +115,8 @@ def why_not_asked(seeds: Gaussians, plan: Plan, settings: Settings) -> str:
         return "asked for"
     if plan.curves == 1 and bool((seeds.attenuation > settings.bone_level).any()):
         return "with dense matter whose material is not free it is that which a short fit leaves unexplained"
-    if not held_materials(seeds):
-        return "every Gaussian has its material free"
+    if not bool(splittable(seeds, settings.bone_level).any()):
+        return "all of it is dense"
     return "" if _most(seeds, settings) >= _LEAST else "more were not asked for"
 
 

@@ -24,7 +24,7 @@ from tomo_polysplat.fit.soft_matter import flatten
 from tomo_polysplat.fit.step import step_rates
 from tomo_polysplat.fit.stopping import Clock
 from tomo_polysplat.kernels.spatial_order import spatial_order
-from tomo_polysplat.model.density_control import grow, held_materials, relocate
+from tomo_polysplat.model.density_control import grow, relocate, splittable
 from tomo_polysplat.model.gaussians import OF_ALL, Gaussians
 from tomo_polysplat.settings import Settings
 
@@ -74,7 +74,8 @@ class Fitter:
         self.steps_of_a_pass = max(1, round(views_of_a_pass(rays) / batch))
         self.relocated = 0
         self.relocation_due = False
-        self.most = len(gaussians) + math.floor(max(settings.growth - 1.0, 0.0) * held_materials(gaussians))
+        light = int(splittable(gaussians, settings.bone_level).sum())
+        self.most = len(gaussians) + math.floor(max(settings.growth - 1.0, 0.0) * light)
 
     def passes(self, clock: Clock) -> Iterator[tuple[float, float, int]]:
         """Step until the clock runs out; what each pass over the views gave, the last perhaps a part of one.
@@ -186,8 +187,9 @@ class Fitter:
         """Split Gaussians where the rays ask for more detail, with a fresh memory of the optimiser."""
         self.relocation_due = False
         before, old = len(self.gaussians), self.step
-        count = min(math.ceil(_SPLIT * held_materials(self.gaussians)), self.most - before)
-        grown, changed = grow(self.gaussians, old.pull, count)
+        dense = self.settings.bone_level
+        count = math.ceil(_SPLIT * int(splittable(self.gaussians, dense).sum()))
+        grown, changed = grow(self.gaussians, old.pull, min(count, self.most - before), dense)
         order = spatial_order(grown.position)
         self.gaussians = grown.select(order)
         hurry = hurried(self.settings, self.steps)

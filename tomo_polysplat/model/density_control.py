@@ -8,7 +8,7 @@ import torch
 
 from tomo_polysplat.model.gaussians import Gaussians
 
-__all__ = ["grow", "held_materials", "relocate"]
+__all__ = ["grow", "relocate", "splittable"]
 
 # Attenuation, in soft references, below which a Gaussian holds nothing.
 _DEAD = 1e-3
@@ -50,11 +50,13 @@ def relocate(gaussians: Gaussians, pull: torch.Tensor, share: float) -> torch.Te
 
 
 @torch.no_grad()
-def grow(gaussians: Gaussians, pull: torch.Tensor, count: int) -> tuple[Gaussians, torch.Tensor]:
-    """Split so many of the Gaussians of held material that are pulled hardest, or all of those that hold something.
+def grow(
+    gaussians: Gaussians, pull: torch.Tensor, count: int, dense: float
+) -> tuple[Gaussians, torch.Tensor]:
+    """Split so many of the light Gaussians that are pulled hardest, or all of those that hold something.
 
-    What is dense, and what lies at it, has its material free. Rays pull hardest there, at its edges, and it would come
-    out worse: pins of 64^3 voxels by 3 dB, and the iron in broccoli of that size by 6.
+    Rays pull hardest at the edges of what is dense, and it would come out worse: pins of 64^3 voxels by 3 dB, and the
+    iron in broccoli of that size by 6.
 
     Parameters
     ----------
@@ -63,6 +65,8 @@ def grow(gaussians: Gaussians, pull: torch.Tensor, count: int) -> tuple[Gaussian
     pull : (n,) tensor
         As for `relocate`.
     count : int
+    dense : float
+        As for `splittable`.
 
     Returns
     -------
@@ -70,7 +74,7 @@ def grow(gaussians: Gaussians, pull: torch.Tensor, count: int) -> tuple[Gaussian
     changed : (2 m,) int64 tensor
         Indices of the m that were split, and of their new halves.
     """
-    alive = (gaussians.attenuation >= _DEAD) & (gaussians.group == 0)
+    alive = (gaussians.attenuation >= _DEAD) & splittable(gaussians, dense)
     source = _hardest(pull, alive, min(count, int(alive.sum())))
     half = _halve(gaussians, source)
     everyone = torch.arange(len(gaussians), device=source.device)
@@ -81,9 +85,13 @@ def grow(gaussians: Gaussians, pull: torch.Tensor, count: int) -> tuple[Gaussian
     return grown, torch.cat([source, target])
 
 
-def held_materials(gaussians: Gaussians) -> int:
-    """How many Gaussians have their material number held, which are those that a cloud grows by."""
-    return int((gaussians.group == 0).sum())
+def splittable(gaussians: Gaussians, dense: float) -> torch.Tensor:
+    """(n,) bool: which Gaussians a cloud grows by.
+
+    That is soft matter, and what has a material number of its own, as all near metal has, and is less dense than
+    ``dense``. Without the latter packed grains of 36^3 voxels with iron balls gain 1.4 instead of 3.0 dB by growth.
+    """
+    return (gaussians.group == 0) | ((gaussians.group < 0) & (gaussians.attenuation < dense))
 
 
 def _hardest(pull: torch.Tensor, alive: torch.Tensor, count: int) -> torch.Tensor:
