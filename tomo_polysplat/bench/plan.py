@@ -180,9 +180,7 @@ def run_plan_bench(
     record |= {"runs": [], "again": [], "stopping": []}
     for name in bench.scans:
         progress(f"simulating: {name}")
-        scan = SCANS[name].scan(bench.size, bench.views, bench.seed)
-        scan.name = name
-        task = Task.of(scan, bench.device, bench.seed)
+        task = _task(name, bench, bench.seed)
         warm_up({"plan": DEFAULT.method()}, task, bench.settings, progress)
         planned = _run(DEFAULT, task, bench.settings, progress)
         record["runs"].append(planned)
@@ -197,16 +195,20 @@ def run_plan_bench(
             update(record)
             if run["seconds"] is not None and run["psnr"] > planned["psnr"] + _AHEAD:
                 ahead.append(variant)
-        for seed in range(bench.seed + 1, bench.seed + 1 + bench.again if ahead else 0):
-            scan = SCANS[name].scan(bench.size, bench.views, seed)
-            scan.name = name
-            other = Task.of(scan, bench.device, seed)
+        for further in range(bench.again if ahead else 0):
+            other = _task(name, bench, bench.seed + 1 + further)
             for variant in (DEFAULT, *ahead):
-                record["again"].append({"seed": seed, **_run(variant, other, bench.settings, progress)})
+                record["again"].append({"seed": other.seed, **_run(variant, other, bench.settings, progress)})
                 update(record)
         record["stopping"].append(_stopping(task, bench.settings, progress))
         update(record)
     return record
+
+
+def _task(name: str, bench: PlanBench, seed: int) -> Task:
+    scan = SCANS[name].scan(bench.size, bench.views, seed)
+    scan.name = name
+    return Task.of(scan, bench.device, seed)
 
 
 def _run(variant: Variant, task: Task, settings: Mapping[str, Any], progress: Progress) -> Record:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -43,12 +45,11 @@ def _table(runs: Runs) -> str:
 
 def _again_table(runs: Runs, again: Runs) -> str:
     """What those ahead of the plan gain with the first scan's noise and with other noise."""
-    first = again[0]["method"]
-    plans = {run["seed"]: run for run in again if run["method"] == first}
+    # The plan is the first on every scan.
+    scans = [runs, *(list(group) for _, group in groupby(again, key=itemgetter("seed")))]
     rows = []
-    for method in dict.fromkeys(run["method"] for run in again if run["method"] != first):
-        mine = [(run, plans[run["seed"]]) for run in again if run["method"] == method]
-        pairs = [(next(run for run in runs if run["method"] == method), runs[0]), *mine]
+    for method in dict.fromkeys(run["method"] for run in again if run["method"] != again[0]["method"]):
+        pairs = [(run, scan[0]) for scan in scans for run in scan if run["method"] == method]
         pairs = [(one, plan) for one, plan in pairs if None not in (one["seconds"], plan["seconds"])]
         row = [method, str(len(pairs))]
         for key in ("psnr", "psnr_all"):

@@ -108,14 +108,14 @@ def seeds_for_edges(
         )
 
     def tried(own: Plan, outcome: FitOutcome) -> Tried | None:
-        def closer(factor: float) -> Gaussians | None:
+        def of_closer(factor: float) -> Gaussians | None:
             many = replace(own, spacing=factor * own.spacing, reasons=dict(own.reasons))
             found = fitted(many, first_gaussians(start, many, problem, settings, device))
             return None if cut_short(found) else found.gaussians
 
         if cut_short(outcome):
             return None
-        return Tried(outcome.gaussians, closer, room_to_grow(len(outcome.gaussians), own, problem, device))
+        return Tried(outcome.gaussians, of_closer, room_to_grow(len(outcome.gaussians), own, problem, device))
 
     if settings.edges != "auto":
         kind = of_kind(settings.edges == "sharp")
