@@ -9,7 +9,10 @@ from xdist.scheduler import LoadFileScheduling
 SPLIT = ("tests/test_notebooks.py",)
 # Files that take longest, the longest first; the order of the others does not matter.
 LONGEST = (
+    "tests/kernels/test_triton_steps.py",
+    "tests/test_reconstruct.py",
     "tests/kernels/test_triton.py",
+    "tests/test_reconstruct_fat.py",
     "tests/test_notebooks.py",
 )
 
