@@ -13,6 +13,20 @@ def pytest_configure():
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    from spread import LongestFirst
+
+    return LongestFirst(config, log) if config.getvalue("dist") == "loadfile" else None
+
+
+def pytest_collection_modifyitems(config, items):
+    if hasattr(config, "workerinput"):  # one of several workers
+        from spread import begin_with_the_longest
+
+        begin_with_the_longest(items)
+
+
 def pytest_runtest_setup(item):
     if item.get_closest_marker("gpu") is None or torch.cuda.is_available():
         return

@@ -1,16 +1,10 @@
 """The Triton kernels: their logic in Triton's interpreter on the CPU, the kernels themselves on a GPU."""
 
-import importlib.util
-import json
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
-from triton_cases import CASES
+from triton_cases import CASES, IMAGES
+from triton_interpreter import interpret
 
 from tomo_polysplat.kernels.spatial_order import spatial_order
 from tomo_polysplat.kernels.views import DetectorViews
@@ -18,21 +12,10 @@ from tomo_polysplat.kernels.views import DetectorViews
 
 @pytest.fixture(scope="module")
 def interpreted() -> dict[str, str]:
-    """Traceback by name of every case that fails in the interpreter.
-
-    Triton decides when it is imported whether it interprets, so that is done in a process of its own.
-    """
-    if importlib.util.find_spec("triton") is None:
-        pytest.skip("triton is not installed")
-    environment = {**os.environ, "TRITON_INTERPRET": "1", "CUDA_VISIBLE_DEVICES": ""}
-    script = Path(__file__).with_name("triton_cases.py")
-    command = [sys.executable, script]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return interpret(IMAGES)
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", IMAGES)
 def test_in_the_interpreter(name, interpreted):
     assert name not in interpreted, interpreted[name]
 

@@ -1,6 +1,6 @@
 """Checks of the Triton kernels that run on a GPU and, tiny, in Triton's interpreter on a CPU.
 
-``python triton_cases.py`` with ``TRITON_INTERPRET=1`` runs every case on the CPU and prints what went
+``python triton_cases.py NAME...`` with ``TRITON_INTERPRET=1`` runs these cases on the CPU and prints what went
 wrong, as JSON.
 """
 
@@ -11,8 +11,11 @@ import traceback
 import numpy as np
 import torch
 import triton_image_cases  # noqa: F401 - adds to CASES
-import triton_step_cases  # noqa: F401
+import triton_step_cases
 from triton_case import CASES
+
+STEPS = tuple(name for name, case in CASES.items() if case.__module__ == triton_step_cases.__name__)
+IMAGES = tuple(name for name in CASES if name not in STEPS)
 
 
 def poison() -> None:
@@ -34,9 +37,9 @@ def main() -> None:
     poison()
     np.seterr(all="ignore")  # the interpreter computes masked lanes too
     problems = {}
-    for name, function in CASES.items():
+    for name in sys.argv[1:]:
         try:
-            function("cpu")
+            CASES[name]("cpu")
         except Exception:  # of any kind: its traceback goes to the test of that case, which fails with it
             problems[name] = traceback.format_exc()
     json.dump(problems, sys.stdout)

@@ -1,0 +1,35 @@
+"""How the tests are spread over the workers of ``-n``: long files first, the notebooks one by one.
+
+A file that begins last and takes a minute leaves the other worker idle for as long.
+"""
+
+from xdist.scheduler import LoadFileScheduling
+
+# Their tests share nothing, so each may go to another worker.
+SPLIT = ("tests/test_notebooks.py",)
+# Files that take longest, the longest first; the order of the others does not matter.
+LONGEST = (
+    "tests/kernels/test_triton_steps.py",
+    "tests/test_reconstruct.py",
+    "tests/kernels/test_triton.py",
+    "tests/test_reconstruct_fat.py",
+    "tests/test_notebooks.py",
+)
+
+
+def begin_with_the_longest(items) -> None:
+    """Sort collected tests by their file's place in ``LONGEST``; the others keep their order behind them."""
+    place = {name: k for k, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.nodeid.split("::", 1)[0], len(place)))
+
+
+class LongestFirst(LoadFileScheduling):
+    """Files to workers in the order of the tests, and not by the number of tests in them."""
+
+    def __init__(self, config, log=None):
+        super().__init__(config, log)
+        config.option.loadscopereorder = False
+
+    def _split_scope(self, nodeid):
+        scope = super()._split_scope(nodeid)
+        return nodeid if scope in SPLIT else scope
