@@ -1,7 +1,7 @@
 """Print the figures the project keeps an eye on: the suite's wall time, README's words, the longest line of docs.
 
-    python -m pytest -n 2 --dist loadfile --junitxml suite.xml
-    python scripts/figures.py suite.xml
+python -m pytest -n 2 --dist loadfile --junitxml suite.xml
+python scripts/figures.py suite.xml
 """
 
 from __future__ import annotations
@@ -39,7 +39,9 @@ def main() -> None:
     """Print each figure on a line."""
     if len(sys.argv) > 1:
         print(f"suite: {suite_seconds(Path(sys.argv[1])):.0f} s")
-    print(f"README: {words_outside_code((ROOT / 'README.md').read_text(encoding='utf-8'))} words outside code")
+    print(
+        f"README: {words_outside_code((ROOT / 'README.md').read_text(encoding='utf-8'))} words outside code"
+    )
     length, place = longest_line(ROOT / "docs")
     print(f"docs: longest line {length} characters, {place}")
 

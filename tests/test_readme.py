@@ -39,9 +39,23 @@ def test_the_readme_has_at_most_1500_words():
     assert len(re.sub(r"^```.*?^```", "", README, flags=re.S | re.M).split()) <= 1500
 
 
-@pytest.mark.parametrize("page", ["README.md", *sorted(f"docs/{p.name}" for p in (ROOT / "docs").glob("*.md"))])
+PAGES = [
+    page for page in sorted((ROOT / "docs").rglob("*.md")) if not {"_build", "gallery"} & set(page.parts)
+]
+
+
+def test_no_line_of_the_docs_is_longer_than_200_characters():
+    assert not [
+        page.name
+        for page in PAGES
+        for line in page.read_text(encoding="utf-8").splitlines()
+        if len(line) > 200
+    ]
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *PAGES], ids=lambda page: page.name)
 def test_links_lead_to_files_that_exist(page):
-    text = (ROOT / page).read_text(encoding="utf-8")
+    text = page.read_text(encoding="utf-8")
     targets = re.findall(r"\]\((?!https?:|#|mailto:)([^)#\s]+)", text)
-    missing = [target for target in targets if not ((ROOT / page).parent / target).exists()]
+    missing = [target for target in targets if not (page.parent / target).exists()]
     assert not missing
