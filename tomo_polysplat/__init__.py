@@ -21,6 +21,7 @@ _PUBLIC = {
     "polysplat": "tomo_polysplat.plugins.tomopy_plugin",
     "reconstruct": "tomo_polysplat.reconstruction",
     "register": "tomo_polysplat.plugins.hosts",
+    "save_scan": "tomo_polysplat.scan.io",
     "simulate_scan": "tomo_polysplat.simulate.scenes",
 }
 
