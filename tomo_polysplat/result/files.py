@@ -33,6 +33,7 @@ from tomo_polysplat.scan.hdf5 import (
     text_attribute,
     write_spectrum,
 )
+from tomo_polysplat.scan.hdf5_writer import new_hdf5
 from tomo_polysplat.units import LENGTH_UNITS
 
 __all__ = ["load_hdf5", "plain", "require_slices_folder", "save_hdf5", "save_npy", "save_tiff"]
@@ -63,15 +64,10 @@ def write_json(path: str | os.PathLike, content: Any, *, overwrite: bool) -> Non
 
 def save_hdf5(result: Result, path: str | os.PathLike, *, overwrite: bool = False) -> None:
     """See :meth:`Result.save`."""
-    import h5py
-
     volume = result.volume[None, ::-1] if result.flipped_2d else result.volume
     arrays = [result.basis, volume, *result.gaussians.values()]
     needed = sum(np.asarray(array).nbytes for array in arrays)
-    with (
-        replacing(path, overwrite=overwrite, needed_bytes=needed) as temporary,
-        h5py.File(temporary, "w") as file,
-    ):
+    with new_hdf5(path, overwrite=overwrite, needed_bytes=needed) as file:
         file["implements"] = "exchange:polysplat"
         data = file.create_dataset("exchange/data", data=volume)
         size = result.grid.voxel_size
