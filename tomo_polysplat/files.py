@@ -167,8 +167,8 @@ def require_room(folder: str | os.PathLike, needed_bytes: int) -> None:
     if needed_bytes > free:
         raise fail(
             "path",
-            f"{needed_bytes / 2**20:,.0f} MiB of free disk space",
-            f"{free / 2**20:,.0f} MiB in {folder}",
+            f"{needed_bytes / 2**20:,.2f} MiB of free disk space",
+            f"{free / 2**20:,.2f} MiB in {folder}",
             "free some space or choose another folder",
             OSError,
         )

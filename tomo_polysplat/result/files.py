@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from tomo_polysplat.checks import fail, require_choice
+from tomo_polysplat.checks import fail, require_choice, require_number
 from tomo_polysplat.files import existing_parent, replacing, require_room, require_writable, write_text
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.result.result import GAUSSIAN_PARTS, Result
@@ -39,6 +39,17 @@ from tomo_polysplat.units import LENGTH_UNITS
 __all__ = ["load_hdf5", "plain", "require_slices_folder", "save_hdf5", "save_npy", "save_tiff"]
 
 FORMAT = 1
+# In any unit; squares of larger ones are beyond single precision.
+_LARGEST = 1e15
+# In g/cm3: forty times osmium.
+_DENSEST = 1e3
+_RANGES = {
+    "position": (-_LARGEST, _LARGEST),
+    "scale": (0.0, _LARGEST),
+    "rotation": (-1.001, 1.001),
+    "density": (-_LARGEST, _LARGEST),
+    "u": (-0.2, 1.1),
+}
 JSON_PARTS = ("history", "plan", "counts", "settings", "provenance")
 
 
@@ -112,19 +123,40 @@ def load_hdf5(path: str | os.PathLike) -> Result:
         basis = read_numbers(group, "basis")
         if basis.ndim != 4:
             raise fail("/polysplat/basis", "shape (channels, z, y, x)", f"{basis.shape}")
-        present = find_group(group, "gaussians") is not None
+        materials = _read_materials(group)
+        limit = _LARGEST if materials is None else _DENSEST
+        _require_range("basis", basis, -limit, limit)
         return Result(
             basis=basis,
             grid=VolumeGrid(basis.shape[1:], read_attribute(group, "lower"), read_attribute(group, "upper")),
             unit=require_choice("unit in the file", text_attribute(group, "unit"), LENGTH_UNITS),
             energy_kev=number_attribute(group, "energy_kev"),
-            materials=_read_materials(group),
+            materials=materials,
             spectrum=read_spectrum(group),
-            gaussians={name: read_numbers(group, f"gaussians/{name}") for name in GAUSSIAN_PARTS if present},
+            gaussians=_read_gaussians(group),
             **_read_parts(group),
-            seconds=number_attribute(group, "seconds") or 0.0,
+            seconds=require_number("seconds in the file", number_attribute(group, "seconds") or 0.0, at_least=0),
             flipped_2d=bool(number_attribute(group, "flipped_2d")),
         )
+
+
+def _read_gaussians(group: Any) -> dict[str, np.ndarray]:
+    if find_group(group, "gaussians") is None:
+        return {}
+    parts = {name: read_numbers(group, f"gaussians/{name}") for name in GAUSSIAN_PARTS}
+    for name, values in parts.items():
+        _require_range(f"gaussians/{name}", values, *_RANGES[name])
+    return parts
+
+
+def _require_range(name: str, values: np.ndarray, low: float, high: float) -> None:
+    """Refuse what no fit makes, NaN and infinity first: one bit of a damaged file is enough for them."""
+    # Both are NaN where any value is, and then no comparison holds.
+    smallest, largest = (float(values.min()), float(values.max())) if values.size else (low, high)
+    if not (smallest >= low and largest <= high):
+        got = f"{smallest:g} to {largest:g}"
+        wanted = f"finite numbers from {low:g} to {high:g}"
+        raise fail(f"/polysplat/{name}", wanted, got, "the file is damaged: copy or write it again")
 
 
 def _read_materials(group: Any) -> Materials | None:

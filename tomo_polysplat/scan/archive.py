@@ -12,7 +12,7 @@ from typing import IO
 
 import numpy as np
 
-from tomo_polysplat.checks import fail, require_array
+from tomo_polysplat.checks import fail, require_array, visible
 from tomo_polysplat.files import existing_file, require_plausible_size
 
 __all__ = ["archived_number", "archived_text", "read_archive"]
@@ -102,7 +102,6 @@ def archived_text(arrays: dict[str, np.ndarray], name: str) -> str | None:
     if array.dtype.kind != "U" or array.size != 1 or array.dtype.itemsize > 4 * _LONGEST_TEXT:
         raise fail(name, "a short text", f"{array.dtype} of shape {array.shape}")
     try:
-        # Half of a surrogate pair could not be written to a report.
-        return str(array.reshape(-1)[0]).encode("utf-8", "replace").decode("utf-8")
+        return visible(array.reshape(-1)[0])
     except ValueError as error:
         raise fail(name, "a text", "characters that do not exist") from error
