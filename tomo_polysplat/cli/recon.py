@@ -6,12 +6,15 @@ import argparse
 import json
 import logging
 import math
+import os
+import tempfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import tomo_polysplat
-from tomo_polysplat.checks import fail
+from tomo_polysplat.checks import fail, visible
 from tomo_polysplat.cli.options import (
     INTERRUPTED,
     add_scan_options,
@@ -34,16 +37,32 @@ logger = logging.getLogger(__name__)
 
 NAME = "recon"
 HELP = "reconstruct a scan into a volume of attenuation in 1/length"
-OUTPUT_SUFFIXES = (".h5", ".hdf5", ".npy")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this subcommand."""
     add_scan_options(parser)
-    parser.add_argument("-o", "--output", required=True, metavar="FILE", help=".h5 with everything, or .npy")
+    parser.add_argument(
+        "-o",
+        "--output",
+        required=True,
+        metavar="FILE",
+        help=".h5 with everything, or the volume as .tif, .ome.tif, .mha, .nrrd, .nii.gz, .vti, .npy, or a folder "
+        "of TIFF slices (NAME/)",
+    )
+    parser.add_argument(
+        "--hu", action="store_true", help="Hounsfield units instead of attenuation (not in .h5)"
+    )
+    parser.add_argument(
+        "--bits",
+        type=int,
+        choices=[16, 32],
+        default=32,
+        help="16 for whole numbers with their slope and offset in the file (default: 32)",
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace files that exist")
     parser.add_argument("--report", metavar="FILE", help="write a page about the reconstruction (.html)")
-    parser.add_argument("--tiff", metavar="FOLDER", help="write the slices as 32-bit TIFF")
+    parser.add_argument("--tiff", metavar="FOLDER", help="write the slices as TIFF")
     parser.add_argument("--json", metavar="FILE", help="write the plan, the counts and the errors as JSON")
     add_spectrum_options(parser)
     group = parser.add_argument_group("reconstruction")
@@ -155,39 +174,84 @@ def _spectrum_of(scan: Scan, arguments: argparse.Namespace) -> Spectrum | None:
 
 def _require_outputs(arguments: argparse.Namespace) -> None:
     """Find out before the work, not after it, that a result could not be written."""
-    from tomo_polysplat.result.files import require_slices_folder
+    from tomo_polysplat.result.formats import format_of
+    from tomo_polysplat.result.tiff import require_slices_folder
 
-    if Path(arguments.output).suffix.lower() not in OUTPUT_SUFFIXES:
-        raise fail("--output", f"a name ending in {', '.join(OUTPUT_SUFFIXES)}", arguments.output)
+    kind = format_of(arguments.output, "--output")
+    if not (kind.everything and arguments.tiff is not None):
+        kind.require(hu=arguments.hu, bits=arguments.bits, argument="--output")
     if arguments.resume and arguments.checkpoint is None:
         raise fail("--resume", "--checkpoint with it", "none")
-    for name in ("output", "report", "json"):
-        if (path := getattr(arguments, name)) is not None:
-            require_replaceable(Path(path), arguments.overwrite, "pass --overwrite", f"--{name}")
-            require_writable(Path(path).parent, f"--{name}")
+    written, folders = {}, {}
+    for name in ("output", "report", "json", "tiff"):
+        if (path := getattr(arguments, name)) is None:
+            continue
+        if name == "tiff" or (name == "output" and kind.is_folder):
+            folders[f"--{name}"] = require_slices_folder(
+                path, overwrite=arguments.overwrite, remedy="pass --overwrite", argument=f"--{name}"
+            )
+        else:
+            file = require_replaceable(path, arguments.overwrite, "pass --overwrite", f"--{name}")
+            require_writable(file.parent, f"--{name}")
+            written[f"--{name}"] = file
     if arguments.checkpoint is not None:
         remedy = "pass --resume to go on from it, or remove it"
-        require_replaceable(Path(arguments.checkpoint), arguments.resume, remedy, "--checkpoint")
-    if arguments.tiff is not None:
-        require_slices_folder(
-            arguments.tiff, overwrite=arguments.overwrite, remedy="pass --overwrite", argument="--tiff"
+        written["--checkpoint"] = require_replaceable(
+            arguments.checkpoint, arguments.resume, remedy, "--checkpoint"
         )
-    named = ("scan", "output", "report", "json", "tiff", "checkpoint")
-    files = [Path(path).resolve() for name in named if (path := getattr(arguments, name)) is not None]
-    if len(set(files)) < len(files):
-        raise fail("--output", "a file of its own for the scan and for everything written", "one file twice")
+    _require_apart(arguments, written, folders)
+
+
+def _require_apart(
+    arguments: argparse.Namespace, written: dict[str, Path], folders: dict[str, Path]
+) -> None:
+    """Refuse to write one file twice, over what is read, or into a folder that is replaced as a whole."""
+    read = {name: Path(path) for name in ("scan", "spectrum") if (path := getattr(arguments, name))}
+    seen: dict[Path, str] = {}
+    for name, path in (read | written | folders).items():
+        real = Path(os.path.realpath(path))
+        twin = seen.get(real) or next((name for old, name in seen.items() if _same_file(old, real)), None)
+        if twin is not None:
+            wanted = "a file of its own for the scan, the spectrum and everything written"
+            raise fail(name, wanted, f"one file twice: {path} is {twin} too")
+        seen[real] = name
+    for name, folder in folders.items():
+        inside = [other for path, other in seen.items() if Path(os.path.realpath(folder)) in path.parents]
+        if inside:
+            raise fail(name, "a folder of its own, replaced as a whole", f"{folder}, which holds {inside[0]}")
+
+
+def _same_file(one: Path, other: Path) -> bool:
+    """Whether two names, perhaps in other letters, are of one file."""
+    try:
+        return one.samefile(other)
+    except OSError:
+        return False
 
 
 def _require_room(arguments: argparse.Namespace, scan: Scan) -> None:
-    """Find out before the work that the disk is too full for the volume."""
-    volume = 4 * math.prod(scan.volume_shape)
-    # Three curves and the volume itself.
-    output = volume if Path(arguments.output).suffix.lower() == ".npy" else 4 * volume
-    needed = {Path(arguments.output).parent: output}
+    """Find out before the work that the disk is too full for the volume, or that the file cannot hold it."""
+    from tomo_polysplat.result.formats import format_of
+
+    voxels = math.prod(scan.volume_shape)
+    kind = format_of(arguments.output, "--output")
+    if not kind.everything:
+        kind.require(hu=arguments.hu, bits=arguments.bits, voxels=voxels, argument="--output")
+    if arguments.hu:
+        _require_hounsfield(arguments, scan)
+    # Of the three curves that there may be.
+    needed = {Path(arguments.output).parent: kind.bytes_needed(voxels, 3, arguments.bits)}
     if arguments.tiff is not None:
         folder = Path(arguments.tiff)
-        needed[folder] = needed.get(folder, 0) + volume
+        needed[folder] = needed.get(folder, 0) + voxels * arguments.bits // 8
     require_room_for(needed)
+
+
+def _require_hounsfield(arguments: argparse.Namespace, scan: Scan) -> None:
+    """Hounsfield units compare with water at an energy that only a spectrum tells."""
+    if scan.unit == "pixel" or arguments.mono or scan.spectrum is None:
+        remedy = "pass --kvp or --spectrum and the pixel's size, or leave it out"
+        raise fail("--hu", "a spectrum and real lengths", "a volume without an energy", remedy)
 
 
 def _setting(text: str) -> tuple[str, Any]:
@@ -201,28 +265,73 @@ def _setting(text: str) -> tuple[str, Any]:
 
 
 def _write(result: Result, scan: Scan, arguments: argparse.Namespace) -> None:
+    """Everything that was asked for; what cannot be written keeps nothing else from it."""
+    failures: list[OSError] = []
+    _attempt(arguments.output, failures, lambda: _save(result, arguments))
+    if failures:
+        _rescue(result, arguments)
+    if arguments.tiff is not None:
+        about = {"overwrite": arguments.overwrite, "hu": arguments.hu, "bits": arguments.bits}
+        _attempt(arguments.tiff, failures, lambda: result.save_tiff(arguments.tiff, **about))
+    _write_about(result, scan, arguments, failures)
+    if failures:
+        raise failures[0]
+
+
+def _write_about(
+    result: Result, scan: Scan, arguments: argparse.Namespace, failures: list[OSError]
+) -> None:
+    """The report, the errors and the JSON file."""
     from tomo_polysplat.report.table import as_text
 
-    output, overwrite = Path(arguments.output), arguments.overwrite
-    save = result.save_npy if output.suffix.lower() == ".npy" else result.save
-    save(output, overwrite=overwrite)
-    print(f"wrote {output}")
-    if arguments.tiff is not None:
-        result.save_tiff(arguments.tiff, overwrite=overwrite)
-        print(f"wrote {arguments.tiff}")
-    errors = _errors(result, scan)
+    overwrite, errors = arguments.overwrite, _errors(result, scan)
     if arguments.report is not None:
         comparable = errors is not None and _same_energy(result, scan)
         known = {"truth": scan.truth, "metal_mask": scan.metal_mask} if comparable else {}
-        result.report(arguments.report, overwrite=overwrite, **known)
-        print(f"wrote {arguments.report}")
+        _attempt(
+            arguments.report,
+            failures,
+            lambda: result.report(arguments.report, overwrite=overwrite, **known),
+        )
     if errors is not None:
         print(as_text([errors], result.unit))
     if arguments.json is not None:
         names = ("unit", "energy_kev", "seconds", "plan", "counts", "provenance")
         about = {name: getattr(result, name) for name in names}
-        write_json(arguments.json, about | {"scan": arguments.scan, "errors": errors}, overwrite=overwrite)
-        print(f"wrote {arguments.json}")
+        about |= {"scan": arguments.scan, "errors": errors}
+        _attempt(arguments.json, failures, lambda: write_json(arguments.json, about, overwrite=overwrite))
+
+
+def _save(result: Result, arguments: argparse.Namespace) -> None:
+    from tomo_polysplat.result.formats import format_of
+
+    everything = format_of(arguments.output, "--output").everything
+    options = {} if everything else {"hu": arguments.hu, "bits": arguments.bits}
+    result.save(arguments.output, overwrite=arguments.overwrite, **options)
+
+
+def _attempt(path: str, failures: list[OSError], write: Callable[[], None]) -> None:
+    """Write one file; what keeps it from that is added to the failures, and the rest goes on."""
+    try:
+        write()
+    except OSError as error:
+        logger.error("%s was not written: %s", path, error)
+        failures.append(error)
+    else:
+        print(f"wrote {visible(path)}")
+
+
+def _rescue(result: Result, arguments: argparse.Namespace) -> None:
+    """Keep what may have taken hours in a folder for temporary files; its name nobody else can foresee."""
+    folder = Path(tempfile.mkdtemp(prefix="tomo-polysplat-"))
+    path = folder / "rescued.h5"
+    try:
+        result.save(path)
+    except OSError as error:
+        logger.error("Nor could the result be kept in %s: %s", folder, error)
+        folder.rmdir()
+    else:
+        print(f"the whole result is in {path}")
 
 
 def _errors(result: Result, scan: Scan) -> dict[str, Any] | None:

@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 
 from tomo_polysplat.checks import fail, require_choice, require_number
-from tomo_polysplat.files import existing_parent, replacing, require_room, require_writable, write_text
+from tomo_polysplat.files import replacing, write_text
 from tomo_polysplat.physics.base_materials import Materials
+from tomo_polysplat.result.image import Image
 from tomo_polysplat.result.result import GAUSSIAN_PARTS, Result
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.scan.hdf5 import (
@@ -36,7 +37,7 @@ from tomo_polysplat.scan.hdf5 import (
 from tomo_polysplat.scan.hdf5_writer import new_hdf5
 from tomo_polysplat.units import LENGTH_UNITS
 
-__all__ = ["load_hdf5", "plain", "require_slices_folder", "save_hdf5", "save_npy", "save_tiff"]
+__all__ = ["load_hdf5", "plain", "save_hdf5", "write_json", "write_npy"]
 
 FORMAT = 1
 # In any unit; squares of larger ones are beyond single precision.
@@ -186,61 +187,11 @@ def _numeric(record: dict[str, Any]) -> bool:
     return all(value is None or isinstance(value, (int, float)) for value in numbers)
 
 
-def save_npy(result: Result, path: str | os.PathLike, *, overwrite: bool = False) -> None:
-    """See :meth:`Result.save_npy`."""
-    volume = result.volume
+def write_npy(image: Image, path: str | os.PathLike, *, overwrite: bool = False) -> None:
+    """The numbers alone, as a NumPy array: (z, y, x), or (y, x) with row 0 at the largest y after a 2D scan."""
+    values = np.ascontiguousarray(image.values[0, ::-1]) if image.top_row == "largest y" else image.values
     with (
-        replacing(path, overwrite=overwrite, needed_bytes=volume.nbytes) as temporary,
+        replacing(path, overwrite=overwrite, needed_bytes=values.nbytes) as temporary,
         open(temporary, "wb") as file,
     ):
-        np.save(file, volume, allow_pickle=False)
-
-
-def require_slices_folder(
-    folder: str | os.PathLike,
-    *,
-    overwrite: bool,
-    remedy: str = "pass overwrite=True",
-    argument: str = "folder",
-) -> list[Path]:
-    """The slices in a folder; refused are slices that must stay, and folders that cannot be written to."""
-    target = Path(folder)
-    if target.exists() and not target.is_dir():
-        raise fail(argument, "a folder", f"the file {target}", error=NotADirectoryError)
-    present = sorted(target.glob("slice_*.tif"))
-    if present and not overwrite:
-        raise fail(
-            argument,
-            "one without slices",
-            f"{len(present)} in {target}",
-            remedy,
-            FileExistsError,
-        )
-    require_writable(existing_parent(target), argument)
-    return present
-
-
-def save_tiff(result: Result, folder: str | os.PathLike, *, overwrite: bool = False) -> None:
-    """See :meth:`Result.save_tiff`."""
-    import tifffile
-
-    target = Path(folder)
-    present = require_slices_folder(target, overwrite=overwrite)
-    target.mkdir(parents=True, exist_ok=True)
-    volume = result.volume.reshape(result.grid.shape)
-    require_room(target, volume.nbytes)
-    about = {
-        "unit": f"1/{result.unit}",
-        "energy_kev": result.energy_kev,
-        "voxel_size": plain(result.grid.voxel_size),
-        "first_row": "largest y" if result.flipped_2d else "smallest y",
-    }
-    written = set()
-    for index, image in enumerate(volume):
-        path = target / f"slice_{index:04d}.tif"
-        with replacing(path, overwrite=True) as temporary:
-            tifffile.imwrite(temporary, image, description=json.dumps(about), metadata=None)
-        written.add(path)
-    # Slices of an earlier, taller volume would otherwise be read as part of this one.
-    for path in set(present) - written:
-        path.unlink()
+        np.save(file, values, allow_pickle=False)
