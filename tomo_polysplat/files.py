@@ -102,7 +102,9 @@ def output_path(path: str | bytes | os.PathLike, argument: str = "path") -> Path
     real = Path(os.path.realpath(target))
     if not real.exists():
         remedy = "remove the link or make what it points to"
-        raise fail(argument, "a file or a new name", f"{target}, a link to nothing", remedy, FileNotFoundError)
+        raise fail(
+            argument, "a file or a new name", f"{target}, a link to nothing", remedy, FileNotFoundError
+        )
     return real
 
 

@@ -15,7 +15,6 @@ import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -220,7 +219,9 @@ def _plan(parts: dict[str, Any]) -> Plan:
     counts = (plan.views_per_step, plan.tv_every)
     amounts = (plan.reference, plan.first, plan.spacing, plan.smallest_scale, plan.tv_factor, plan.growth)
     levels = (plan.soft_u, plan.depth, plan.support_level, plan.finer, plan.passes)
-    above_zero = all(_SMALLEST <= amount <= _LARGEST for amount in (*amounts, *counts)) and plan.pixel_rays >= 0
+    above_zero = (
+        all(_SMALLEST <= amount <= _LARGEST for amount in (*amounts, *counts)) and plan.pixel_rays >= 0
+    )
     above_zero = above_zero and all(abs(level) <= _LARGEST for level in levels)
     whole = all(type(n) is int for n in (*counts, plan.pixel_rays))
     corners = len(plan.tv_corners) == 2 and all(

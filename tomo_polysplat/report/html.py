@@ -143,9 +143,7 @@ def _section(heading: str, content: Mapping[str, Any]) -> list[str]:
 
 
 def _rows(content: Mapping[str, Any]) -> str:
-    lines = (
-        f"<tr><th>{_text(key)}</th><td>{_value(item)}</td></tr>" for key, item in content.items()
-    )
+    lines = (f"<tr><th>{_text(key)}</th><td>{_value(item)}</td></tr>" for key, item in content.items())
     return f"<table>{''.join(lines)}</table>"
 
 

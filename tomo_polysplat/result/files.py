@@ -136,7 +136,9 @@ def load_hdf5(path: str | os.PathLike) -> Result:
             spectrum=read_spectrum(group),
             gaussians=_read_gaussians(group),
             **_read_parts(group),
-            seconds=require_number("seconds in the file", number_attribute(group, "seconds") or 0.0, at_least=0),
+            seconds=require_number(
+                "seconds in the file", number_attribute(group, "seconds") or 0.0, at_least=0
+            ),
             flipped_2d=bool(number_attribute(group, "flipped_2d")),
         )
 

@@ -159,7 +159,9 @@ def _water(result: Result) -> float:
     from tomo_polysplat.physics.materials import mass_attenuation
 
     if result.energy_kev is None:
-        remedy = "they compare with water at one energy: reconstruct with a spectrum, or set result.energy_kev"
+        remedy = (
+            "they compare with water at one energy: reconstruct with a spectrum, or set result.energy_kev"
+        )
         raise fail("hu", "a volume of known energy for Hounsfield units", "none", remedy)
     if result.unit not in CM_PER_UNIT:
         remedy = "pass the unit and size of a pixel to reconstruct"

@@ -185,7 +185,7 @@ def _new(path: str | os.PathLike, image: Image, overwrite: bool) -> Iterator[IO[
         yield file
 
 
-def _write_values(file: IO[bytes], values: np.ndarray) -> None:
+def _write_values(file: IO[bytes] | gzip.GzipFile, values: np.ndarray) -> None:
     for plane in values:
         little = plane if sys.byteorder == "little" else plane.byteswap()
         file.write(np.ascontiguousarray(little).data)

@@ -102,9 +102,7 @@ def require_slices_folder(
     argument: str = "folder",
 ) -> Path:
     """The folder of slices that would be written; refused is one that is, or holds, what must stay."""
-    return require_replaceable_folder(
-        folder, _is_ours, overwrite=overwrite, remedy=remedy, argument=argument
-    )
+    return require_replaceable_folder(folder, _is_ours, overwrite=overwrite, remedy=remedy, argument=argument)
 
 
 def _is_ours(path: Path) -> bool:

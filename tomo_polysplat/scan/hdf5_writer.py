@@ -26,9 +26,7 @@ _FULL = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
 
 
 @contextmanager
-def new_hdf5(
-    path: str | os.PathLike, *, overwrite: bool, needed_bytes: int
-) -> Iterator[h5py.File]:
+def new_hdf5(path: str | os.PathLike, *, overwrite: bool, needed_bytes: int) -> Iterator[h5py.File]:
     """An open HDF5 file that becomes `path` when the block ends without an error and all of it is on the disk.
 
     Parameters
