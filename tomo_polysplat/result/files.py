@@ -134,7 +134,7 @@ def load_hdf5(path: str | os.PathLike) -> Result:
             energy_kev=number_attribute(group, "energy_kev"),
             materials=materials,
             spectrum=read_spectrum(group),
-            gaussians=_read_gaussians(group),
+            gaussians=_read_gaussians(group, planar=basis.shape[1] == 1),
             **_read_parts(group),
             seconds=require_number(
                 "seconds in the file", number_attribute(group, "seconds") or 0.0, at_least=0
@@ -143,12 +143,16 @@ def load_hdf5(path: str | os.PathLike) -> Result:
         )
 
 
-def _read_gaussians(group: Any) -> dict[str, np.ndarray]:
+def _read_gaussians(group: Any, planar: bool) -> dict[str, np.ndarray]:
     if find_group(group, "gaussians") is None:
         return {}
     parts = {name: read_numbers(group, f"gaussians/{name}") for name in GAUSSIAN_PARTS}
     for name, values in parts.items():
-        _require_range(f"gaussians/{name}", values, *_RANGES[name])
+        # Those of a slice have no end along z.
+        bounded = values[..., :2] if planar and name == "scale" else values
+        _require_range(f"gaussians/{name}", bounded, *_RANGES[name])
+    if planar:
+        _require_range("gaussians/scale", parts["scale"], 0.0, math.inf)
     return parts
 
 
