@@ -20,6 +20,7 @@ BASICS = (
     "folders",
     "file_lock",
     "json_text",
+    "plain_file",
     "units",
     "settings",
     "progress",

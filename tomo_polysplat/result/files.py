@@ -20,6 +20,7 @@ import numpy as np
 from tomo_polysplat.checks import fail, require_choice, require_number
 from tomo_polysplat.files import replacing, write_text
 from tomo_polysplat.physics.base_materials import Materials
+from tomo_polysplat.plain_file import PlainFile
 from tomo_polysplat.result.image import Image
 from tomo_polysplat.result.result import GAUSSIAN_PARTS, Result
 from tomo_polysplat.scan.geometry import VolumeGrid
@@ -198,6 +199,6 @@ def write_npy(image: Image, path: str | os.PathLike, *, overwrite: bool = False)
     values = np.ascontiguousarray(image.values[0, ::-1]) if image.top_row == "largest y" else image.values
     with (
         replacing(path, overwrite=overwrite, needed_bytes=values.nbytes) as temporary,
-        open(temporary, "wb") as file,
+        PlainFile(temporary) as file,
     ):
         np.save(file, values, allow_pickle=False)

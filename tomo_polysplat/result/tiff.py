@@ -18,6 +18,7 @@ import numpy as np
 from tomo_polysplat.checks import fail
 from tomo_polysplat.files import replacing
 from tomo_polysplat.folders import replacing_folder, require_replaceable_folder
+from tomo_polysplat.plain_file import PlainFile
 from tomo_polysplat.result.image import Image
 
 __all__ = ["require_slices_folder", "require_tiff_size", "write_ome_tiff", "write_tiff", "write_tiff_slices"]
@@ -38,17 +39,10 @@ def write_tiff(image: Image, path: str | os.PathLike, *, overwrite: bool = False
     ValueError
         If it is larger than TIFF can hold.
     """
-    import tifffile
-
     require_tiff_size(image.values.nbytes)
+    metadata = _calibration(image) | {"axes": "ZYX"}
     with replacing(path, overwrite=overwrite, needed_bytes=image.values.nbytes) as temporary:
-        tifffile.imwrite(
-            temporary,
-            np.stack(list(image.pictures())) if image.top_row == "largest y" else image.values,
-            imagej=True,
-            metadata=_calibration(image) | {"axes": "ZYX"},
-            **_tags(image),
-        )
+        _write(temporary, _stacked(image), _tags(image), imagej=True, metadata=metadata)
 
 
 def require_tiff_size(size: int, argument: str = "path") -> None:
@@ -60,38 +54,34 @@ def require_tiff_size(size: int, argument: str = "path") -> None:
 
 def write_ome_tiff(image: Image, path: str | os.PathLike, *, overwrite: bool = False) -> None:
     """One file of any size with OME's metadata, for Bio-Formats, napari and others."""
-    import tifffile
-
     metadata: dict[str, Any] = {"axes": "ZYX", "Description": image.about_text()}
     unit = {"um": "µm", "pixel": "pixel"}.get(image.unit, image.unit)
     for axis, size in zip("XYZ", image.voxel_size):
         metadata |= {f"PhysicalSize{axis}": size, f"PhysicalSize{axis}Unit": unit}
     with replacing(path, overwrite=overwrite, needed_bytes=image.values.nbytes) as temporary:
-        tifffile.imwrite(
-            temporary,
-            np.stack(list(image.pictures())) if image.top_row == "largest y" else image.values,
-            ome=True,
-            bigtiff=image.values.nbytes > _LARGEST_TIFF,
-            photometric="minisblack",
-            metadata=metadata,
-            **_tags(image),
-        )
+        large = image.values.nbytes > _LARGEST_TIFF
+        _write(temporary, _stacked(image), _tags(image), ome=True, bigtiff=large, metadata=metadata)
 
 
 def write_tiff_slices(image: Image, folder: str | os.PathLike, *, overwrite: bool = False) -> None:
     """A folder of ``slice_0000.tif``, ``slice_0001.tif``, ... that is there whole or not at all."""
-    import tifffile
-
     needed = image.values.nbytes + _TAGS * len(image.values)
     with replacing_folder(folder, _is_ours, overwrite=overwrite, needed_bytes=needed) as temporary:
         for index, picture in enumerate(image.pictures()):
-            tifffile.imwrite(
-                temporary / f"slice_{index:04d}.tif",
-                np.ascontiguousarray(picture),
-                imagej=True,
-                metadata=_calibration(image),
-                **_tags(image),
-            )
+            name = temporary / f"slice_{index:04d}.tif"
+            _write(name, picture, _tags(image), imagej=True, metadata=_calibration(image))
+
+
+def _write(path: Path, values: np.ndarray, tags: dict[str, Any], **options: Any) -> None:
+    import tifffile
+
+    with PlainFile(path) as file:
+        tifffile.imwrite(file, np.ascontiguousarray(values), photometric="minisblack", **tags, **options)
+
+
+def _stacked(image: Image) -> np.ndarray:
+    """The values with the top row first."""
+    return image.values[:, ::-1] if image.top_row == "largest y" else image.values
 
 
 def require_slices_folder(
