@@ -13,9 +13,10 @@ from tomo_polysplat.checks import fail
 __all__ = ["parse_json"]
 
 # What the longest runs write is a thousandth of this: a history of a dozen numbers a pass.
-_MOST_VALUES, _DEEPEST, _LONGEST = 1_000_000, 50, 1 << 28
+_MOST_VALUES, _DEEPEST, _LONGEST = 1_000_000, 50, 1 << 26
 _LONGEST_NUMBER = 40
-_STRINGS = re.compile(r'"(?:[^"\\]|\\.)*"', re.DOTALL)
+# The end of a string may be missing: asked for, it would be looked for from every quotation mark in it.
+_STRINGS = re.compile(r'"(?:[^"\\]|\\.)*"?', re.DOTALL)
 _BRACKETS = re.compile(r"[\[{\]}]")
 
 
