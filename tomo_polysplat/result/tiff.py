@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, cast
 
 import numpy as np
 
@@ -75,7 +75,9 @@ def write_tiff_slices(image: Image, folder: str | os.PathLike, *, overwrite: boo
 def _write(path: Path, values: np.ndarray, tags: dict[str, Any], **options: Any) -> None:
     import tifffile
 
-    with PlainFile(path) as file:
+    with PlainFile(path) as plain:
+        # Which is all of one that tifffile uses.
+        file = cast(IO[bytes], plain)
         tifffile.imwrite(file, np.ascontiguousarray(values), photometric="minisblack", **tags, **options)
 
 

@@ -43,7 +43,9 @@ NAMES = (
 # Numbers that those may have whose size does not go with the scan's.
 _MOST = {
     **dict.fromkeys(("astra_type", "unit", "spectrum_label", "e_ref", "e_eff"), 1),
-    **{"vol_shape": 3, "vol_window": 6, "carries_water_correction": 100},
+    "vol_shape": 3,
+    "vol_window": 6,
+    "carries_water_correction": 100,
     **dict.fromkeys(("energies", "spectrum"), 1_000_000),
 }
 
