@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib
 import json
@@ -219,10 +220,8 @@ def killed_and_resumed() -> Any:
             if len(passes) == 3:
                 raise MemoryError("killed")
 
-        try:
+        with contextlib.suppress(MemoryError):
             fitted(scan, {"passes": 11}, checkpoint=path, callbacks=[killing])
-        except MemoryError:
-            pass
         return fitted(scan, {"passes": 11}, checkpoint=path, resume=True)
 
 

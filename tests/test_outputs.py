@@ -126,7 +126,7 @@ def test_nothing_is_replaced_without_being_asked(scan_file, tmp_path, no_solver,
     slices.mkdir()
     (slices / "slice_0000.tif").write_text("precious")
     command = ["recon", scan_file, "-o", tmp_path / "v.h5"]
-    assert "1 in" in refused([*command, "--tiff", slices], capsys)
+    assert "nothing but slices" in refused([*command, "--tiff", slices, "--overwrite"], capsys)
     for option in ("--report", "--json"):
         assert "which exists" in refused([*command, option, scan_file], capsys)
     for option in ("--report", "--json", "--checkpoint"):

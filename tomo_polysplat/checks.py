@@ -7,15 +7,50 @@ from __future__ import annotations
 
 import difflib
 import math
+import unicodedata
 from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
-__all__ = ["did_you_mean", "fail", "require_array", "require_choice", "require_number", "require_shape"]
+__all__ = [
+    *("did_you_mean", "fail", "require_array", "require_choice", "require_number", "require_shape"),
+    "visible",
+]
 
 # Characters. A whole file may be handed over as a name, and comparing that would take long.
 _LONGEST_NAME = 60
+# Unicode's categories of what has no shape of its own: control, format (the direction of writing among them),
+# halves of surrogate pairs, and the separators of lines and paragraphs.
+_UNSEEN = ("Cc", "Cf", "Cs", "Zl", "Zp")
+
+
+def visible(text: Any) -> str:
+    """A text from a file or a caller as it may be shown in a terminal, a log or a page.
+
+    Characters that would move the cursor, change colours or the direction of writing, or hide others, become
+    their numbers: an escape becomes ``\\x1b``. Line ends become spaces.
+
+    Parameters
+    ----------
+    text : anything
+        What is no text is shown as `str` shows it.
+    """
+    whole = str(text)
+    if whole.isprintable():
+        return whole
+    return "".join(map(_visible, whole))
+
+
+def _visible(character: str) -> str:
+    if character in "\n\r\t":
+        return " "
+    if unicodedata.category(character) not in _UNSEEN:
+        return character
+    number = ord(character)
+    return (
+        f"\\x{number:02x}" if number < 256 else f"\\u{number:04x}" if number < 65536 else f"\\U{number:08x}"
+    )
 
 
 def fail(
@@ -23,13 +58,13 @@ def fail(
 ) -> Exception:
     """The exception to raise: ``raise fail("angles", "radians", "degrees", "use numpy.deg2rad")``."""
     message = f"{_short(argument, 200)}: expected {expected}, got {_short(got, 400)}"
-    return error(f"{message}; {remedy}" if remedy else message)
+    return error(f"{message}; {visible(remedy)}" if remedy else message)
 
 
 def _short(text: Any, longest: int) -> str:
     """What a caller passed may be a whole file."""
     whole = str(text)
-    return whole if len(whole) <= longest else f"{whole[:longest]} ..."
+    return visible(whole if len(whole) <= longest else f"{whole[:longest]} ...")
 
 
 def require_number(

@@ -16,17 +16,22 @@ __all__ = [
     "available_memory",
     "existing_file",
     "existing_parent",
+    "flush_to_disk",
+    "output_path",
     "replacing",
     "require_plausible_size",
     "require_replaceable",
     "require_room",
     "require_room_for",
     "require_writable",
+    "temporary_beside",
     "write_text",
 ]
 
 # Deflate, the strongest compression met in these formats, cannot shrink data by more than 1032.
 LARGEST_COMPRESSION = 1100
+# What a name may be long where the file system does not say; and the longest ending that a program goes by.
+_LONGEST_NAME, _LONGEST_SUFFIX = 255, 12
 # An array as it is read, in the order and type that are wanted, and at work.
 _COPIES = 3
 
@@ -50,16 +55,17 @@ def replacing(path: str | os.PathLike, *, overwrite: bool, needed_bytes: int = 0
         If the file exists and `overwrite` is false.
     OSError
         If the disk has too little free space.
+    ValueError
+        If no file can have this name.
     """
-    target = Path(path)
-    require_replaceable(target, overwrite)
+    target = require_replaceable(path, overwrite)
     require_room(target.parent, needed_bytes)
-    temporary = target.with_name(f".{target.stem}-{secrets.token_hex(6)}.part{target.suffix}")
+    temporary = temporary_beside(target)
     # With the usual permissions, which a temporary file of the library's does not have.
     temporary.touch(exist_ok=False)
     try:
         yield temporary
-        _flush(temporary)
+        flush_to_disk(temporary)
         if target.exists():
             shutil.copymode(target, temporary)
         require_replaceable(target, overwrite)
@@ -69,16 +75,63 @@ def replacing(path: str | os.PathLike, *, overwrite: bool, needed_bytes: int = 0
             temporary.unlink()
 
 
+def temporary_beside(target: Path) -> Path:
+    """A name that nobody can foresee, in the folder of `target` and with its ending, however long its own is."""
+    suffix = target.suffix if len(target.suffix) <= _LONGEST_SUFFIX else ""
+    return target.with_name(f".polysplat-{secrets.token_hex(8)}.part{suffix}")
+
+
+def output_path(path: str | bytes | os.PathLike, argument: str = "path") -> Path:
+    """Where a file of this name is written: a link is followed, so that it stays and its file is replaced.
+
+    Raises
+    ------
+    ValueError
+        If no file can have this name.
+    FileNotFoundError
+        For a link that leads nowhere.
+    """
+    name = os.fsdecode(path)
+    if not name or "\0" in name:
+        raise fail(argument, "the name of a file", repr(name), "choose another name")
+    target = Path(name)
+    _require_short(target, argument)
+    if not target.is_symlink():
+        return target
+    # Followed by hand: a loop has no end to resolve to.
+    real = Path(os.path.realpath(target))
+    if not real.exists():
+        remedy = "remove the link or make what it points to"
+        raise fail(
+            argument, "a file or a new name", f"{target}, a link to nothing", remedy, FileNotFoundError
+        )
+    return real
+
+
+def _require_short(target: Path, argument: str) -> None:
+    try:
+        longest = os.pathconf(existing_parent(target.parent), "PC_NAME_MAX")
+    except (AttributeError, OSError, ValueError):
+        longest = _LONGEST_NAME
+    if (size := max((len(os.fsencode(part)) for part in target.parts), default=0)) > longest:
+        raise fail(argument, f"names of at most {longest} bytes", f"{size} bytes", "choose a shorter name")
+
+
 def write_text(path: str | os.PathLike, text: str, *, overwrite: bool) -> None:
     """Write a file of text by `replacing`."""
-    with replacing(path, overwrite=overwrite, needed_bytes=len(text)) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    content = text.encode("utf-8", "replace")
+    with replacing(path, overwrite=overwrite, needed_bytes=len(content)) as temporary:
+        temporary.write_bytes(content)
 
 
 def require_replaceable(
-    target: Path, overwrite: bool, remedy: str = "pass overwrite=True", argument: str = "path"
-) -> None:
-    """Refuse a file that could not be written: a folder, one in a missing folder, or one that must stay."""
+    path: str | bytes | os.PathLike,
+    overwrite: bool,
+    remedy: str = "pass overwrite=True",
+    argument: str = "path",
+) -> Path:
+    """The file that would be written; refused are a folder, one in a missing folder, and one that must stay."""
+    target = output_path(path, argument)
     if target.is_dir():
         raise fail(argument, "a file", f"the folder {target}", error=IsADirectoryError)
     if not target.parent.is_dir():
@@ -87,6 +140,9 @@ def require_replaceable(
         )
     if target.exists() and not overwrite:
         raise fail(argument, "a new file", f"{target}, which exists", remedy, FileExistsError)
+    if target.exists() and not target.is_file():
+        raise fail(argument, "a file", f"{target}, a device or a pipe", "name a file")
+    return target
 
 
 def require_writable(folder: str | os.PathLike, argument: str = "path") -> None:
@@ -101,8 +157,8 @@ def require_writable(folder: str | os.PathLike, argument: str = "path") -> None:
         ) from error
 
 
-def _flush(path: Path) -> None:
-    # Without this a crash of the machine could leave the new name with none of the new contents.
+def flush_to_disk(path: Path) -> None:
+    """Wait for the disk: a crash of the machine could else leave the new name with none of the new contents."""
     with open(path, "rb+") as file:
         os.fsync(file.fileno())
 
@@ -113,8 +169,8 @@ def require_room(folder: str | os.PathLike, needed_bytes: int) -> None:
     if needed_bytes > free:
         raise fail(
             "path",
-            f"{needed_bytes / 2**20:,.0f} MiB of free disk space",
-            f"{free / 2**20:,.0f} MiB in {folder}",
+            f"{needed_bytes / 2**20:,.2f} MiB of free disk space",
+            f"{free / 2**20:,.2f} MiB in {folder}",
             "free some space or choose another folder",
             OSError,
         )

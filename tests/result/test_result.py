@@ -218,7 +218,7 @@ def test_tiff_slices(tmp_path):
     files = sorted(folder.iterdir())
     assert [file.name for file in files] == ["slice_0000.tif", "slice_0001.tif", "slice_0002.tif"]
     np.testing.assert_array_equal(np.stack([tifffile.imread(file) for file in files]), result.volume)
-    about = json.loads(tifffile.TiffFile(files[0]).pages[0].description)
+    about = json.loads(tifffile.TiffFile(files[0]).imagej_metadata["Info"])
     assert about["unit"] == "1/cm" and about["energy_kev"] == 55.0
     with pytest.raises(FileExistsError):
         result.save_tiff(folder)

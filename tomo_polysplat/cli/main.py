@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 
 import tomo_polysplat
+from tomo_polysplat.checks import visible
 from tomo_polysplat.cli import bench, check, demo, doctor, recon, simulate
 from tomo_polysplat.cli.options import INTERRUPTED
 
@@ -27,7 +28,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = build_parser().parse_args(argv)
     level = logging.DEBUG if arguments.debug else logging.INFO if arguments.verbose else logging.WARNING
-    logging.basicConfig(level=level, format="%(levelname)s: %(message)s", stream=sys.stderr)
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_VisibleFormatter("%(levelname)s: %(message)s"))
+    logging.basicConfig(level=level, handlers=[handler])
     if arguments.debug:
         return arguments.run(arguments)
     try:
@@ -64,8 +67,16 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
+class _VisibleFormatter(logging.Formatter):
+    """One line a message, whatever stands in the texts of files that it tells of."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  # its name in the library
+        record.message = visible(record.message)
+        return super().formatMessage(record)
+
+
 def _complain(message: str, code: int) -> int:
-    print(f"tomo-polysplat: error: {' '.join(message.split())}", file=sys.stderr)
+    print(f"tomo-polysplat: error: {' '.join(visible(message).split())}", file=sys.stderr)
     return code
 
 

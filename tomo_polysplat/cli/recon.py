@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import logging
-import math
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import tomo_polysplat
@@ -20,30 +17,42 @@ from tomo_polysplat.cli.options import (
     scan_from,
     spectrum_from,
 )
-from tomo_polysplat.files import require_replaceable, require_room_for, require_writable
+from tomo_polysplat.cli.recon_outputs import require_outputs, require_room_of, write_outputs
 from tomo_polysplat.interrupts import postponed_interrupts
 from tomo_polysplat.progress import progress_reports
-from tomo_polysplat.result.files import write_json
 
 if TYPE_CHECKING:
     from tomo_polysplat.physics.spectrum import Spectrum
-    from tomo_polysplat.result.result import Result
     from tomo_polysplat.scan.scan import Scan
-
-logger = logging.getLogger(__name__)
 
 NAME = "recon"
 HELP = "reconstruct a scan into a volume of attenuation in 1/length"
-OUTPUT_SUFFIXES = (".h5", ".hdf5", ".npy")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this subcommand."""
     add_scan_options(parser)
-    parser.add_argument("-o", "--output", required=True, metavar="FILE", help=".h5 with everything, or .npy")
+    parser.add_argument(
+        "-o",
+        "--output",
+        required=True,
+        metavar="FILE",
+        help=".h5 with everything, or the volume as .tif, .ome.tif, .mha, .nrrd, .nii.gz, .vti, .npy, or a folder "
+        "of TIFF slices (NAME/)",
+    )
+    parser.add_argument(
+        "--hu", action="store_true", help="Hounsfield units instead of attenuation (not in .h5)"
+    )
+    parser.add_argument(
+        "--bits",
+        type=int,
+        choices=[16, 32],
+        default=32,
+        help="16 for whole numbers with their slope and offset in the file (default: 32)",
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace files that exist")
     parser.add_argument("--report", metavar="FILE", help="write a page about the reconstruction (.html)")
-    parser.add_argument("--tiff", metavar="FOLDER", help="write the slices as 32-bit TIFF")
+    parser.add_argument("--tiff", metavar="FOLDER", help="write the slices as TIFF")
     parser.add_argument("--json", metavar="FILE", help="write the plan, the counts and the errors as JSON")
     add_spectrum_options(parser)
     group = parser.add_argument_group("reconstruction")
@@ -95,10 +104,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Reconstruct, and write what was asked for."""
-    _require_outputs(arguments)
+    require_outputs(arguments)
     scan = scan_from(arguments, spectrum_from(arguments))
     spectrum = _spectrum_of(scan, arguments)
-    _require_room(arguments, scan)
+    require_room_of(arguments, scan)
     print(scan)
     with progress_reports(None) as progress:
         result = tomo_polysplat.reconstruct(
@@ -126,7 +135,7 @@ def run(arguments: argparse.Namespace) -> int:
             result = replace(result, energy_kev=arguments.energy)
         result.provenance = {"scan": scan.name} | result.provenance
         print(result)
-        _write(result, scan, arguments)
+        write_outputs(result, scan, arguments)
     interrupted = interruption.asked or "interrupted" in result.plan.get("stop", "")
     return INTERRUPTED if interrupted else 0
 
@@ -153,43 +162,6 @@ def _spectrum_of(scan: Scan, arguments: argparse.Namespace) -> Spectrum | None:
     return spectrum
 
 
-def _require_outputs(arguments: argparse.Namespace) -> None:
-    """Find out before the work, not after it, that a result could not be written."""
-    from tomo_polysplat.result.files import require_slices_folder
-
-    if Path(arguments.output).suffix.lower() not in OUTPUT_SUFFIXES:
-        raise fail("--output", f"a name ending in {', '.join(OUTPUT_SUFFIXES)}", arguments.output)
-    if arguments.resume and arguments.checkpoint is None:
-        raise fail("--resume", "--checkpoint with it", "none")
-    for name in ("output", "report", "json"):
-        if (path := getattr(arguments, name)) is not None:
-            require_replaceable(Path(path), arguments.overwrite, "pass --overwrite", f"--{name}")
-            require_writable(Path(path).parent, f"--{name}")
-    if arguments.checkpoint is not None:
-        remedy = "pass --resume to go on from it, or remove it"
-        require_replaceable(Path(arguments.checkpoint), arguments.resume, remedy, "--checkpoint")
-    if arguments.tiff is not None:
-        require_slices_folder(
-            arguments.tiff, overwrite=arguments.overwrite, remedy="pass --overwrite", argument="--tiff"
-        )
-    named = ("scan", "output", "report", "json", "tiff", "checkpoint")
-    files = [Path(path).resolve() for name in named if (path := getattr(arguments, name)) is not None]
-    if len(set(files)) < len(files):
-        raise fail("--output", "a file of its own for the scan and for everything written", "one file twice")
-
-
-def _require_room(arguments: argparse.Namespace, scan: Scan) -> None:
-    """Find out before the work that the disk is too full for the volume."""
-    volume = 4 * math.prod(scan.volume_shape)
-    # Three curves and the volume itself.
-    output = volume if Path(arguments.output).suffix.lower() == ".npy" else 4 * volume
-    needed = {Path(arguments.output).parent: output}
-    if arguments.tiff is not None:
-        folder = Path(arguments.tiff)
-        needed[folder] = needed.get(folder, 0) + volume
-    require_room_for(needed)
-
-
 def _setting(text: str) -> tuple[str, Any]:
     name, separator, value = text.partition("=")
     if not separator:
@@ -198,56 +170,3 @@ def _setting(text: str) -> tuple[str, Any]:
         return name, json.loads(value)
     except ValueError:
         return name, value
-
-
-def _write(result: Result, scan: Scan, arguments: argparse.Namespace) -> None:
-    from tomo_polysplat.report.table import as_text
-
-    output, overwrite = Path(arguments.output), arguments.overwrite
-    save = result.save_npy if output.suffix.lower() == ".npy" else result.save
-    save(output, overwrite=overwrite)
-    print(f"wrote {output}")
-    if arguments.tiff is not None:
-        result.save_tiff(arguments.tiff, overwrite=overwrite)
-        print(f"wrote {arguments.tiff}")
-    errors = _errors(result, scan)
-    if arguments.report is not None:
-        comparable = errors is not None and _same_energy(result, scan)
-        known = {"truth": scan.truth, "metal_mask": scan.metal_mask} if comparable else {}
-        result.report(arguments.report, overwrite=overwrite, **known)
-        print(f"wrote {arguments.report}")
-    if errors is not None:
-        print(as_text([errors], result.unit))
-    if arguments.json is not None:
-        names = ("unit", "energy_kev", "seconds", "plan", "counts", "provenance")
-        about = {name: getattr(result, name) for name in names}
-        write_json(arguments.json, about | {"scan": arguments.scan, "errors": errors}, overwrite=overwrite)
-        print(f"wrote {arguments.json}")
-
-
-def _errors(result: Result, scan: Scan) -> dict[str, Any] | None:
-    """Figures of merit at the energy of the truth, where the scan carries one that the volume can be compared with."""
-    if scan.truth is None:
-        return None
-    from tomo_polysplat.result.metrics import compare
-
-    energy = _truth_energy(scan)
-    volume = result.volume if result.is_monochromatic or energy is None else result.attenuation(energy)
-    name = "mono" if result.is_monochromatic else "polysplat"
-    try:
-        found = compare(volume, scan.truth, scan.metal_mask)
-    except ValueError as error:
-        logger.warning("Not compared with the truth: %s", error)
-        return None
-    return {"name": name, "seconds": result.seconds, **found}
-
-
-def _truth_energy(scan: Scan) -> float | None:
-    if scan.truth_energy_kev is not None or scan.spectrum is None:
-        return scan.truth_energy_kev
-    return scan.spectrum.effective_energy
-
-
-def _same_energy(result: Result, scan: Scan) -> bool:
-    energy = _truth_energy(scan)
-    return energy is None or result.energy_kev is None or abs(energy - result.energy_kev) < 0.05

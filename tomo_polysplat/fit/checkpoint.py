@@ -15,16 +15,17 @@ import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
 from tomo_polysplat.checks import fail
+from tomo_polysplat.file_lock import FileLock
 from tomo_polysplat.files import replacing, require_replaceable, require_writable
 from tomo_polysplat.fit.plan import Plan
 from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.json_text import parse_json
 from tomo_polysplat.model.gaussians import OF_ALL, Gaussians
 from tomo_polysplat.scan.archive import read_archive
 
@@ -35,6 +36,8 @@ logger = logging.getLogger(__name__)
 FORMAT = 17
 # Writing takes at most this share of the time.
 _LARGEST_SHARE = 0.05
+# Of what a plan counts, in any unit: beyond these single precision fails.
+_SMALLEST, _LARGEST = 1e-9, 1e9
 _PARTS = tuple(field.name for field in fields(Gaussians))
 _FITTED = tuple(name for name in _PARTS if name != "group")
 # What taking apart something else than the expected raises.
@@ -109,10 +112,12 @@ class Checkpoint:
     def __init__(
         self, path: str | os.PathLike, problem: Problem, options: Mapping[str, Any], *, resume: bool
     ) -> None:
-        self.path = Path(path)
         remedy = "pass resume=True to go on from it, or remove it"
-        require_replaceable(self.path, resume, remedy)
+        self.path = require_replaceable(path, resume, remedy, "checkpoint")
         require_writable(self.path.parent)
+        self._lock = FileLock(self.path, "checkpoint")
+        # Another run may have written it and ended since.
+        require_replaceable(self.path, resume, remedy, "checkpoint")
         self._views = len(problem.projections)
         self.scan, self.options = _digest(problem), json.loads(json.dumps(dict(options)))
         self.plan: Plan | None = None
@@ -203,7 +208,8 @@ def _digest(problem: Problem) -> str:
 
 def _content(about: np.ndarray) -> dict[str, Any]:
     try:
-        return json.loads(about.tobytes())
+        # The least loss so far may be infinite.
+        return parse_json(about.tobytes().decode("utf-8"), "about", finite=False)
     except ValueError as error:
         raise TypeError(f"no JSON: {error}") from error
 
@@ -212,10 +218,14 @@ def _plan(parts: dict[str, Any]) -> Plan:
     plan = Plan(**parts)
     counts = (plan.views_per_step, plan.tv_every)
     amounts = (plan.reference, plan.first, plan.spacing, plan.smallest_scale, plan.tv_factor, plan.growth)
-    above_zero = min(*amounts, *counts) > 0 and plan.pixel_rays >= 0
-    whole = all(isinstance(n, int) for n in (*counts, plan.pixel_rays))
+    levels = (plan.soft_u, plan.depth, plan.support_level, plan.finer, plan.passes)
+    above_zero = (
+        all(_SMALLEST <= amount <= _LARGEST for amount in (*amounts, *counts)) and plan.pixel_rays >= 0
+    )
+    above_zero = above_zero and all(abs(level) <= _LARGEST for level in levels)
+    whole = all(type(n) is int for n in (*counts, plan.pixel_rays))
     corners = len(plan.tv_corners) == 2 and all(
-        isinstance(corner, (int, float)) and corner >= 0 for corner in plan.tv_corners
+        isinstance(corner, (int, float)) and 0 <= corner <= _LARGEST for corner in plan.tv_corners
     )
     choices = plan.curves in (1, 3) and isinstance(plan.blurred, bool) and isinstance(plan.sharp, bool)
     choices = choices and isinstance(plan.fat, bool | None)

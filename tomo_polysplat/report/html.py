@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tomo_polysplat.checks import require_shape
+from tomo_polysplat.checks import require_shape, visible
 from tomo_polysplat.files import write_text
 from tomo_polysplat.report import table as tables
 from tomo_polysplat.report.figures import history_figure, png_bytes, slices_figure
@@ -64,8 +64,8 @@ def write_report(
     metal = None if metal_mask is None else _spatial(result, metal_mask).astype(bool)
     title = f"tomo-polysplat reconstruction{_of_what(result)}"
     body = [
-        f"<h1>{html.escape(title)}</h1>",
-        f'<p class="note">{html.escape(repr(result))}</p>',
+        f"<h1>{_text(title)}</h1>",
+        f'<p class="note">{_text(repr(result))}</p>',
         *_slices(result, volume, true, metal),
         *_errors(result, volume, true, metal),
         "<h2>Speed against error</h2>",
@@ -80,7 +80,12 @@ def write_report(
 
 def page(title: str, body: Sequence[str]) -> str:
     """A whole page of these parts, which are HTML."""
-    return PAGE.format(title=html.escape(title), body="\n".join(body), ink=INK, accent=ACCENT, quiet=QUIET)
+    return PAGE.format(title=_text(title), body="\n".join(body), ink=INK, accent=ACCENT, quiet=QUIET)
+
+
+def _text(words: Any) -> str:
+    """Words as they stand in HTML."""
+    return html.escape(visible(words))
 
 
 def _of_what(result: Result) -> str:
@@ -92,7 +97,7 @@ def _of_what(result: Result) -> str:
 def image(png: bytes, description: str) -> str:
     """A picture inside the page."""
     data = base64.b64encode(png).decode("ascii")
-    return f'<img alt="{html.escape(description)}" src="data:image/png;base64,{data}">'
+    return f'<img alt="{_text(description)}" src="data:image/png;base64,{data}">'
 
 
 def _spatial(result: Result, volume: np.ndarray) -> np.ndarray:
@@ -112,7 +117,7 @@ def _slices(
     note = f"All slices are shown from {window[0]:.3g} to {window[1]:.3g} 1/{result.unit}; brighter is white."
     return [
         "<h2>Slices</h2>",
-        f'<p class="note">{html.escape(note)}</p>',
+        f'<p class="note">{_text(note)}</p>',
         image(png_bytes(figure), "orthogonal slices"),
     ]
 
@@ -138,9 +143,7 @@ def _section(heading: str, content: Mapping[str, Any]) -> list[str]:
 
 
 def _rows(content: Mapping[str, Any]) -> str:
-    lines = (
-        f"<tr><th>{html.escape(str(key))}</th><td>{_value(item)}</td></tr>" for key, item in content.items()
-    )
+    lines = (f"<tr><th>{_text(key)}</th><td>{_value(item)}</td></tr>" for key, item in content.items())
     return f"<table>{''.join(lines)}</table>"
 
 
@@ -149,4 +152,4 @@ def _value(item: Any) -> str:
         return _rows(item)
     if isinstance(item, (list, tuple)):
         return "<br>".join(_value(part) for part in item)
-    return html.escape(f"{item:.6g}" if isinstance(item, (float, np.floating)) else str(item))
+    return _text(f"{item:.6g}" if isinstance(item, (float, np.floating)) else item)

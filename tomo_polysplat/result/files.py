@@ -17,9 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from tomo_polysplat.checks import fail, require_choice
-from tomo_polysplat.files import existing_parent, replacing, require_room, require_writable, write_text
+from tomo_polysplat.checks import fail, require_choice, require_number
+from tomo_polysplat.files import replacing, write_text
 from tomo_polysplat.physics.base_materials import Materials
+from tomo_polysplat.plain_file import PlainFile
+from tomo_polysplat.result.image import Image
 from tomo_polysplat.result.result import GAUSSIAN_PARTS, Result
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.scan.hdf5 import (
@@ -33,11 +35,23 @@ from tomo_polysplat.scan.hdf5 import (
     text_attribute,
     write_spectrum,
 )
+from tomo_polysplat.scan.hdf5_writer import new_hdf5
 from tomo_polysplat.units import LENGTH_UNITS
 
-__all__ = ["load_hdf5", "plain", "require_slices_folder", "save_hdf5", "save_npy", "save_tiff"]
+__all__ = ["load_hdf5", "plain", "save_hdf5", "write_json", "write_npy"]
 
 FORMAT = 1
+# In any unit; squares of larger ones are beyond single precision.
+_LARGEST = 1e15
+# In g/cm3: forty times osmium.
+_DENSEST = 1e3
+_RANGES = {
+    "position": (-_LARGEST, _LARGEST),
+    "scale": (0.0, _LARGEST),
+    "rotation": (-1.001, 1.001),
+    "density": (-_LARGEST, _LARGEST),
+    "u": (-0.2, 1.1),
+}
 JSON_PARTS = ("history", "plan", "counts", "settings", "provenance")
 
 
@@ -63,15 +77,10 @@ def write_json(path: str | os.PathLike, content: Any, *, overwrite: bool) -> Non
 
 def save_hdf5(result: Result, path: str | os.PathLike, *, overwrite: bool = False) -> None:
     """See :meth:`Result.save`."""
-    import h5py
-
     volume = result.volume[None, ::-1] if result.flipped_2d else result.volume
     arrays = [result.basis, volume, *result.gaussians.values()]
     needed = sum(np.asarray(array).nbytes for array in arrays)
-    with (
-        replacing(path, overwrite=overwrite, needed_bytes=needed) as temporary,
-        h5py.File(temporary, "w") as file,
-    ):
+    with new_hdf5(path, overwrite=overwrite, needed_bytes=needed) as file:
         file["implements"] = "exchange:polysplat"
         data = file.create_dataset("exchange/data", data=volume)
         size = result.grid.voxel_size
@@ -116,19 +125,46 @@ def load_hdf5(path: str | os.PathLike) -> Result:
         basis = read_numbers(group, "basis")
         if basis.ndim != 4:
             raise fail("/polysplat/basis", "shape (channels, z, y, x)", f"{basis.shape}")
-        present = find_group(group, "gaussians") is not None
+        materials = _read_materials(group)
+        limit = _LARGEST if materials is None else _DENSEST
+        _require_range("basis", basis, -limit, limit)
         return Result(
             basis=basis,
             grid=VolumeGrid(basis.shape[1:], read_attribute(group, "lower"), read_attribute(group, "upper")),
             unit=require_choice("unit in the file", text_attribute(group, "unit"), LENGTH_UNITS),
             energy_kev=number_attribute(group, "energy_kev"),
-            materials=_read_materials(group),
+            materials=materials,
             spectrum=read_spectrum(group),
-            gaussians={name: read_numbers(group, f"gaussians/{name}") for name in GAUSSIAN_PARTS if present},
+            gaussians=_read_gaussians(group, planar=basis.shape[1] == 1),
             **_read_parts(group),
-            seconds=number_attribute(group, "seconds") or 0.0,
+            seconds=require_number(
+                "seconds in the file", number_attribute(group, "seconds") or 0.0, at_least=0
+            ),
             flipped_2d=bool(number_attribute(group, "flipped_2d")),
         )
+
+
+def _read_gaussians(group: Any, planar: bool) -> dict[str, np.ndarray]:
+    if find_group(group, "gaussians") is None:
+        return {}
+    parts = {name: read_numbers(group, f"gaussians/{name}") for name in GAUSSIAN_PARTS}
+    for name, values in parts.items():
+        # Those of a slice have no end along z.
+        bounded = values[..., :2] if planar and name == "scale" else values
+        _require_range(f"gaussians/{name}", bounded, *_RANGES[name])
+    if planar:
+        _require_range("gaussians/scale", parts["scale"], 0.0, math.inf)
+    return parts
+
+
+def _require_range(name: str, values: np.ndarray, low: float, high: float) -> None:
+    """Refuse what no fit makes, NaN and infinity first: one bit of a damaged file is enough for them."""
+    # Both are NaN where any value is, and then no comparison holds.
+    smallest, largest = (float(values.min()), float(values.max())) if values.size else (low, high)
+    if not (smallest >= low and largest <= high):
+        got = f"{smallest:g} to {largest:g}"
+        wanted = f"finite numbers from {low:g} to {high:g}"
+        raise fail(f"/polysplat/{name}", wanted, got, "the file is damaged: copy or write it again")
 
 
 def _read_materials(group: Any) -> Materials | None:
@@ -158,61 +194,11 @@ def _numeric(record: dict[str, Any]) -> bool:
     return all(value is None or isinstance(value, (int, float)) for value in numbers)
 
 
-def save_npy(result: Result, path: str | os.PathLike, *, overwrite: bool = False) -> None:
-    """See :meth:`Result.save_npy`."""
-    volume = result.volume
+def write_npy(image: Image, path: str | os.PathLike, *, overwrite: bool = False) -> None:
+    """The numbers alone, as a NumPy array: (z, y, x), or (y, x) with row 0 at the largest y after a 2D scan."""
+    values = np.ascontiguousarray(image.values[0, ::-1]) if image.top_row == "largest y" else image.values
     with (
-        replacing(path, overwrite=overwrite, needed_bytes=volume.nbytes) as temporary,
-        open(temporary, "wb") as file,
+        replacing(path, overwrite=overwrite, needed_bytes=values.nbytes) as temporary,
+        PlainFile(temporary) as file,
     ):
-        np.save(file, volume, allow_pickle=False)
-
-
-def require_slices_folder(
-    folder: str | os.PathLike,
-    *,
-    overwrite: bool,
-    remedy: str = "pass overwrite=True",
-    argument: str = "folder",
-) -> list[Path]:
-    """The slices in a folder; refused are slices that must stay, and folders that cannot be written to."""
-    target = Path(folder)
-    if target.exists() and not target.is_dir():
-        raise fail(argument, "a folder", f"the file {target}", error=NotADirectoryError)
-    present = sorted(target.glob("slice_*.tif"))
-    if present and not overwrite:
-        raise fail(
-            argument,
-            "one without slices",
-            f"{len(present)} in {target}",
-            remedy,
-            FileExistsError,
-        )
-    require_writable(existing_parent(target), argument)
-    return present
-
-
-def save_tiff(result: Result, folder: str | os.PathLike, *, overwrite: bool = False) -> None:
-    """See :meth:`Result.save_tiff`."""
-    import tifffile
-
-    target = Path(folder)
-    present = require_slices_folder(target, overwrite=overwrite)
-    target.mkdir(parents=True, exist_ok=True)
-    volume = result.volume.reshape(result.grid.shape)
-    require_room(target, volume.nbytes)
-    about = {
-        "unit": f"1/{result.unit}",
-        "energy_kev": result.energy_kev,
-        "voxel_size": plain(result.grid.voxel_size),
-        "first_row": "largest y" if result.flipped_2d else "smallest y",
-    }
-    written = set()
-    for index, image in enumerate(volume):
-        path = target / f"slice_{index:04d}.tif"
-        with replacing(path, overwrite=True) as temporary:
-            tifffile.imwrite(temporary, image, description=json.dumps(about), metadata=None)
-        written.add(path)
-    # Slices of an earlier, taller volume would otherwise be read as part of this one.
-    for path in set(present) - written:
-        path.unlink()
+        np.save(file, values, allow_pickle=False)

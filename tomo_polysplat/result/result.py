@@ -167,27 +167,38 @@ class Result:
         """In the order of the caller's geometry."""
         return np.ascontiguousarray(volume[0, ::-1]) if self.flipped_2d else volume
 
-    def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> None:
-        """Write everything to an HDF5 file in the Data Exchange layout; :meth:`load` reads it back.
+    def save(
+        self, path: str | os.PathLike, *, overwrite: bool = False, hu: bool = False, bits: int = 32
+    ) -> None:
+        """Write to a file of the kind that the name's ending stands for.
 
-        An interrupted write leaves an existing file as it was.
+        ``.h5`` and ``.hdf5`` hold everything, in the Data Exchange layout, and :meth:`load` reads them back. The
+        others hold :attr:`volume` with voxel size and unit: ``.tif`` (ImageJ), ``.ome.tif``, a name ending in
+        ``/`` (a folder of TIFF slices), ``.mha``, ``.nrrd``, ``.nii``, ``.nii.gz``, ``.vti`` (ParaView); ``.npy``
+        holds its numbers alone. Whatever fails or interrupts it, the old file stays as it was.
 
         Parameters
         ----------
         path : str or path
         overwrite : bool
-            Whether an existing file is replaced.
+            Whether an existing file, or folder of slices, is replaced.
+        hu : bool
+            Hounsfield units at :attr:`energy_kev` instead of attenuation: water is 0, nothing is -1000.
+        bits : {32, 16}
+            16 for whole numbers; the file says their slope and offset.
 
         Raises
         ------
         FileExistsError
-            If the file exists and `overwrite` is false.
+            If the file exists and `overwrite` is false, or the folder holds anything but slices.
         OSError
-            If the disk has too little free space.
+            If the disk has too little free space, or the file could not be written.
+        ValueError
+            For another ending; for `hu` or `bits` where the file or the volume cannot have them.
         """
-        from tomo_polysplat.result.files import save_hdf5
+        from tomo_polysplat.result.formats import save_as
 
-        save_hdf5(self, path, overwrite=overwrite)
+        save_as(self, path, overwrite=overwrite, hu=hu, bits=bits)
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> Result:
@@ -207,20 +218,24 @@ class Result:
 
         return load_hdf5(path)
 
-    def save_tiff(self, folder: str | os.PathLike, *, overwrite: bool = False) -> None:
-        """Write :attr:`volume` as 32-bit TIFF slices ``slice_0000.tif``, ... to a folder, made if need be.
+    def save_tiff(
+        self, folder: str | os.PathLike, *, overwrite: bool = False, hu: bool = False, bits: int = 32
+    ) -> None:
+        """Write :attr:`volume` as TIFF slices ``slice_0000.tif``, ... to a folder that is there whole or not at all.
 
-        Slices that are there stand for the file of :meth:`save`, whose options and errors these are.
+        The folder is new, or holds nothing but slices of before; parameters and errors are those of :meth:`save`.
         """
-        from tomo_polysplat.result.files import save_tiff
+        from tomo_polysplat.result.image import image_of
+        from tomo_polysplat.result.tiff import write_tiff_slices
 
-        save_tiff(self, folder, overwrite=overwrite)
+        write_tiff_slices(image_of(self, hu=hu, bits=bits), folder, overwrite=overwrite)
 
     def save_npy(self, path: str | os.PathLike, *, overwrite: bool = False) -> None:
         """Write :attr:`volume` as a NumPy array file; parameters and errors are those of :meth:`save`."""
-        from tomo_polysplat.result.files import save_npy
+        from tomo_polysplat.result.files import write_npy
+        from tomo_polysplat.result.image import image_of
 
-        save_npy(self, path, overwrite=overwrite)
+        write_npy(image_of(self), path, overwrite=overwrite)
 
     def report(
         self,

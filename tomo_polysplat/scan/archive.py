@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import math
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import IO
 
 import numpy as np
 
-from tomo_polysplat.checks import fail, require_array
+from tomo_polysplat.checks import fail, require_array, visible
 from tomo_polysplat.files import existing_file, require_plausible_size
 
 __all__ = ["archived_number", "archived_text", "read_archive"]
@@ -23,10 +24,16 @@ _COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 # What zipfile and zlib raise for archives that are broken, encrypted or of a later version.
 _BROKEN = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, RuntimeError, UnicodeDecodeError)
 _LONGEST_TEXT = 1000
+# NumPy's own limit for headers that it takes apart.
+_LONGEST_HEADER = 10_000
 
 
-def read_archive(path: str | Path, names: Iterable[str]) -> dict[str, np.ndarray]:
+def read_archive(
+    path: str | Path, names: Iterable[str], most: Mapping[str, int] | None = None
+) -> dict[str, np.ndarray]:
     """Arrays called `names` of a NumPy archive, those that it has.
+
+    `most` says how many numbers some of them may have; more are refused by the header alone.
 
     Nothing is unpickled, and each header is compared with what is stored before memory is taken.
 
@@ -43,18 +50,25 @@ def read_archive(path: str | Path, names: Iterable[str]) -> dict[str, np.ndarray
         with zipfile.ZipFile(file) as archive:
             members = {info.filename: info for info in archive.infolist()}
             chosen = [name for name in names if f"{name}.npy" in members]
-            return {name: _read_member(archive, members[f"{name}.npy"], size) for name in chosen}
+            limits = most or {}
+            return {
+                name: _read_member(archive, members[f"{name}.npy"], size, limits.get(name)) for name in chosen
+            }
     except _BROKEN as error:
         raise fail(
             "path", "a readable .npz archive", f"{file} ({error})", "copy or write the file again"
         ) from error
 
 
-def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, file_size: int) -> np.ndarray:
+def _read_member(
+    archive: zipfile.ZipFile, info: zipfile.ZipInfo, file_size: int, most: int | None
+) -> np.ndarray:
     if info.compress_type not in _COMPRESSIONS:
         raise fail(info.filename, "a stored or deflated array", f"compression type {info.compress_type}")
     with archive.open(info) as stream:
         shape, dtype = _header(stream, info)
+    if most is not None and math.prod(shape) > most:
+        raise fail(info.filename, f"at most {most} numbers", f"shape {shape}"[:200], "damaged file")
     declared = math.prod(shape) * dtype.itemsize
     if declared > info.file_size:
         raise fail(
@@ -71,7 +85,13 @@ def _header(stream: IO[bytes], info: zipfile.ZipInfo) -> tuple[tuple[int, ...], 
         version = np.lib.format.read_magic(stream)
         if version not in _HEADERS:
             raise ValueError(f"format {version}")
-        shape, _, dtype = _HEADERS[version](stream)
+        # Its length first: NumPy reads the whole of a header before it asks whether that is too long.
+        layout = "<H" if version == (1, 0) else "<I"
+        length = stream.read(struct.calcsize(layout))
+        (size,) = struct.unpack(layout, length)
+        if size > _LONGEST_HEADER:
+            raise ValueError(f"{size} bytes of it")
+        shape, _, dtype = _HEADERS[version](io.BytesIO(length + stream.read(size)))
     except _BROKEN:
         raise
     except Exception as error:  # the text of a header goes through Python's parser, which may raise anything
@@ -102,7 +122,6 @@ def archived_text(arrays: dict[str, np.ndarray], name: str) -> str | None:
     if array.dtype.kind != "U" or array.size != 1 or array.dtype.itemsize > 4 * _LONGEST_TEXT:
         raise fail(name, "a short text", f"{array.dtype} of shape {array.shape}")
     try:
-        # Half of a surrogate pair could not be written to a report.
-        return str(array.reshape(-1)[0]).encode("utf-8", "replace").decode("utf-8")
+        return visible(array.reshape(-1)[0])
     except ValueError as error:
         raise fail(name, "a text", "characters that do not exist") from error

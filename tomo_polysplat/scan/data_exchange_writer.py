@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tomo_polysplat.files import replacing
-from tomo_polysplat.scan.dxchange_host import write_first_array
 from tomo_polysplat.scan.hdf5 import write_spectrum
+from tomo_polysplat.scan.hdf5_writer import new_hdf5
 from tomo_polysplat.scan.layout import vector_form, window_of
 from tomo_polysplat.scan.scan import Scan
 
@@ -21,21 +20,16 @@ __all__ = ["write_hdf5"]
 
 def write_hdf5(scan: Scan, path: str | Path, *, overwrite: bool = False) -> None:
     """Write a scan as Data Exchange with a group ``/polysplat`` of our own."""
-    import h5py
-
     needed = sum(
         a.nbytes for a in (scan.projections, scan.truth, scan.metal_mask, scan.valid) if a is not None
     )
-    with replacing(path, overwrite=overwrite, needed_bytes=needed) as temporary:
-        write_first_array(temporary, "exchange", "data", scan.projections.transpose(1, 0, 2))
-        with h5py.File(temporary, "r+") as file:
-            _describe(file, scan)
+    with new_hdf5(path, overwrite=overwrite, needed_bytes=needed) as file:
+        file["exchange/data"] = scan.projections.transpose(1, 0, 2)
+        _describe(file, scan)
 
 
 def _describe(file: h5py.File, scan: Scan) -> None:
     """Add to a file that holds the projections what else there is to know."""
-    if "implements" in file:
-        del file["implements"]
     file["implements"] = "exchange:measurement:polysplat"
     file["measurement/sample/name"] = scan.name
     description = {"description": "attenuation", "axes": "theta:y:x", "units": "1"}

@@ -1,6 +1,7 @@
 """Arrays of Data Exchange files through dxchange where it is installed, through h5py otherwise.
 
-Only whole arrays and blocks of views go through dxchange. Its readers of complete scans make up the angles 0 to
+Only whole arrays and blocks of views go through dxchange, and only when they are read: on a full disk its
+writer ends the process. Its readers of complete scans make up the angles 0 to
 180 degrees, end point included, when a file has none, and leave out what they do not find; these choices are
 made in the open by `data_exchange`.
 """
@@ -10,7 +11,6 @@ from __future__ import annotations
 import logging
 from importlib import import_module
 from importlib.util import find_spec
-from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
@@ -19,7 +19,7 @@ import numpy as np
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["real_dxchange", "read_block", "write_first_array"]
+__all__ = ["real_dxchange", "read_block"]
 
 logger = logging.getLogger(__name__)
 
@@ -48,16 +48,3 @@ def read_block(dataset: h5py.Dataset, part: slice = slice(None)) -> np.ndarray:
     if array is None:
         raise OSError(f"dxchange did not read {dataset.name} of {dataset.file.filename}")
     return array
-
-
-def write_first_array(path: Path, group: str, name: str, array: np.ndarray) -> None:
-    """Begin a new file at `path` with one array; what else belongs into the file is added by the caller."""
-    import h5py
-
-    host = real_dxchange()
-    # dxchange adds .h5 to a name that does not end so, and would write another file.
-    if host is not None and path.suffix == ".h5":
-        host.write_hdf5(array, fname=str(path), gname=group, dname=name, overwrite=True)
-        return
-    with h5py.File(path, "w") as file:
-        file[f"{group}/{name}"] = array

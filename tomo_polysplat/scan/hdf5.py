@@ -6,7 +6,6 @@ compared with what the file stores.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tomo_polysplat.checks import fail
+from tomo_polysplat.checks import fail, visible
 from tomo_polysplat.files import existing_file, require_plausible_size
+from tomo_polysplat.json_text import parse_json
 from tomo_polysplat.scan.hdf5_heaps import require_sound_heaps
 
 if TYPE_CHECKING:
@@ -188,12 +188,7 @@ def read_text(group: h5py.Group, name: str, default: str = "") -> str:
 
 
 def _text(value: Any) -> str:
-    return value.decode("utf-8", "replace") if isinstance(value, bytes) else _writable(str(value))
-
-
-def _writable(text: str) -> str:
-    # Half of a surrogate pair could not be written to a report.
-    return text.encode("utf-8", "replace").decode("utf-8")
+    return visible(value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value))
 
 
 def read_attribute(item: h5py.HLObject, name: str) -> Any:
@@ -244,10 +239,7 @@ def number_attribute(item: h5py.HLObject, name: str) -> float | None:
 def read_json(group: h5py.Group, name: str, default: Any) -> Any:
     """What a string dataset holds as JSON."""
     text = read_text(group, name)
-    try:
-        return json.loads(text) if text else default
-    except (ValueError, RecursionError) as error:
-        raise fail(f"{group.name}/{name}", "JSON text", f"{text[:40]!r}") from error
+    return parse_json(text, f"{group.name}/{name}") if text else default
 
 
 def write_spectrum(group: h5py.Group, spectrum: Spectrum | None) -> None:

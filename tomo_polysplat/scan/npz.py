@@ -40,11 +40,20 @@ NAMES = (
     "carries_water_correction",
 )
 
+# Numbers that those may have whose size does not go with the scan's.
+_MOST = {
+    **dict.fromkeys(("astra_type", "unit", "spectrum_label", "e_ref", "e_eff"), 1),
+    "vol_shape": 3,
+    "vol_window": 6,
+    "carries_water_correction": 100,
+    **dict.fromkeys(("energies", "spectrum"), 1_000_000),
+}
+
 
 def scan_from_npz(path: Path, options: ReadOptions) -> Scan:
     """Read a scan; see :func:`tomo_polysplat.load_scan`."""
     options.refuse_parallel_only()
-    arrays = read_archive(path, NAMES)
+    arrays = read_archive(path, NAMES, _MOST)
     missing = [name for name in ("projections", "vectors", "vol_shape", "vol_window") if name not in arrays]
     if missing:
         raise fail(

@@ -1,0 +1,128 @@
+"""Writing HDF5 files so that a full disk is an error and not the end of the process.
+
+HDF5 keeps parts of a file in memory until it is closed. When they cannot be written then, it goes on with what
+it has half freed, and the process may die. So it never learns of it here: it writes to a file object that keeps
+the first error for later, and the room for the arrays is taken before it begins.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from tomo_polysplat.checks import fail
+from tomo_polysplat.files import replacing
+
+if TYPE_CHECKING:
+    import h5py
+
+__all__ = ["new_hdf5"]
+
+# A disk or a quota that is full, or a limit on the size of files. Others say that room cannot be taken ahead.
+_FULL = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
+
+
+@contextmanager
+def new_hdf5(path: str | os.PathLike, *, overwrite: bool, needed_bytes: int) -> Iterator[h5py.File]:
+    """An open HDF5 file that becomes `path` when the block ends without an error and all of it is on the disk.
+
+    Parameters
+    ----------
+    path, overwrite
+        See :func:`tomo_polysplat.files.replacing`, whose errors are raised too.
+    needed_bytes : int
+        Of the arrays; their room is taken first.
+
+    Raises
+    ------
+    OSError
+        If the file could not be written; the old one is as it was.
+    """
+    import h5py
+
+    with (
+        replacing(path, overwrite=overwrite, needed_bytes=needed_bytes) as temporary,
+        open(temporary, "r+b", buffering=0) as file,
+    ):
+        _take_room(file.fileno(), needed_bytes)
+        patient = _PatientFile(file.fileno())
+        try:
+            with h5py.File(patient, "w", driver="fileobj") as handle:
+                yield handle
+        except Exception as error:
+            raise patient.error or error from error
+        patient.finish()
+
+
+def _take_room(file: int, needed_bytes: int) -> None:
+    if not needed_bytes or not hasattr(os, "posix_fallocate"):
+        return
+    try:
+        os.posix_fallocate(file, 0, needed_bytes)
+    except OSError as error:
+        if error.errno in _FULL:
+            raise _too_full(error, needed_bytes) from error
+
+
+def _too_full(error: OSError, size: int) -> Exception:
+    remedy = "free some space or choose another folder"
+    return fail("path", f"room for {size / 2**20:,.1f} MiB", error.strerror, remedy, OSError)
+
+
+class _PatientFile:
+    """A file object for HDF5: after a write that fails it only pretends, and `finish` raises what had happened."""
+
+    def __init__(self, file: int) -> None:
+        self.error: Exception | None = None
+        self._file, self._at, self._end = file, 0, 0
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        start = {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: self._end}[whence]
+        self._at = start + offset
+        return self._at
+
+    def tell(self) -> int:
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        view = memoryview(buffer).cast("B")
+        got = os.pread(self._file, len(view), self._at)
+        view[: len(got)] = got
+        # Beyond what is written a file holds zeros, and HDF5 takes fewer bytes for an error.
+        view[len(got) :] = bytes(len(view) - len(got))
+        self._at += len(view)
+        return len(view)
+
+    def read(self, size: int) -> bytes:
+        """What h5py knows a file object by; it reads by `readinto`."""
+        buffer = bytearray(size)
+        self.readinto(buffer)
+        return bytes(buffer)
+
+    def write(self, data: Any) -> int:
+        view = memoryview(data).cast("B")
+        try:
+            done = 0
+            while self.error is None and done < len(view):
+                done += os.pwrite(self._file, view[done:], self._at + done)
+        except OSError as error:
+            self.error = _too_full(error, self._at + len(view)) if error.errno in _FULL else error
+        self._at += len(view)
+        self._end = max(self._end, self._at)
+        return len(view)
+
+    def truncate(self, size: int | None = None) -> int:
+        self._end = self._at if size is None else size
+        return self._end
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+    def finish(self) -> None:
+        """Cut off the room that was not needed."""
+        if self.error is not None:
+            raise self.error
+        os.ftruncate(self._file, self._end)
