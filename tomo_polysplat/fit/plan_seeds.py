@@ -29,7 +29,7 @@ _APART, _CLOSER, _SMALL_CLOUD = 1.3, 1.15, 6000
 # each shows more of an edge: half as thick (H200, six scenes of 128^3 to 256^3) 0.8 dB more everywhere in the mean,
 # 0.05 without metal. Where they are many (40^3), and in slices, that changed nothing or lost 0.1 dB.
 _SMALLEST, _SMALLEST_OF_FEW = 0.2, 0.1
-# Gaussians that a laptop fits in a time people wait for. A GPU's are limited by its memory, of which metal, seeded twice
+# Gaussians that a laptop fits in a time people wait for. A GPU has memory for so many, of which metal, seeded twice
 # as closely and not counted, may take half.
 _MOST_ON_CPU, _SHARE_OF_SEEDS = 60_000, 0.5
 # What a cloud has to show is mostly surfaces. Where they have more than so many Gaussians a voxel, fewer but thin ones
