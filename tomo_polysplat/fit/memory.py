@@ -18,7 +18,7 @@ logger = logging.getLogger(__name__)
 # each view of a step.
 _GAUSSIAN, _FOOTPRINT = 640, 144
 # Bytes a Gaussian of a large cloud was seen to take in all, at the peak of a run that is made both ways (H100, bone of
-# 96^3 and 192^3 voxels, 7.4e5 to 5.6e6 Gaussians: 8500 to 13000).
+# 96^3 and 192^3 voxels, 7.4e5 to 1.2e7 Gaussians: 4300 to 13500).
 _AT_THE_PEAK = 12_000
 # Bytes a pixel of a step takes: image and gradient of four channels, projections and their slopes.
 _PIXEL = 48

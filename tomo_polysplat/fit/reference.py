@@ -59,7 +59,7 @@ _METAL = 3.0
 # So many voxels an axis have a mean in which there is little noise, and what is so many times its deviation is matter.
 _ALIKE_VOXELS, _ABOVE_NOISE, _UPPER = 3, 3.0, 0.75
 # Water is taken after all where so large a share of the matter has about its density, all around it too, which edges of
-# pores have not: marrow in bone of 192^3, measured by bone, left 0.91 of bone's contrast, by water 0.99 (30.2, 31.1).
+# pores have not: marrow in bone of 192^3, measured by bone, left 0.91 of bone's contrast, by water 0.99 (one seed).
 _LIKE_WATER, _SOFT_INSIDE = (0.6, 1.6), 0.05
 # Material number of main matter that is not the first of curves of which nothing is known.
 _BETWEEN = 0.3
