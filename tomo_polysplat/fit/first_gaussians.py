@@ -7,7 +7,7 @@ import math
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.memory import require_room, room_for_gaussians
+from tomo_polysplat.fit.memory import most_gaussians, require_room, room_for_gaussians
 from tomo_polysplat.fit.plan import AVERAGED_RAYS, Plan
 from tomo_polysplat.fit.plan_costs import alternatives, work
 from tomo_polysplat.fit.plan_seeds import finest_spacing
@@ -83,7 +83,8 @@ def room_to_grow(gaussians: int, plan: Plan, problem: Problem, device: torch.dev
     problem : Problem
     device : torch.device
     """
-    return room_for_gaussians(device, **_all_else(plan, problem)) / max(_runs(plan) * gaussians, 1)
+    room = room_for_gaussians(device, **_all_else(plan, problem)) / _runs(plan)
+    return min(room, most_gaussians(device)) / max(gaussians, 1)
 
 
 def _runs(plan: Plan) -> int:

@@ -101,6 +101,8 @@ class Plan:
         Whether rays are seen through the detector's blur; see ``physics.detector_blur``.
     tv_factor : float
         What the settings' weight of the total variation is multiplied by; see `fit.smoothing`.
+    dense : float
+        Of dense matter with soft matter in it, which is no metal; see ``fit.reference``.
     reasons : dict
         Decision by decision, what was chosen and why; it becomes ``Result.plan``.
     """
@@ -124,11 +126,12 @@ class Plan:
     sharp: bool = False
     growth: float = 1.0
     tv_factor: float = 1.0
+    dense: float = 0.0
     reasons: dict[str, Any] = field(default_factory=dict)
 
     def adapted(self, settings: Settings) -> Settings:
         """The settings for this object: levels and material numbers (``fit.reference``), and how much is smoothed."""
-        settings = SoftReference(self.reference, self.first, self.soft_u).adapted(settings)
+        settings = SoftReference(self.reference, self.first, self.soft_u, dense=self.dense).adapted(settings)
         weight = self.tv_factor * settings.tv_weight
         return replace(settings, tv_weight=weight, support_level=self.support_level, growth=self.growth)
 
@@ -152,7 +155,9 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
     level = settings.support_level * min(1.0, light / _LIGHT)
     least = level * reference * problem.depth
     support = int((start > least).sum())
-    spacing, finer, because = seed_spacing(start, least, support, problem, settings, device)
+    spacing, finer, because = seed_spacing(
+        start, least, support, problem, settings, device, settings.bone_level * reference * problem.depth
+    )
     smallest, thin = smallest_scale(spacing, problem, settings)
     longer = _longer(cells(support, problem) / spacing**problem.dimensions, problem.planar)
     passes, views, reason = _length(problem, settings, device, longer)
@@ -164,6 +169,7 @@ def make_plan(start: np.ndarray | torch.Tensor, problem: Problem, settings: Sett
         reference=reference,
         first=first,
         soft_u=matter.number,
+        dense=matter.dense,
         depth=optical_depth(relative, level, reference, problem),
         support_level=level,
         spacing=spacing,

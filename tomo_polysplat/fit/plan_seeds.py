@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from tomo_polysplat.fit.memory import most_gaussians
 from tomo_polysplat.model.seed_samples import box_mean, widened
 from tomo_polysplat.settings import Settings
 
@@ -28,8 +29,9 @@ _APART, _CLOSER, _SMALL_CLOUD = 1.3, 1.15, 6000
 # each shows more of an edge: half as thick (H200, six scenes of 128^3 to 256^3) 0.8 dB more everywhere in the mean,
 # 0.05 without metal. Where they are many (40^3), and in slices, that changed nothing or lost 0.1 dB.
 _SMALLEST, _SMALLEST_OF_FEW = 0.2, 0.1
-# Gaussians that a laptop and a GPU fit in a time people wait for.
-_MOST_GAUSSIANS = {"cpu": 60_000, "cuda": 400_000}
+# Gaussians that a laptop fits in a time people wait for. A GPU has memory for so many, of which metal, seeded twice
+# as closely and not counted, may take half.
+_MOST_ON_CPU, _SHARE_OF_SEEDS = 60_000, 0.5
 # What a cloud has to show is mostly surfaces. Where they have more than so many Gaussians a voxel, fewer but thin ones
 # are better and quicker (128^3, teeth, pins, pancreas: 43.6, 36.6, 40.0 dB in 2.1 s with 450 000 of them, 44.6, 37.6,
 # 40.4 in 1.3 s with 150 000), unless they are few anyway (64^3: 40.9 for 41.8 dB).
@@ -43,14 +45,15 @@ def seed_spacing(
     problem: Problem,
     settings: Settings,
     device: str,
+    dense: float = math.inf,
 ) -> tuple[float, float, str]:
     """Distance of the seeds in voxels (the shortest edge), the finer share, and why.
 
-    Matter is what is above ``least``; ``support`` voxels have some.
+    Matter is what is above ``least``, dense matter what is above ``dense``; ``support`` voxels have some.
     """
     if settings.seed_spacing:
         return settings.seed_spacing, 0.0, "asked for"
-    most, limit = _most_gaussians(start, least, problem, settings, device)
+    most, limit = _most_gaussians(start, (least, dense), problem, settings, device)
     finest, because = finest_spacing(problem)
     crowded = (cells(support, problem) / most) ** (1 / problem.dimensions)
     if crowded <= finest:
@@ -86,17 +89,27 @@ def cells(voxels: int, problem: Problem) -> float:
 
 
 def _most_gaussians(
-    start: np.ndarray | torch.Tensor, least: float, problem: Problem, settings: Settings, device: str
+    start: np.ndarray | torch.Tensor,
+    levels: tuple[float, float],
+    problem: Problem,
+    settings: Settings,
+    device: str,
 ) -> tuple[int, str]:
-    """How many Gaussians at most, and why not more; matter is what is above ``least``."""
-    most = settings.max_gaussians or _MOST_GAUSSIANS[device]
-    if settings.max_gaussians or problem.planar or most <= _NOT_TOO_MANY:
-        return most, ""
-    # Averaged, as noise would make holes with surfaces of their own.
-    matter = box_mean(torch.as_tensor(start), np.minimum(3, start.shape)) > least
-    surface = int((matter & widened(~matter, 1)).sum())
+    """How many Gaussians at most, and why not more; matter and dense matter are what is above ``levels``."""
+    if settings.max_gaussians or device == "cpu":
+        return settings.max_gaussians or _MOST_ON_CPU, ""
+    room = _SHARE_OF_SEEDS * most_gaussians(torch.device(device))
+    most = max(round(min(room, math.prod(start.shape))), 1)
+    told = ", for which there is memory," if room < math.prod(start.shape) else ""
+    if problem.planar:
+        return most, told
+    # Averaged, as noise would make holes with surfaces of their own. What is dense has surfaces within other matter.
+    mean, surface = box_mean(torch.as_tensor(start), np.minimum(3, start.shape)), 0
+    for level in levels:
+        matter = mean > level
+        surface += int((matter & widened(~matter, 1)).sum())
     enough = max(_NOT_TOO_MANY, round(_MOST_PER_SURFACE * surface * cells(1, problem) ** (2 / 3)))
-    return (most, "") if most <= enough else (enough, f", for {surface} voxels at its surfaces,")
+    return (most, told) if most <= enough else (enough, f", for {surface} voxels at its surfaces,")
 
 
 def finest_spacing(problem: Problem) -> tuple[float, str]:
