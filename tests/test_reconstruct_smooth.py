@@ -35,11 +35,11 @@ def test_values_of_a_smooth_object_are_true(rows):
     slope = np.polyfit(truth[inside], result.volume[inside], 1)[0]
     assert slope == pytest.approx(1, abs=0.02)
     assert np.sqrt(np.mean((result.volume - truth) ** 2)) < 0.005 * truth.max()
-    assert "without metal" in result.plan["detector_blur"]
+    assert "without metal" in result.plan["detector_blur"].why
 
 
 def test_blur_is_fitted_where_there_is_metal_and_held_where_asked():
-    assert "fitted" in reconstruct(fan()).plan["detector_blur"]
-    assert "without metal" in reconstruct(fan(metal=False)).plan["detector_blur"]
+    assert "fitted" in reconstruct(fan()).plan["detector_blur"].why
+    assert "without metal" in reconstruct(fan(metal=False)).plan["detector_blur"].why
     held = reconstruct(fan(metal=False), settings={"passes": 1, "blur": 0.3, "learning_rate_blur": 0})
-    assert "0.300" in held.plan["detector_blur"]
+    assert "0.300" in held.plan["detector_blur"].why

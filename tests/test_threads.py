@@ -102,7 +102,7 @@ def broken(*_, **__):
 
 STAGES = {
     "none": None,
-    "start volume": "tomo_polysplat.fit.preparation.first_volume",
+    "start volume": "tomo_polysplat.plan.preparation.first_volume",
     "fit": "tomo_polysplat.fit.scene.FitScene.projections",
     "volume": "tomo_polysplat.fit.scene.FitScene.basis",
 }

@@ -13,6 +13,7 @@ import numpy as np
 
 from tomo_polysplat.checks import require_shape, visible
 from tomo_polysplat.files import write_text
+from tomo_polysplat.plan.answer import Answer
 from tomo_polysplat.report import table as tables
 from tomo_polysplat.report.figures import history_figure, png_bytes, slices_figure
 from tomo_polysplat.report.slices import display_window, planes_through
@@ -70,7 +71,7 @@ def write_report(
         *_errors(result, volume, true, metal),
         "<h2>Speed against error</h2>",
         image(png_bytes(history_figure(result.history)), "error of the projections against seconds"),
-        *_section("What was modelled and why", result.plan),
+        *_section("What was modelled and why", {name: _told(answer) for name, answer in result.plan.items()}),
         *_section("Left out or limited", result.counts),
         *_section("Settings", result.settings),
         *_section("Made from and with", result.provenance),
@@ -140,6 +141,11 @@ def _errors(
 
 def _section(heading: str, content: Mapping[str, Any]) -> list[str]:
     return [f"<h2>{heading}</h2>", _rows(content)] if content else []
+
+
+def _told(answer: Answer) -> Any:
+    """An answer in words, or what it holds by name."""
+    return answer.value if isinstance(answer.value, Mapping) and not answer.why else str(answer)
 
 
 def _rows(content: Mapping[str, Any]) -> str:
