@@ -36,9 +36,13 @@ def suite_seconds(report: Path) -> float:
     """Wall time of a test run, in seconds, from pytest's ``--junitxml`` or from its saved output (``in 271.3s``)."""
     if report.suffix == ".xml":
         return sum(float(suite.get("time", 0)) for suite in ElementTree.parse(report).iter("testsuite"))
-    ends = re.findall(r"\d (?:passed|failed|error|skipped)\w*.* in ([\d.]+)s", report.read_text(encoding="utf-8"))
+    ends = re.findall(
+        r"\d (?:passed|failed|error|skipped)\w*.* in ([\d.]+)s", report.read_text(encoding="utf-8")
+    )
     if not ends:
-        raise SystemExit(f"{report}: neither pytest's --junitxml (.xml) nor an output of pytest that ends with its seconds")
+        raise SystemExit(
+            f"{report}: neither pytest's --junitxml (.xml) nor an output of pytest that ends with its seconds"
+        )
     return float(ends[-1])
 
 
