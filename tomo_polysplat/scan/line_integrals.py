@@ -96,7 +96,7 @@ def _require_some_light(finite: np.ndarray) -> None:
 
 
 def _air(some: np.ndarray, span: float) -> float | None:
-    """The value of air, at both ends of the columns; None unless it is flat and the same there, compared with `span`."""
+    """The value of air, at both ends of the columns; None unless it is flat and the same there, against `span`."""
     (known,) = (np.isfinite(some).mean(axis=(0, 1)) > 0.5).nonzero()
     if len(known) < _FEWEST_COLUMNS:
         return None
