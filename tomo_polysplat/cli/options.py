@@ -19,7 +19,7 @@ __all__ = [
 ]
 
 
-# Exit status of a command that Ctrl-C has ended, as of a shell's.
+# Exit status after Ctrl-C, as shells use it.
 INTERRUPTED = 130
 
 
@@ -98,7 +98,7 @@ def _detector(text: str) -> Detector:
 
 
 def add_scan_options(parser: argparse.ArgumentParser) -> None:
-    """The scan and what its file leaves open."""
+    """The scan, and what its file does not say."""
     parser.add_argument("scan", metavar="SCAN", help="Data Exchange HDF5 file or .npz scan")
     group = parser.add_argument_group("what the file does not say")
     group.add_argument("--unit", help="unit of its lengths: cm (default), mm, um, m or pixel")
@@ -149,6 +149,6 @@ def scan_from(arguments: argparse.Namespace, spectrum: Spectrum | None = None) -
 
 
 def add_solver_options(parser: argparse._ActionsContainer) -> None:
-    """Where and from what seed to compute."""
+    """Device and seed."""
     parser.add_argument("--device", default="auto", help="auto (default), cpu, cuda or cuda:N")
     parser.add_argument("--seed", type=int, default=0, help="seed of everything random (default: 0)")

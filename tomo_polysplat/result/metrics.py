@@ -77,7 +77,7 @@ def ssim(volume: np.ndarray, truth: np.ndarray, span: float) -> float:
         raise fail("truth", "at least 3 voxels along each axis longer than one", f"shape {truth.shape}")
     margin = window // 2
     bounds = split_range(len(truth) - 2 * margin, 4 * cpu_threads())
-    # By several threads: a volume of 256^3 takes one of them seconds.
+    # With several threads: a volume of 256^3 takes one of them seconds.
     slabs = [(volume[a : b + 2 * margin], truth[a : b + 2 * margin], span, window) for a, b in bounds]
     total = sum(run_tasks(_ssim_sum, slabs))
     return total / math.prod(n - 2 * margin for n in truth.shape)

@@ -14,11 +14,11 @@ __all__ = ["estimate_centre"]
 
 logger = logging.getLogger(__name__)
 
-# A mirrored pair must share this part of the detector's width, or noise alone could look alike.
+# A view and its mirror image must overlap by this share of the detector's width; in less noise alone may agree.
 SMALLEST_OVERLAP = 0.3
 # Rows transformed together: few enough to stay in cache.
 _ROWS_AT_ONCE = 8
-# Of the largest sum of squares.
+# Rounding errors, as a share of the largest sum of squares.
 _ROUNDING = 1e-10
 
 
@@ -119,7 +119,7 @@ def _mismatches(projections: np.ndarray, valid: np.ndarray | None, pairs: _Pairs
         return _spectra(projections[a:b], None if valid is None else valid[a:b], pairs, length)
 
     energy, product = irfft(np.sum(run_tasks(part, blocks), axis=0), length)[:, : 2 * columns - 1]
-    # Of nothing at all the transforms leave rounding errors.
+    # Where a row holds nothing the transforms leave rounding errors.
     something = energy > _ROUNDING * energy.max()
     return np.where(something, 1 - 2 * product / np.where(something, energy, 1), np.nan)
 

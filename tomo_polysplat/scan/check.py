@@ -1,4 +1,4 @@
-"""What is wrong with a scan, found in seconds, before minutes are spent on it."""
+"""Find what is wrong with a scan, in seconds, before a reconstruction takes minutes."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def check_scan(scan: Scan) -> list[Finding]:
 
 
 def _nothing_to_see(measured: Measured) -> str:
-    """Why the scan as a whole tells nothing, or an empty text."""
+    """Why the whole scan shows nothing, or an empty text."""
     if measured.scan.columns < _FEWEST_COLUMNS:
         return f"fewer than {_FEWEST_COLUMNS} columns do not tell"
     if not measured.valid.any():
