@@ -141,9 +141,11 @@ def reconstruct(
     run_options = RunOptions.of(quality, settings, time_budget, seed, device, callbacks)
     spectrum = require_spectrum("spectrum", spectrum)
     geometry, grid = from_astra(proj_geom, vol_geom)
-    values, counts = usable_rays(projections, proj_geom, valid, water_correction, spectrum)
     widest, on = run_options.settings.surroundings, run_options.device
-    problem = Problem.of(values, geometry, grid, unit, spectrum, materials, widest, on)
+    # What torch adds up depends on how many threads it has.
+    with one_torch_thread(on):
+        values, counts = usable_rays(projections, proj_geom, valid, water_correction, spectrum)
+        problem = Problem.of(values, geometry, grid, unit, spectrum, materials, widest, on)
     # Sorted, they may be a copy: these would stay in memory beside it.
     del values
     wanted = Calibration.of(calibrate, soft_density, problem.spectrum)
