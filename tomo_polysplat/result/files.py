@@ -26,6 +26,7 @@ from tomo_polysplat.result.image import Image
 from tomo_polysplat.result.result import GAUSSIAN_PARTS, Result
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.scan.hdf5 import (
+    find_array,
     find_group,
     number_attribute,
     opened,
@@ -53,6 +54,8 @@ _RANGES = {
     "density": (-_LARGEST, _LARGEST),
     "u": (-0.2, 1.1),
 }
+# Numbers in a part of a Gaussian: its rotation has them.
+_MOST_PARTS = 4
 JSON_PARTS = ("history", "plan", "counts", "settings", "provenance")
 
 
@@ -151,7 +154,9 @@ def load_hdf5(path: str | os.PathLike) -> Result:
 def _read_gaussians(group: Any, planar: bool) -> dict[str, np.ndarray]:
     if find_group(group, "gaussians") is None:
         return {}
-    parts = {name: read_numbers(group, f"gaussians/{name}") for name in GAUSSIAN_PARTS}
+    density = find_array(group, "gaussians/density")
+    most = _MOST_PARTS * (0 if density is None else density.size)
+    parts = {name: read_numbers(group, f"gaussians/{name}", most=most) for name in GAUSSIAN_PARTS}
     for name, values in parts.items():
         # Those of a slice have no end along z.
         bounded = values[..., :2] if planar and name == "scale" else values

@@ -47,11 +47,17 @@ from tomo_polysplat.scan.scan import Scan
 if TYPE_CHECKING:
     import h5py
 
+    from tomo_polysplat.scan.hdf5_array import StoredArray
+
 __all__ = ["scan_from_hdf5"]
 
 logger = logging.getLogger(__name__)
 
 BLOCK_BYTES = 2**27
+# Of the longest kind of vectors, and of a polynomial.
+_PER_VECTOR, _MOST_COEFFICIENTS = 13, 100
+# Open-beam or dark images beside fewer views than that.
+_MOST_FRAMES = 1000
 # Where APS tomography files keep the size of a pixel in the plane of the object. The size of a camera's own
 # pixel is not used: without the magnification it is off by the objective's factor.
 PIXEL_SIZE_PATHS = ("measurement/instrument/detection_system/objective/resolution",)
@@ -81,12 +87,12 @@ def scan_from_hdf5(path: Path, options: ReadOptions) -> Scan:
             name=read_text(file, "measurement/sample/name") or path.stem,
             notes=notes,
             **geometry,
-            **_knowledge(file, options),
+            **_knowledge(file, geometry["vol_geom"], options),
         )
 
 
 def _line_integrals(
-    exchange: h5py.Group, data: h5py.Dataset, options: ReadOptions
+    exchange: h5py.Group, data: StoredArray, options: ReadOptions
 ) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
     """Projections and validity in the order (rows, views, columns), read a block of views at a time."""
     views, rows, columns = data.shape
@@ -101,6 +107,8 @@ def _line_integrals(
                 "none",
                 "or pass input='transmission' or 'attenuation'",
             )
+        for frames in filter(None, (white, dark)):
+            _require_few(frames, data)
         no_light = None if dark is None else read_block(dark)
         flat, background = flat_and_dark(read_block(white), no_light, (rows, columns))
     projections = np.empty((rows, views, columns), np.float32)
@@ -117,7 +125,16 @@ def _line_integrals(
     return projections, valid, {"input": kind, "rays": rays}
 
 
-def _input_kind(data: h5py.Dataset, has_white: bool, stated: str | None) -> str:
+def _require_few(frames: StoredArray, data: StoredArray) -> None:
+    """Refuse open-beam or dark images of another size than the data, or unreasonably many, before they are read."""
+    if frames.ndim not in (2, 3) or frames.shape[-2:] != data.shape[1:]:
+        raise fail(frames.name, f"frames of shape {data.shape[1:]}, as the data", f"{frames.shape}")
+    most = max(_MOST_FRAMES, data.shape[0])
+    if frames.ndim == 3 and len(frames) > most:
+        raise fail(frames.name, f"at most {most} frames", f"{len(frames)}")
+
+
+def _input_kind(data: StoredArray, has_white: bool, stated: str | None) -> str:
     """What the numbers are: as the caller or the file states it, else as they look, with a warning."""
     if stated is not None:
         return stated
@@ -165,9 +182,13 @@ def _geometry(
         }
     if group is not None:
         proj_geom = vector_geometry(
-            _attribute(group, "astra_type"), read_numbers(group, "vectors"), projections.shape
+            _attribute(group, "astra_type"),
+            read_numbers(group, "vectors", most=_PER_VECTOR * projections.shape[1]),
+            projections.shape,
         )
-        vol_geom = volume_geometry(read_numbers(group, "volume_shape"), read_numbers(group, "volume_window"))
+        vol_geom = volume_geometry(
+            read_numbers(group, "volume_shape", (3,)), read_numbers(group, "volume_window", (6,))
+        )
         unit = options.settled_unit(_attribute(group, "unit"), "cm")
         return {"proj_geom": proj_geom, "vol_geom": dict(options.vol_geom or vol_geom), "unit": unit}
     rows, views, columns = projections.shape
@@ -196,6 +217,8 @@ def _angles(file: h5py.File, views: int, given: Any, centre: float | None) -> np
         if dataset is None:
             raise _missing_theta(views)
         in_radians = (text_attribute(dataset, "units") or "").lower().startswith("rad")
+        if dataset.shape != (views,):
+            raise fail("theta", f"shape {(views,)} (views,)", f"{dataset.shape}")
         given = read_block(dataset)
     theta = require_array("theta", given, 1).astype(np.float64)
     require_shape("theta", theta, (views,), "(views,)")
@@ -239,7 +262,7 @@ def _pixel_size(file: h5py.File, options: ReadOptions) -> tuple[float, str]:
     return 1.0, "pixel"
 
 
-def _knowledge(file: h5py.File, options: ReadOptions) -> dict[str, Any]:
+def _knowledge(file: h5py.File, vol_geom: dict[str, Any], options: ReadOptions) -> dict[str, Any]:
     """Spectrum, water correction, truth and metal mask, where the file has them."""
     known: dict[str, Any] = {"spectrum": options.spectrum, "water_correction": options.water_correction}
     group = find_group(file, "polysplat")
@@ -247,10 +270,12 @@ def _knowledge(file: h5py.File, options: ReadOptions) -> dict[str, Any]:
         return known
     known["spectrum"] = options.spectrum or read_spectrum(group)
     if options.water_correction is None and find_array(group, "water_correction") is not None:
-        known["water_correction"] = read_numbers(group, "water_correction")
+        known["water_correction"] = read_numbers(group, "water_correction", most=_MOST_COEFFICIENTS)
     truth = find_array(group, "truth")
     if options.vol_geom is None and truth is not None:
-        known["truth"], known["truth_energy_kev"] = truth[()], number_attribute(truth, "energy_kev")
+        shape = tuple(int(vol_geom[f"Grid{axis}Count"]) for axis in ("Slice", "Row", "Col"))
+        known["truth"] = read_numbers(group, "truth", shape)
+        known["truth_energy_kev"] = number_attribute(truth, "energy_kev")
         if find_array(group, "metal_mask") is not None:
-            known["metal_mask"] = read_numbers(group, "metal_mask")
+            known["metal_mask"] = read_numbers(group, "metal_mask", shape)
     return known
