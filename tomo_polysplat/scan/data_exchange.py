@@ -21,8 +21,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tomo_polysplat.checks import fail, require_array, require_choice, require_shape
+from tomo_polysplat.checks import fail, require_array, require_choice, require_number, require_shape
 from tomo_polysplat.scan.centre import estimate_centre
+from tomo_polysplat.scan.circular import parallel_geometry
 from tomo_polysplat.scan.defects import attenuation, flat_and_dark
 from tomo_polysplat.scan.dxchange_host import read_block
 from tomo_polysplat.scan.hdf5 import (
@@ -36,7 +37,6 @@ from tomo_polysplat.scan.hdf5 import (
     text_attribute,
 )
 from tomo_polysplat.scan.layout import (
-    parallel_geometry,
     spatial_geometry,
     vector_geometry,
     volume_geometry,
@@ -177,7 +177,15 @@ def _geometry(
         centre = estimate_centre(projections, theta, valid)
     notes |= {"centre": float(centre), "centre_estimated": options.centre is None}
     pixel_size, unit = _pixel_size(file, options)
-    proj_geom, vol_geom = parallel_geometry(theta, rows, columns, centre, pixel_size)
+    remedy = "in columns from the edge"
+    centre = require_number("centre", centre, above=0, at_most=columns, remedy=remedy)
+    # In degrees: those may be of many turns, where radians are looked at with suspicion.
+    proj_geom, vol_geom = parallel_geometry(
+        pixel=require_number("pixel_size", pixel_size, above=0),
+        degrees=np.rad2deg(theta),
+        detector=(rows, columns),
+        offset=((columns / 2 - centre) * pixel_size, 0.0),
+    )
     return {"proj_geom": proj_geom, "vol_geom": dict(options.vol_geom or vol_geom), "unit": unit}
 
 
