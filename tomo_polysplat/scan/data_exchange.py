@@ -8,7 +8,8 @@ in a group of our own, ``/polysplat``:
   ymin, ymax, zmin, zmax);
 - ``spectrum``: datasets ``energies`` (keV) and ``weights``;
 - ``truth`` (z, y, x) in 1/unit with attribute ``energy_kev``; ``metal_mask`` (z, y, x);
-  ``valid`` (like data); ``water_correction``, the coefficients of ``Scan``.
+  ``valid`` (like data); ``water_correction``, the coefficients of ``Scan``;
+- ``scanner``: JSON text of what a scanner's folder told (``Scan.notes["scanner"]``).
 
 The attribute ``input`` of ``/exchange/data`` tells counts, transmission and attenuation apart.
 """
@@ -24,18 +25,20 @@ import numpy as np
 from tomo_polysplat.checks import fail, require_array, require_choice, require_number, require_shape
 from tomo_polysplat.scan.centre import estimate_centre
 from tomo_polysplat.scan.circular import parallel_geometry
-from tomo_polysplat.scan.defects import attenuation, flat_and_dark
+from tomo_polysplat.scan.defects import flat_and_dark
 from tomo_polysplat.scan.dxchange_host import read_block
 from tomo_polysplat.scan.hdf5 import (
     find_array,
     find_group,
     number_attribute,
     opened,
+    read_json,
     read_numbers,
     read_spectrum,
     read_text,
     text_attribute,
 )
+from tomo_polysplat.scan.in_blocks import line_integrals
 from tomo_polysplat.scan.layout import (
     spatial_geometry,
     vector_geometry,
@@ -51,7 +54,6 @@ __all__ = ["scan_from_hdf5"]
 
 logger = logging.getLogger(__name__)
 
-BLOCK_BYTES = 2**27
 # Where APS tomography files keep the size of a pixel in the plane of the object. The size of a camera's own
 # pixel is not used: without the magnification it is off by the objective's factor.
 PIXEL_SIZE_PATHS = ("measurement/instrument/detection_system/objective/resolution",)
@@ -75,6 +77,8 @@ def scan_from_hdf5(path: Path, options: ReadOptions) -> Scan:
             valid &= stored.transpose(1, 0, 2)
         _report_defects(notes["rays"], valid)
         geometry = _geometry(file, projections, valid, options, notes)
+        if (scanner := read_json(file, "polysplat/scanner", None)) is not None:
+            notes["scanner"] = scanner
         return Scan(
             projections=projections,
             valid=None if valid.all() else valid,
@@ -89,7 +93,7 @@ def _line_integrals(
     exchange: h5py.Group, data: h5py.Dataset, options: ReadOptions
 ) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
     """Projections and validity in the order (rows, views, columns), read a block of views at a time."""
-    views, rows, columns = data.shape
+    rows, columns = data.shape[1:]
     white, dark = find_array(exchange, "data_white"), find_array(exchange, "data_dark")
     kind = _input_kind(data, white is not None, options.input)
     flat = background = None
@@ -103,17 +107,9 @@ def _line_integrals(
             )
         no_light = None if dark is None else read_block(dark)
         flat, background = flat_and_dark(read_block(white), no_light, (rows, columns))
-    projections = np.empty((rows, views, columns), np.float32)
-    valid = np.empty((rows, views, columns), bool)
-    rays: dict[str, int] = {}
-    block = max(1, BLOCK_BYTES // (rows * columns * 8))
-    for first in range(0, views, block):
-        part = slice(first, min(first + block, views))
-        values, usable, counts = attenuation(
-            read_block(data, part), kind, flat, background, options.saturation
-        )
-        projections[:, part], valid[:, part] = values.transpose(1, 0, 2), usable.transpose(1, 0, 2)
-        rays = {name: rays.get(name, 0) + count for name, count in counts.items()}
+    projections, valid, rays = line_integrals(
+        lambda part: read_block(data, part), data.shape, kind, flat, background, options.saturation
+    )
     return projections, valid, {"input": kind, "rays": rays}
 
 
