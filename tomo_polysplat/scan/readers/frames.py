@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from tomo_polysplat.checks import fail
 from tomo_polysplat.files import existing_file, require_plausible_size
 
-__all__ = ["ArrayFrames", "Frames", "TiffFrames", "in_order"]
+__all__ = ["ArrayFrames", "Frames", "TiffFrames"]
 
 
 class Frames(Protocol):
@@ -99,15 +98,6 @@ def _page(file: Path, number: int) -> Iterator[Any]:
             raise _unreadable(file, error) from error
         _require_picture(file, page)
         yield page
-
-
-def in_order(files: Iterable[Path]) -> list[Path]:
-    """By name, and by number where names differ in one: picture 10 comes after picture 9."""
-    return sorted(files, key=lambda file: [_part(text) for text in re.split(r"(\d+)", file.name.lower())])
-
-
-def _part(text: str) -> tuple[int, str]:
-    return (int(text), "") if text.isdecimal() else (-1, text)
 
 
 def _unreadable(file: Path, error: Exception) -> Exception:

@@ -14,6 +14,8 @@ from tomo_polysplat.checks import did_you_mean, fail, require_array, require_cho
 from tomo_polysplat.files import existing_file
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
 from tomo_polysplat.scan.readers.filter_text import filters_of
+from tomo_polysplat.scan.readers.frames import TiffFrames
+from tomo_polysplat.scan.readers.picture_names import named_files
 from tomo_polysplat.scan.reading import INPUT_KINDS, ReadOptions
 from tomo_polysplat.units import LENGTH_UNITS
 
@@ -100,7 +102,7 @@ def with_options(stated: Mapping[str, Any], options: ReadOptions) -> dict[str, A
 
 
 def stated_over(told: Acquisition, stated: Mapping[str, Any], folder: Path) -> Acquisition:
-    """What a reader was told, with what the user states put in its place; pictures are not looked at here."""
+    """What a reader was told, with what the user states put in its place."""
     tube = Tube(
         _number(stated, "kvp", told.tube.kvp),
         told.tube.filters if "filter" not in stated else _filters(stated["filter"]),
@@ -110,6 +112,9 @@ def stated_over(told: Acquisition, stated: Mapping[str, Any], folder: Path) -> A
         told = replace(told, setup=_setup(told.setup, stated, folder, told.frames.shape[0]))
     elif given := {"source_object", "source_detector", "pixel", "offset", "degrees", "arc"} & stated.keys():
         raise fail(sorted(given)[0], "nothing, as the file has the geometry of each view", "a value")
+    for name in ("flats", "darks"):
+        if name in stated:
+            told = replace(told, **{name: TiffFrames(named_files(folder, stated[name], name))})  # type: ignore[arg-type]
     return replace(
         told,
         tube=tube,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -12,19 +11,13 @@ import numpy as np
 
 from tomo_polysplat.checks import fail
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup
-from tomo_polysplat.scan.readers.frames import TiffFrames, in_order
-from tomo_polysplat.scan.readers.stated import KEYS, read_toml, require_known, stated_over
+from tomo_polysplat.scan.readers.frames import TiffFrames
+from tomo_polysplat.scan.readers.picture_names import TIFF_SUFFIXES, has_word, named_files, tiffs_in
+from tomo_polysplat.scan.readers.stated import read_toml, require_known, stated_over
 
-__all__ = ["read", "recognises", "tiffs_in"]
+__all__ = ["read", "recognises"]
 
 KIND = "stack of TIFFs"
-_SUFFIXES = (".tif", ".tiff")
-# Words in a name that make a picture, or a folder of them, a flat or a dark one, or one with the object.
-_WORDS = {
-    "flats": ("flat", "flats", "white", "whites", "open", "bright", "ref", "gain", "ff", "i0"),
-    "darks": ("dark", "darks", "dk", "df", "background"),
-    "projections": ("projections", "projection", "proj", "projs", "data", "tomo", "images", "raw"),
-}
 _REMEDY = (
     "pass scanner={'source_object': ..., 'source_detector': ..., 'pixel': ...} in mm (--sod, --sdd, --pixel), write "
     "them into a file scan.toml in the folder, or say that beam = 'parallel'"
@@ -34,13 +27,8 @@ _REMEDY = (
 def recognises(path: Path) -> bool:
     """Whether it is a TIFF, a TOML file, or a folder with TIFFs in it or in folders of it."""
     if path.is_file():
-        return path.suffix.lower() in (*_SUFFIXES, ".toml")
+        return path.suffix.lower() in (*TIFF_SUFFIXES, ".toml")
     return bool(tiffs_in(path)) or any(tiffs_in(folder) for folder in path.iterdir() if folder.is_dir())
-
-
-def tiffs_in(folder: Path) -> list[Path]:
-    """The TIFF files of a folder, in order."""
-    return in_order(file for file in folder.iterdir() if file.suffix.lower() in _SUFFIXES and file.is_file())
 
 
 def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
@@ -48,14 +36,14 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     folder = path if path.is_dir() else path.parent
     written, other = _written(path)
     known = written | require_known(stated, "scanner")
-    if path.suffix.lower() in _SUFFIXES and path.is_file():
+    if path.suffix.lower() in TIFF_SUFFIXES and path.is_file():
         known.setdefault("projections", path)
     files = _sorted_out(folder, known)
     frames = TiffFrames(files["projections"])
     views = frames.shape[0]
-    flats, darks = (TiffFrames(files[name]) if files[name] else None for name in ("flats", "darks"))
+    known |= {name: files[name] for name in ("flats", "darks") if files[name]}
     setup = Setup(np.arange(views) * (360.0 / views), np.nan)
-    told = Acquisition(KIND, frames, setup, folder.name, flats=flats, darks=darks, other=other)
+    told = Acquisition(KIND, frames, setup, folder.name, other=other)
     return _guessed(stated_over(told, known, folder), known)
 
 
@@ -83,19 +71,20 @@ def _is_known(key: str) -> bool:
 
 def _sorted_out(folder: Path, known: Mapping[str, Any]) -> dict[str, list[Path]]:
     """Files of the projections, flats and darks: as stated, else by the words in their names."""
-    files = {name: _named(folder, known[name], name) for name in _WORDS if name in known}
+    kinds = ("projections", "flats", "darks")
+    files = {name: named_files(folder, known[name], name) for name in kinds if name in known}
     taken = {file for some in files.values() for file in some}
     inside = [inner for inner in sorted(folder.iterdir()) if inner.is_dir()]
     for name in ("flats", "darks"):
         if name not in files:
-            matching = [file for file in tiffs_in(folder) if _has_word(file.stem, name) and file not in taken]
+            matching = [file for file in tiffs_in(folder) if has_word(file.stem, name) and file not in taken]
             for inner in inside:
-                matching += tiffs_in(inner) if _has_word(inner.name, name) else []
+                matching += tiffs_in(inner) if has_word(inner.name, name) else []
             files[name] = matching
             taken |= set(matching)
     if "projections" not in files:
         left = [file for file in tiffs_in(folder) if file not in taken]
-        folders = [inner for inner in inside if _has_word(inner.name, "projections")]
+        folders = [inner for inner in inside if has_word(inner.name, "projections")]
         if not left and len(folders) == 1:
             left = tiffs_in(folders[0])
         if not left:
@@ -103,27 +92,6 @@ def _sorted_out(folder: Path, known: Mapping[str, Any]) -> dict[str, list[Path]]
             raise fail("path", "TIFF pictures of an object", f"none in {folder}", remedy)
         files["projections"] = left
     return files
-
-
-def _named(folder: Path, names: Any, argument: str) -> list[Path]:
-    """Files of a folder, a file or a pattern, as seen from the scan's folder, else from where we are."""
-    texts = [names] if isinstance(names, (str, Path)) else list(names)
-    files: list[Path] = []
-    for text in texts:
-        here = next((place for place in (folder / text, Path(text)) if place.exists()), None)
-        if here is not None:
-            files += tiffs_in(here) if here.is_dir() else [here]
-            continue
-        pattern = str(text)
-        files += in_order(folder.glob(pattern)) if not Path(pattern).is_absolute() else []
-    if not files:
-        raise fail(argument, KEYS[argument], f"{names}, of which there is none in {folder}")
-    return files
-
-
-def _has_word(name: str, kind: str) -> bool:
-    words = re.split(r"[^a-z0-9]+|(?<=[a-z])(?=[0-9])", name.lower())
-    return bool(set(words) & set(_WORDS[kind]))
 
 
 def _guessed(told: Acquisition, known: Mapping[str, Any]) -> Acquisition:

@@ -7,12 +7,12 @@ from pathlib import Path
 
 from tomo_polysplat.checks import fail, require_choice
 from tomo_polysplat.scan.scan import Scan
-from tomo_polysplat.simulate.folders import tiffs
+from tomo_polysplat.simulate.folders import skyscan, tiffs
 from tomo_polysplat.simulate.folders.scene import marked_scan, pictures_of
 
 __all__ = ["KINDS", "write_folder"]
 
-KINDS = {"tiffs": tiffs.write}
+KINDS = {"tiffs": tiffs.write, "skyscan": skyscan.write}
 
 
 def write_folder(kind: str, folder: str | os.PathLike, scan: Scan | None = None) -> Scan:
