@@ -5,7 +5,7 @@ import pytest
 from small_scans import fan, reconstruct
 
 import tomo_polysplat as tps
-from tomo_polysplat.scan.layout import parallel_geometry
+from tomo_polysplat.scan.circular import parallel_geometry
 
 COLUMNS, VIEWS = 49, 60
 # x, y and deviation in pixels, attenuation in 1/pixel.
@@ -15,7 +15,7 @@ BLOBS = [(5.0, 3.0, 4.0, 0.05), (-8.0, -2.0, 3.0, 0.04), (1.0, -9.0, 5.0, 0.03)]
 def smooth_scan(rows):
     """Projections (rows, views, columns) and true slices, ascending in z by a fifth."""
     theta = np.linspace(0, np.pi, VIEWS, endpoint=False)
-    proj_geom, vol_geom = parallel_geometry(theta, rows, COLUMNS, COLUMNS / 2, 1.0)
+    proj_geom, vol_geom = parallel_geometry(pixel=1.0, radians=theta, detector=(rows, COLUMNS))
     s, height = np.arange(COLUMNS) + 0.5 - COLUMNS / 2, 1 + 0.2 * np.arange(rows)
     y, x = np.meshgrid(s, s, indexing="ij")
     rays, slices = np.zeros((VIEWS, COLUMNS)), np.zeros((COLUMNS, COLUMNS))

@@ -8,7 +8,8 @@ in a group of our own, ``/polysplat``:
   ymin, ymax, zmin, zmax);
 - ``spectrum``: datasets ``energies`` (keV) and ``weights``;
 - ``truth`` (z, y, x) in 1/unit with attribute ``energy_kev``; ``metal_mask`` (z, y, x);
-  ``valid`` (like data); ``water_correction``, the coefficients of ``Scan``.
+  ``valid`` (like data); ``water_correction``, the coefficients of ``Scan``;
+- ``scanner``: JSON text of what a scanner's folder told (``Scan.notes["scanner"]``).
 
 The attribute ``input`` of ``/exchange/data`` tells counts, transmission and attenuation apart.
 """
@@ -21,22 +22,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tomo_polysplat.checks import fail, require_array, require_choice, require_shape
+from tomo_polysplat.checks import fail, require_array, require_choice, require_number, require_shape
 from tomo_polysplat.scan.centre import estimate_centre
-from tomo_polysplat.scan.defects import attenuation, flat_and_dark
+from tomo_polysplat.scan.circular import parallel_geometry
+from tomo_polysplat.scan.defects import flat_and_dark
 from tomo_polysplat.scan.dxchange_host import read_block
 from tomo_polysplat.scan.hdf5 import (
     find_array,
     find_group,
     number_attribute,
     opened,
+    read_json,
     read_numbers,
     read_spectrum,
     read_text,
     text_attribute,
 )
+from tomo_polysplat.scan.in_blocks import line_integrals
 from tomo_polysplat.scan.layout import (
-    parallel_geometry,
     spatial_geometry,
     vector_geometry,
     volume_geometry,
@@ -53,7 +56,6 @@ __all__ = ["scan_from_hdf5"]
 
 logger = logging.getLogger(__name__)
 
-BLOCK_BYTES = 2**27
 # Of the longest kind of vectors, and of a polynomial.
 _PER_VECTOR, _MOST_COEFFICIENTS = 13, 100
 # Open-beam or dark images beside fewer views than that.
@@ -81,6 +83,8 @@ def scan_from_hdf5(path: Path, options: ReadOptions) -> Scan:
             valid &= stored.transpose(1, 0, 2)
         _report_defects(notes["rays"], valid)
         geometry = _geometry(file, projections, valid, options, notes)
+        if (scanner := read_json(file, "polysplat/scanner", None)) is not None:
+            notes["scanner"] = scanner
         return Scan(
             projections=projections,
             valid=None if valid.all() else valid,
@@ -95,7 +99,7 @@ def _line_integrals(
     exchange: h5py.Group, data: StoredArray, options: ReadOptions
 ) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
     """Projections and validity in the order (rows, views, columns), read a block of views at a time."""
-    views, rows, columns = data.shape
+    rows, columns = data.shape[1:]
     white, dark = find_array(exchange, "data_white"), find_array(exchange, "data_dark")
     kind = _input_kind(data, white is not None, options.input)
     flat = background = None
@@ -111,17 +115,9 @@ def _line_integrals(
             _require_few(frames, data)
         no_light = None if dark is None else read_block(dark)
         flat, background = flat_and_dark(read_block(white), no_light, (rows, columns))
-    projections = np.empty((rows, views, columns), np.float32)
-    valid = np.empty((rows, views, columns), bool)
-    rays: dict[str, int] = {}
-    block = max(1, BLOCK_BYTES // (rows * columns * 8))
-    for first in range(0, views, block):
-        part = slice(first, min(first + block, views))
-        values, usable, counts = attenuation(
-            read_block(data, part), kind, flat, background, options.saturation
-        )
-        projections[:, part], valid[:, part] = values.transpose(1, 0, 2), usable.transpose(1, 0, 2)
-        rays = {name: rays.get(name, 0) + count for name, count in counts.items()}
+    projections, valid, rays = line_integrals(
+        lambda part: read_block(data, part), data.shape, kind, flat, background, options.saturation
+    )
     return projections, valid, {"input": kind, "rays": rays}
 
 
@@ -198,7 +194,15 @@ def _geometry(
         centre = estimate_centre(projections, theta, valid)
     notes |= {"centre": float(centre), "centre_estimated": options.centre is None}
     pixel_size, unit = _pixel_size(file, options)
-    proj_geom, vol_geom = parallel_geometry(theta, rows, columns, centre, pixel_size)
+    remedy = "in columns from the edge"
+    centre = require_number("centre", centre, above=0, at_most=columns, remedy=remedy)
+    # In degrees: those may be of many turns, where radians are looked at with suspicion.
+    proj_geom, vol_geom = parallel_geometry(
+        pixel=require_number("pixel_size", pixel_size, above=0),
+        degrees=np.rad2deg(theta),
+        detector=(rows, columns),
+        offset=((columns / 2 - centre) * pixel_size, 0.0),
+    )
     return {"proj_geom": proj_geom, "vol_geom": dict(options.vol_geom or vol_geom), "unit": unit}
 
 
