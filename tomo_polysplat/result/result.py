@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,6 +16,9 @@ from tomo_polysplat.physics.materials import require_energies
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.units import cm_per
+
+if TYPE_CHECKING:
+    from tomo_polysplat.scan.scan import Scan
 
 __all__ = ["Result"]
 
@@ -241,19 +244,21 @@ class Result:
         self,
         path: str | os.PathLike,
         *,
+        scan: Scan | None = None,
         truth: np.ndarray | None = None,
         metal_mask: np.ndarray | None = None,
         overwrite: bool = False,
     ) -> None:
-        """Write one self-contained HTML page: slices, speed against error, the plan, the
-        settings, and what it was made from and with.
+        """Write one self-contained HTML page for a colleague: a verdict, slices, residuals, decisions, the record.
 
         Parameters
         ----------
         path : str or path
+        scan : Scan, optional
+            What this was made from: the page then has FDK beside the result, and how well the rays are explained in
+            units of their noise, by view and by pixel. It takes the time of FDK and of one look at 180 views.
         truth, metal_mask : array shaped like :attr:`volume`, or None
-            True attenuation in 1/`unit` at :attr:`energy_kev`, and voxels of metal, for an error map and
-            figures of merit.
+            True attenuation in 1/`unit` at :attr:`energy_kev`, and voxels of metal, for figures of merit.
         overwrite : bool
             Whether an existing file is replaced.
 
@@ -262,11 +267,11 @@ class Result:
         FileExistsError
             If the file exists and `overwrite` is false.
         ValueError
-            If truth or mask have another shape than the volume.
+            If truth or mask have another shape than the volume, or the scan another volume.
         """
         from tomo_polysplat.report.html import write_report
 
-        write_report(self, path, truth=truth, metal_mask=metal_mask, overwrite=overwrite)
+        write_report(self, path, scan=scan, truth=truth, metal_mask=metal_mask, overwrite=overwrite)
 
     def __repr__(self) -> str:
         energy = "unknown energy" if self.energy_kev is None else f"{self.energy_kev:.1f} keV"
