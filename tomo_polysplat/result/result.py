@@ -273,6 +273,42 @@ class Result:
 
         write_report(self, path, scan=scan, truth=truth, metal_mask=metal_mask, overwrite=overwrite)
 
+    def show(
+        self,
+        others: Mapping[str, Any] | Result | np.ndarray | None = None,
+        *,
+        window: tuple[float, float] | None = None,
+    ) -> Any:
+        """Linked slices in a notebook, with sliders, one window for all volumes, a difference, and a scale bar.
+
+        Parameters
+        ----------
+        others : Result, array or mapping of names to these, optional
+            What is shown below this result, such as ``{"FDK": tps.baselines.fdk(scan)}``; shaped like :attr:`volume`.
+        window : pair of float, optional
+            Attenuation in 1/`unit` that is black, and white, to begin with.
+
+        Returns
+        -------
+        ipywidgets.Widget
+            Shown where it is the last line of a cell.
+
+        Raises
+        ------
+        ImportError
+            Without ipywidgets: ``pip install "tomo-polysplat[notebook]"``.
+        ValueError
+            For volumes of another shape.
+        """
+        from tomo_polysplat.report.show import show
+
+        return show(self, others, window)
+
+    def _repr_html_(self) -> str:
+        from tomo_polysplat.report.show import snippet
+
+        return snippet(self)
+
     def __repr__(self) -> str:
         energy = "unknown energy" if self.energy_kev is None else f"{self.energy_kev:.1f} keV"
         kind = "monochromatic" if self.materials is None else "polychromatic"
