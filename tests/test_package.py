@@ -37,7 +37,7 @@ LAYERS = (
     ("render",),
     ("fit",),
     ("result", "report"),
-    ("reconstruction",),
+    ("reconstruction", "viewer"),
     ("baselines", "bench", "cli", "doctor", "plugins"),
 )
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

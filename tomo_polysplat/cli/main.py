@@ -9,12 +9,12 @@ from collections.abc import Sequence
 
 import tomo_polysplat
 from tomo_polysplat.checks import visible
-from tomo_polysplat.cli import bench, check, demo, doctor, recon, simulate
+from tomo_polysplat.cli import bench, check, demo, doctor, recon, simulate, view
 from tomo_polysplat.cli.options import INTERRUPTED
 
 __all__ = ["main"]
 
-COMMANDS = (demo, recon, simulate, check, bench, doctor)
+COMMANDS = (demo, recon, view, simulate, check, bench, doctor)
 BAD_INPUT, FAILED = 2, 1
 
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from tomo_polysplat.result.result import Result
     from tomo_polysplat.scan.scan import Scan
 
-__all__ = ["image", "page", "write_report"]
+__all__ = ["image", "page", "title_of", "told", "write_report"]
 
 logger = logging.getLogger(__name__)
 
@@ -50,25 +50,48 @@ def write_report(
     residuals = None if scan is None else residuals_of(result, scan)
     shown = [] if scan is None else [_beside(scan)]
     shown += [(full_name(OURS), volume), *([] if true is None else [("truth", true)])]
-    title = _name_of(result, scan)
+    title = title_of(result, scan)
     body = [
         f"<h1>{text(title)}</h1>",
         f'<p class="note">{text(_about(result))}</p>',
-        f'<div class="verdict">{"".join(f"<p>{text(words)}</p>" for words in verdict(result, residuals))}</div>',
+        *_verdict(result, residuals),
         *_slices(result, shown, true, metal),
         *_errors(result, volume, true, metal),
         *_rays(residuals),
         "<h2>What the voxels hold</h2>",
         image(png_bytes(histogram_figure(result)), "histogram of the attenuation with the materials named"),
-        "<h2>Speed against error</h2>",
-        image(png_bytes(history_figure(result.history)), "error of the projections against seconds"),
+        *_speed(result),
         *_decided(result),
         *_folded(result),
     ]
     write_text(path, page(f"{title} – tomo-polysplat", body), overwrite=overwrite)
 
 
-def _name_of(result: Result, scan: Scan | None) -> str:
+def told(result: Result, residuals: Residuals | None) -> list[str]:
+    """Pieces of HTML on how well the rays are explained and what was decided, without slices and for another page."""
+    return [
+        f'<p class="note">{text(_about(result))}</p>',
+        *_verdict(result, residuals),
+        *_rays(residuals),
+        *_speed(result),
+        *_decided(result),
+    ]
+
+
+def _verdict(result: Result, residuals: Residuals | None) -> list[str]:
+    sentences = "".join(f"<p>{text(words)}</p>" for words in verdict(result, residuals))
+    return [f'<div class="verdict">{sentences}</div>']
+
+
+def _speed(result: Result) -> list[str]:
+    figure = history_figure(result.history)
+    return [
+        "<h2>Speed against error</h2>",
+        image(png_bytes(figure), "error of the projections against seconds"),
+    ]
+
+
+def title_of(result: Result, scan: Scan | None) -> str:
     """The scan's name, where somebody has told it."""
     told = result.provenance.get("scan") or ("" if scan is None else scan.name)
     return str(told or "Reconstruction")

@@ -97,7 +97,9 @@ def _odd_pixels(residuals: Residuals) -> tuple[float, str]:
         known, residuals.bias - median_filter(np.where(known, residuals.bias, 0.0), (1, _BESIDE)), 0.0
     )
     spread = 1.4826 * float(np.median(np.abs(alone[known])))
-    odd = np.abs(alone) > max(6 * spread, _ODD_PIXEL / residuals.block)
+    # The same in every view: by far more than it varies from view to view.
+    varies = np.sqrt(np.maximum(residuals.by_pixel**2 - residuals.bias**2, 0.0))
+    odd = known & (np.abs(alone) > np.maximum(_ODD_PIXEL * varies, 6 * spread))
     rows, columns = np.nonzero(odd)
     if not len(rows):
         return 0.0, ""
