@@ -2,8 +2,8 @@
 
     python scripts/view_speed.py [VOXELS] [SCREENSHOT]
 
-Needs ``pip install playwright`` and Chromium (``playwright install chromium``, or the system's). Prints the milliseconds
-from a slider's event to the picture, and fails where the page has asked for anything from outside.
+Needs ``pip install playwright`` and Chromium (``playwright install chromium``, or the system's). Prints the
+milliseconds from a slider's event to the picture, and fails where the page has asked for anything from outside.
 """
 
 from __future__ import annotations

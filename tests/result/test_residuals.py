@@ -67,6 +67,11 @@ def ball(plan=None):
     return Result(np.full((1, 7, 11, 9), 0.01), grid, gaussians=gaussians, plan=plan or {})
 
 
+def ball_of(result):
+    result.gaussians = ball().gaussians
+    return result
+
+
 def test_the_right_model_leaves_noise():
     found = residuals_of(ball(), scan_of(line_integrals()))
     # Read off few rays, the photons are uncertain by some per cent.
@@ -133,8 +138,18 @@ def test_rays_that_are_not_valid_do_not_count():
 
 def test_another_scan_is_refused():
     other = Result(np.zeros((1, 3, 4, 5)), VolumeGrid((3, 4, 5), (-1, -1, -1), (1, 1, 1)))
-    with pytest.raises(ValueError, match="scan: expected the scan of the result"):
+    with pytest.raises(ValueError, match="with its Gaussians"):
         residuals_of(other, scan_of(line_integrals()))
+    with pytest.raises(ValueError, match="scan: expected the scan of the result"):
+        residuals_of(ball_of(other), scan_of(line_integrals()))
+
+
+def test_without_any_gaussian_all_is_residual():
+    values = np.full((VIEWS, ROWS, COLUMNS), 0.5)
+    nothing = ball()
+    nothing.gaussians = {name: part[:0] for name, part in nothing.gaussians.items()}
+    found = residuals_of(nothing, scan_of(values))
+    assert found.rms == pytest.approx(0.5 * found.photons**0.5, rel=0.01)
 
 
 def test_the_page_of_a_scan_has_fdk_and_the_residuals(tmp_path):

@@ -8,11 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tomo_polysplat.checks import fail, visible
+from tomo_polysplat.files import existing_file
 
 if TYPE_CHECKING:
     from tomo_polysplat.result.result import Result
     from tomo_polysplat.viewer.volumes import Shown
 
+# How such a file begins.
+_HDF5 = b"\x89HDF\r\n\x1a\n"
 NAME = "view"
 HELP = "look at results in the browser: linked slices, before and after, residuals, what was decided"
 
@@ -63,7 +66,7 @@ def shown_by(arguments: argparse.Namespace) -> Shown:
     if scan is not None:
         from tomo_polysplat.report.classical import standard_volume
 
-        residuals = residuals_of(result, scan)
+        residuals = residuals_of(result, scan) if result.gaussians else None
         others = dict([standard_volume(scan)]) | others
         others |= {} if scan.truth is None else {"truth": scan.truth}
     return shown_of(result, others, title_of(result, scan), "\n".join(told(result, residuals)))
@@ -72,6 +75,11 @@ def shown_by(arguments: argparse.Namespace) -> Shown:
 def _loaded(path: str) -> Result:
     from tomo_polysplat.result.result import Result
 
+    with open(existing_file(path, "RESULT"), "rb") as stream:
+        start = stream.read(8)
+    if start != _HDF5:
+        remedy = "`recon SCAN -o RESULT.h5` writes what is shown here; look at a TIFF in ImageJ"
+        raise fail("RESULT", "the .h5 that recon has written", f"{path}, a file of another kind", remedy)
     return Result.load(path)
 
 

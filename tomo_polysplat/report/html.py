@@ -47,7 +47,7 @@ def write_report(
     volume = _spatial(result, result.volume)
     true = None if truth is None else _spatial(result, truth)
     metal = None if metal_mask is None else _spatial(result, metal_mask).astype(bool)
-    residuals = None if scan is None else residuals_of(result, scan)
+    residuals = None if scan is None or not result.gaussians else residuals_of(result, scan)
     shown = [] if scan is None else [_beside(scan)]
     shown += [(full_name(OURS), volume), *([] if true is None else [("truth", true)])]
     title = title_of(result, scan)

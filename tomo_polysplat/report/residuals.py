@@ -106,8 +106,10 @@ def residuals_of(
     Raises
     ------
     ValueError
-        If the scan has another volume or unit than the result.
+        If the scan has another volume or unit than the result, or this has no Gaussians.
     """
+    if not result.gaussians:
+        raise fail("result", "one with its Gaussians", "a volume alone")
     if scan.volume_shape != result.grid.shape or scan.unit != result.unit:
         got = f"a volume of {scan.volume_shape} in {scan.unit}"
         wanted = f"the scan of the result, {result.grid.shape} in {result.unit}"
