@@ -38,7 +38,7 @@ LAYERS = (
     ("fit",),
     ("plan",),
     ("result", "report"),
-    ("reconstruction",),
+    ("reconstruction", "viewer"),
     ("baselines", "bench", "cli", "doctor", "plugins"),
 )
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

@@ -126,7 +126,9 @@ def load_hdf5(path: str | os.PathLike) -> Result:
     with opened(Path(path)) as file:
         group = find_group(file, "polysplat")
         if group is None or number_attribute(group, "format") is None:
-            raise fail("path", "a file written by Result.save", f"{path} without /polysplat and its format")
+            remedy = "a scan is reconstructed first, by `tomo-polysplat recon SCAN -o RESULT.h5`"
+            got = f"{path} without /polysplat and its format"
+            raise fail("path", "a file written by Result.save", got, remedy)
         if (version := number_attribute(group, "format")) != FORMAT:
             raise fail("path", f"a file of format {FORMAT}", f"format {version:g}", "update tomo-polysplat")
         basis = read_numbers(group, "basis")

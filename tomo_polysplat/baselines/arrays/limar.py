@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from tomo_polysplat.baselines.fdk import fdk
-from tomo_polysplat.baselines.metal_trace import find_metal, replace_trace
-from tomo_polysplat.baselines.water_bhc import water_corrected
+from tomo_polysplat.baselines.arrays.fdk import fdk
+from tomo_polysplat.baselines.arrays.metal_trace import find_metal, replace_trace
+from tomo_polysplat.baselines.arrays.water_bhc import water_corrected
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.scan.defects import fill_invalid
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from tomo_polysplat.baselines.voxel_model import VoxelModel, start_voxels
+from tomo_polysplat.baselines.arrays.voxel_model import VoxelModel, start_voxels
 from tomo_polysplat.fit.loss import misfit, total_variation
 from tomo_polysplat.fit.problem import OPAQUE
 from tomo_polysplat.fit.rays import Rays

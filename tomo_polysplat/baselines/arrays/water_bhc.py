@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tomo_polysplat.baselines.fdk import fdk
+from tomo_polysplat.baselines.arrays.fdk import fdk
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.water import water_linearised
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid

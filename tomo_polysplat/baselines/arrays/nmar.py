@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from tomo_polysplat.baselines.fdk import fdk
-from tomo_polysplat.baselines.metal_trace import MetalTrace, find_metal, forward_project, replace_trace
-from tomo_polysplat.baselines.water_bhc import water_corrected
+from tomo_polysplat.baselines.arrays.fdk import fdk
+from tomo_polysplat.baselines.arrays.metal_trace import MetalTrace, find_metal, forward_project, replace_trace
+from tomo_polysplat.baselines.arrays.water_bhc import water_corrected
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.scan.defects import fill_invalid
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
@@ -30,7 +30,7 @@ def nmar(
     """Normalised metal artefact reduction (Meyer et al. 2010, doi:10.1118/1.3484090).
 
     The prior is the interpolated reconstruction, with air and soft matter made uniform. Bone stays as it is.
-    Parameters and result are those of :func:`tomo_polysplat.baselines.limar.limar`.
+    Parameters and result are those of :func:`tomo_polysplat.baselines.arrays.limar.limar`.
     """
     corrected = water_corrected(projections, spectrum)
     metal = find_metal(corrected, geometry, grid, level=metal_level, device=device)
