@@ -22,7 +22,7 @@ from tomo_polysplat.plan.decisions.light import Light
 from tomo_polysplat.plan.decisions.optical_depth import OpticalDepth
 from tomo_polysplat.plan.decisions.passes import Passes
 from tomo_polysplat.plan.decisions.pixel_rays import PixelRays
-from tomo_polysplat.plan.decisions.scatter import ScatterSearch
+from tomo_polysplat.plan.decisions.scatter import Scattering
 from tomo_polysplat.plan.decisions.seed_spacing import SeedSpacing
 from tomo_polysplat.plan.decisions.smallest_scale import SmallestScale
 from tomo_polysplat.plan.decisions.soft_reference import SoftReference
@@ -55,7 +55,7 @@ ORDER: tuple[type[Decision], ...] = (
     CloserSeeds,
     Growth,
     TvFactor,
-    ScatterSearch,
+    Scattering,
     PixelRays,
     Light,
 )

@@ -38,7 +38,10 @@ _STEPS = 240
 
 
 class Agent(Decision):
-    """Which settings the seeds start from: a dict of those that change."""
+    """What does a dense material that was named start as?
+
+    A dict of the settings that change for the seeds.
+    """
 
     name = "agent"
     needs = (SoftReference,)

@@ -18,7 +18,10 @@ _CLOSER, _SMALL_CLOUD = 1.15, 6000
 
 
 class CloserSeeds(Decision):
-    """Distance of those seeds in voxels; 0 leaves all as far apart as they are."""
+    """Do thin seeds of a small cloud lie closer?
+
+    Their distance in voxels; 0 leaves all as far apart as they are.
+    """
 
     name = "closer_seeds"
     needs = (Edges, SeedSpacing)

@@ -14,7 +14,10 @@ __all__ = ["Curves"]
 
 
 class Curves(Decision):
-    """Three, or the first alone, as of one energy."""
+    """How many material curves does the model mix?
+
+    Three, or the first alone.
+    """
 
     name = "curves"
     needs = (SoftReference,)

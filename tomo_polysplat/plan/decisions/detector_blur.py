@@ -15,7 +15,10 @@ __all__ = ["DetectorBlur"]
 
 
 class DetectorBlur(Decision):
-    """Where the blur is to be fitted, metal must show that edges are sharp; see ``physics.detector_blur``."""
+    """Are rays seen through a blur of the detector?
+
+    Where the blur is to be fitted, metal must show that edges are sharp; see ``physics.detector_blur``.
+    """
 
     name = "detector_blur"
     needs = (SoftReference,)

@@ -50,7 +50,10 @@ _FEWEST_PASSES = 6.0
 
 
 class Edges(Decision):
-    """ "sharp" where seeds are thin across edges however close they are, else "blurred"."""
+    """Are the object's edges as sharp as the detector could show?
+
+    "sharp": seeds are thin across edges however close they are. "blurred": they are not.
+    """
 
     name = "edges"
     needs = (Agent, Passes, SeedSpacing)

@@ -14,7 +14,10 @@ __all__ = ["FinerSeeds"]
 
 
 class FinerSeeds(Decision):
-    """The share; see ``model.seed``."""
+    """Which share of the seeds lies twice as close as the rest?
+
+    See ``model.seed``.
+    """
 
     name = "finer_seeds"
     needs = (SeedSpacing,)

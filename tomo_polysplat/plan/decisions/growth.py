@@ -62,7 +62,10 @@ _MEDIAN_SQUARE = 0.4549
 
 
 class Growth(Decision):
-    """So many times as many Gaussians as seeds there may be in the end, by splitting; 1: no more of them."""
+    """Does the object have more detail than its seeds can show?
+
+    There may be so many times as many Gaussians as seeds in the end, by splitting; 1: no more of them.
+    """
 
     name = "growth"
     needs = (Agent, Passes, SeedSpacing, Edges, CloserSeeds, Curves)

@@ -46,7 +46,10 @@ _CERTAIN = 2.0
 
 
 class Light(Decision):
-    """What light matter is: "soft" matter that is less dense, or "fat"."""
+    """Is light soft matter fat, or thin water?
+
+    "fat" or "soft".
+    """
 
     name = "light"
     needs = (SoftReference, Curves, Passes)

@@ -16,7 +16,10 @@ __all__ = ["OpticalDepth"]
 
 
 class OpticalDepth(Decision):
-    """-log(I/I0) of a typical ray, as if nothing were denser than the soft reference; see `plan.depth`."""
+    """How much light does soft matter take from a typical ray?
+
+    -log(I/I0), as if nothing were denser than the soft reference; see `plan.depth`.
+    """
 
     name = "optical_depth"
     needs = (SoftReference, SupportLevel)

@@ -33,7 +33,10 @@ _LONGER, _LONGER_PLANAR = (2.0, 18_000), (2.0, 36_000)
 
 
 class Passes(Decision):
-    """Passes over the views at most; the held-out rays may end the run before."""
+    """How often is every view used?
+
+    At most: the held-out rays may end the run before.
+    """
 
     name = "passes"
     needs = (SeedSpacing,)

@@ -43,7 +43,10 @@ _SEEN = 0.05
 
 
 class PixelRays(Decision):
-    """Rays a pixel and axis over which the light is averaged; 1: infinitely thin ones."""
+    """Do pixels average the light over their area?
+
+    Rays a pixel and axis over which it is averaged; 1: infinitely thin rays.
+    """
 
     name = "pixel_rays"
     needs = (Passes,)

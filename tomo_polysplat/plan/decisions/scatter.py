@@ -22,7 +22,7 @@ from tomo_polysplat.plan.ray_sample import RaySample, sample_rays
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.initial import FEW_VIEWS
 
-__all__ = ["ScatterSearch"]
+__all__ = ["Scattering"]
 
 logger = logging.getLogger(__name__)
 
@@ -39,8 +39,11 @@ _ASKED = "calibrate=True fits it all the same"
 _SHORT = 480
 
 
-class ScatterSearch(Decision):
-    """What of the light is scattered: the record's parts of `plan.calibrated_physics.with_fitted`, empty for none."""
+class Scattering(Decision):
+    """Do the rays hold scattered light?
+
+    What was fitted, as `plan.calibrated_physics.with_fitted` takes it; empty for none.
+    """
 
     name = "scatter"
     when = When.DURING

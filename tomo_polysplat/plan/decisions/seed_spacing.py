@@ -27,7 +27,10 @@ _MOST_PER_SURFACE, _NOT_TOO_MANY = 1.7, 60_000
 
 
 class SeedSpacing(Decision):
-    """Distance of the seeds in voxels (the shortest edge)."""
+    """How far from each other are Gaussians seeded?
+
+    In voxels (the shortest edge).
+    """
 
     name = "seed_spacing"
     needs = (SupportLevel,)

@@ -17,7 +17,10 @@ _SMALLEST, _SMALLEST_OF_FEW = 0.2, 0.1
 
 
 class SmallestScale(Decision):
-    """Smallest deviation in voxels, or in spacings of the seeds where these are closer."""
+    """How thin may a Gaussian become?
+
+    Its smallest standard deviation in voxels, or in spacings of the seeds where these are closer.
+    """
 
     name = "smallest_scale"
     needs = (SeedSpacing,)

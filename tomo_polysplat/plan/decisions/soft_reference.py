@@ -186,7 +186,10 @@ def _first_density(material: MaterialLike, level: float) -> float:
 
 
 class SoftReference(Decision):
-    """What densities are measured by: a dict of ``value``, ``first`` and ``number`` (`Reference`)."""
+    """What are densities measured by: water, or the object's main matter?
+
+    The answer is a dict of ``value``, ``first``, ``number`` and ``dense`` (`Reference`).
+    """
 
     name = "soft_reference"
 

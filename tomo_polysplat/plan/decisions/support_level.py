@@ -19,7 +19,10 @@ _LIGHT = 0.15
 
 
 class SupportLevel(Decision):
-    """The level in soft references; the evidence tells how light the main matter is."""
+    """Below which level is the start empty?
+
+    In soft references. The evidence tells how light the main matter is.
+    """
 
     name = "support_level"
     needs = (SoftReference,)

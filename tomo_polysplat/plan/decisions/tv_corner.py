@@ -134,7 +134,10 @@ def _ramp(value: float, start: float, end: float) -> float:
 
 
 class TvCorner(Decision):
-    """Differences of neighbouring voxels that count in full, of soft and of dense matter, in soft references."""
+    """Up to which difference of neighbouring voxels is the volume smoothed in full?
+
+    Two numbers in soft references: of soft and of dense matter.
+    """
 
     name = "tv_corner"
     needs = (SoftReference, SupportLevel)

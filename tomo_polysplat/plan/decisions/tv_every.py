@@ -22,7 +22,10 @@ _VOXELS, _VOXELS_PLANAR = {"cpu": 140_000, "cuda": 4_200_000}, 65_536
 
 
 class TvEvery(Decision):
-    """In every how many steps the total variation is taken, and counts as many times."""
+    """In every how many steps is the volume smoothed?
+
+    It then counts as many times.
+    """
 
     name = "tv_every"
 

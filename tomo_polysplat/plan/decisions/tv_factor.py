@@ -68,7 +68,10 @@ _FEWEST_PASSES = 10.0
 
 
 class TvFactor(Decision):
-    """So many times the usual weight of the total variation is taken."""
+    """How strongly is the volume smoothed?
+
+    In times the usual weight of the total variation.
+    """
 
     name = "tv_factor"
     needs = (Agent, CloserSeeds, Curves, Edges, Growth, OpticalDepth, Passes)

@@ -24,7 +24,10 @@ _PASSES = 15.0
 
 
 class ViewsPerStep(Decision):
-    """As many as leave enough steps."""
+    """How many views make one step of the optimiser?
+
+    As many as leave enough steps.
+    """
 
     name = "views_per_step"
     needs = (Passes, SeedSpacing)
