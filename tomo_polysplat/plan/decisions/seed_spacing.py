@@ -60,8 +60,10 @@ def _most_gaussians(lab: Lab) -> tuple[int, str]:
     if settings.max_gaussians or lab.device.type == "cpu":
         return settings.max_gaussians or _MOST_ON_CPU, ""
     room = _SHARE_OF_SEEDS * most_gaussians(lab.device)
-    most = max(round(min(room, math.prod(start.shape))), 1)
-    told = ", for which there is memory," if room < math.prod(start.shape) else ""
+    # Few voxels hold more seeds than one each: rays tell what is inside them.
+    voxels = max(math.prod(start.shape), _NOT_TOO_MANY)
+    most = max(round(min(room, voxels)), 1)
+    told = ", for which there is memory," if room < voxels else ""
     if problem.planar:
         return most, told
     # Averaged, as noise would make holes with surfaces of their own. What is dense has surfaces within other matter.
