@@ -20,7 +20,7 @@ REMEDIES = {
 
 
 def probe_logarithm(measured: Measured) -> Finding:
-    """Tell -log(I/I0) from I/I0 and from counts: an object adds to the first and takes away from the others."""
+    """Tell -log(I/I0) from I/I0 and from counts: an object raises the first and lowers the others."""
     values = measured.filled
     width = max(1, int(_BORDER * values.shape[2]))
     air = float(np.median(np.concatenate([values[..., :width], values[..., -width:]], axis=2)))
