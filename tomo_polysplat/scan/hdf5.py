@@ -1,7 +1,7 @@
-"""Read HDF5 files that may be damaged, truncated or other files.
+"""Reading HDF5 files that may be damaged, truncated or something else altogether.
 
-Objects are looked up link by link, so nothing outside the file is opened. Every size is compared with what the file
-stores before it is used.
+Everything is looked up link by link: nothing outside the file is opened, and no size is believed before it is
+compared with what the file stores.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ __all__ = [
 _MOST_LINKS = 16
 _LARGEST_ATTRIBUTE = 2**16
 _ADDRESS_BYTES = 8
-# What h5py may raise at any time while it reads a damaged file.
+# What h5py raises for files that HDF5 cannot make sense of, at any time while they are read.
 _BROKEN = (OSError, RuntimeError, KeyError, UnicodeDecodeError)
 _OUTSIDE = "copy the data into one file: h5repack does, and so does h5py"
 
 
 @contextmanager
 def opened(path: str | Path) -> Iterator[h5py.File]:
-    """Open a file for reading; an error of HDF5 about a damaged file becomes one clear ValueError."""
+    """The file open for reading; what HDF5 reports as broken becomes one clear ValueError."""
     import h5py
 
     file = existing_file(path)
@@ -57,7 +57,7 @@ def opened(path: str | Path) -> Iterator[h5py.File]:
 
 
 def _of_h5py(error: BaseException) -> bool:
-    """Whether h5py raised an exception, and not the code that uses what it read."""
+    """Whether an exception was raised by h5py, and not by what is done with what it read."""
     last = error.__traceback__
     while last is not None and last.tb_next is not None:
         last = last.tb_next
@@ -77,7 +77,7 @@ def _member(group: h5py.Group, path: str, links: int = _MOST_LINKS) -> Any:
     here: Any = group.file if path.startswith("/") else group
     for part in filter(None, path.split("/")):
         name = part.encode("utf-8", "surrogateescape")
-        # Look at the link itself: h5py's own look-ups would first follow it, to any file it names.
+        # Asked of the link itself: h5py's own look-ups follow it first, to whatever file it names.
         if not isinstance(here, h5py.Group) or not here.id.links.exists(name):
             return None
         kind = here.id.links.get_info(name).type
@@ -136,7 +136,7 @@ def find_array(group: h5py.Group, name: str) -> h5py.Dataset | None:
 
 
 def _require_chunks(where: str, dataset: h5py.Dataset) -> None:
-    """Refuse more chunks than the file has room for addresses, because HDF5 would look for each of them."""
+    """Refuse more chunks than the file can have addresses of: each would be looked for."""
     chunks = math.prod(-(-length // size) for length, size in zip(dataset.shape, dataset.chunks))
     most = Path(dataset.file.filename).stat().st_size // _ADDRESS_BYTES
     if chunks > max(most, 1):
@@ -144,7 +144,7 @@ def _require_chunks(where: str, dataset: h5py.Dataset) -> None:
 
 
 def _described(item: Any) -> str:
-    """A description of an object that holds no numbers; h5py's own repr fails on unknown types."""
+    """What a file has where numbers were expected; h5py's own repr fails on types that a file has made up."""
     return f"{type(item).__name__} of type {_type_of(item)} and shape {getattr(item, 'shape', None)}"
 
 
@@ -206,7 +206,7 @@ def read_attribute(item: h5py.HLObject, name: str) -> Any:
     try:
         about = item.attrs.get_id(name)
         size = math.prod(about.shape or ()) * about.dtype.itemsize
-        # Of the other types, damaged lists of variable length end the process.
+        # Of what else there is, lists of a length of their own that are damaged end the process.
         if about.dtype.kind not in "fiubS" and h5py.check_string_dtype(about.dtype) is None:
             raise TypeError(f"values of type {about.dtype}")
         value = item.attrs[name] if size <= _LARGEST_ATTRIBUTE else None

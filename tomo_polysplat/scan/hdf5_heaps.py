@@ -1,8 +1,8 @@
-"""Check the heaps in which HDF5 keeps texts, before HDF5 reads them.
+"""The heaps in which HDF5 keeps texts, looked through before HDF5 does.
 
-HDF5 (2.0 and earlier) goes through a heap from object to object by their stated sizes. If a size is 0 it never ends,
-and neither an exception nor Ctrl-C stops it. So damaged heaps must be found first. The layout is that of the HDF5 file
-format specification, section III.E, "Global Heap".
+HDF5 (2.0 and earlier) walks a heap from object to object by the sizes that it states, and never ends where one
+is 0. No exception and no Ctrl-C gets out of that, so a damaged heap has to be found first. The layout is that of
+the HDF5 file format specification, section III.E, "Global Heap".
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ _COLLECTION = b"GCOL\x01\x00\x00\x00"
 # Of a collection and of an object, with lengths of 8 bytes.
 _HEADER = 16
 _BLOCK = 2**24
-# All heaps together may have this many times the size of the file: a heap inside another is counted twice.
+# Times that all the heaps of a file may walk over all of it: one that lies inside another is walked by both.
 _MOST_WALKS = 4
 _REMEDY = "it is damaged: copy or write it again"
 
 
 def require_sound_heaps(file: Path) -> None:
-    """Refuse an HDF5 file in which HDF5 would never end.
+    """Refuse an HDF5 file that HDF5 would not return from.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def require_sound_heaps(file: Path) -> None:
 
 
 def _places(stream: BinaryIO) -> list[int]:
-    """Where collections begin, or seem to begin."""
+    """Where collections begin, or what looks so."""
     places, begin, overlap = [], 0, b""
     stream.seek(0)
     while block := stream.read(_BLOCK):

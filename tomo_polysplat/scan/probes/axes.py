@@ -9,13 +9,13 @@ from tomo_polysplat.scan.probes.measured import Finding, Measured
 __all__ = ["probe_axes"]
 
 AXES = ("rows", "views", "columns")
-# An order of axes is a defect if another order keeps the sums this many times more constant.
+# An order of axes is doubted when another one keeps sums this many times more constant.
 _MUCH_BETTER = 4.0
 _LARGE = 0.03
 
 
 def probe_axes(measured: Measured) -> Finding:
-    """Check that the sum over each detector row does not change as the object turns.
+    """Check that what a detector row sees in all does not change as the object turns.
 
     In a parallel beam the sum over the columns is the mass of a slice and the same in every view; in a cone
     beam nearly so. An order of axes is judged by the part of these sums' scatter that is along the views.
@@ -25,7 +25,7 @@ def probe_axes(measured: Measured) -> Finding:
     if min(scan.views, scan.columns) < 3:
         return Finding("order of axes", "unknown", "too few views or columns")
     scatter = {(1, 2): _scatter(values, 1, 2)}
-    # Only axes of equal length can be confused: others would not fit the geometry.
+    # Axes of different length cannot be confused: the geometry's lengths would not fit.
     if scan.views == scan.columns:
         scatter[2, 1] = _scatter(values, 2, 1)
     if scan.rows > 1 and scan.rows == scan.columns:

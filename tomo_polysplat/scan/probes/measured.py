@@ -1,4 +1,4 @@
-"""The data that probes look at, and the findings that they return."""
+"""What the probes look at, and what they answer."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Finding:
 
     @property
     def misleading(self) -> bool:
-        """Whether it would mislead other probes: true for all defects except those of a few views."""
+        """Whether it would mislead other probes: any defect but one of a few views."""
         return self.verdict == "defect" and self.values.get("misplaced", 1.0) > 0.1
 
 
@@ -81,7 +81,7 @@ class Measured:
 
     @cached_property
     def level(self) -> float:
-        """A large value of this scan: the 99th percentile."""
+        """What counts as large in this scan: the 99th percentile of its values."""
         return float(np.percentile(self.filled, 99))
 
     @cached_property

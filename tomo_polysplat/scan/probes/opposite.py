@@ -1,9 +1,9 @@
-"""Compare rays that were measured from both ends: where is the axis, and in which direction did the scan go?
+"""Do rays that were measured from both ends agree: where is the axis, and which way round did the scan go?
 
-A ray leaves a source at azimuth b, at the angle g from the axis. It is measured again, backwards, from the azimuth
-b + pi + 2 g at the angle -g. If the detector is off by some columns, or the angles run the other way (b + pi - 2 g),
-the two values differ. In a parallel beam g is zero. Reversed angles then give the mirror image of the object, which
-agrees as well as the object itself.
+The ray from a source at azimuth b that leaves at the angle g from the axis is met again, backwards, from the
+azimuth b + pi + 2 g at the angle -g. If the detector is off by some columns, or the angles run the other way
+(b + pi - 2 g), the two do not agree. In a parallel beam g is zero, and turning the angles round gives the mirror
+image of the object, which agrees as well as the object itself.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from tomo_polysplat.scan.probes.measured import Finding, Measured
 
 __all__ = ["CENTRE", "DIRECTION", "probe_centre_and_direction"]
 
-# An offset of this many columns or more is a defect.
+# Columns off from which it is a defect.
 _TOLERATED = 0.5
 # The other direction must fit this many times better.
 _MUCH_BETTER = 2.0
 # Half the range of offsets that is searched, as a share of the columns; views compared; columns smoothed over.
 _RANGE, _MOST_VIEWS, _SMOOTH = 0.12, 60, 1.0
-# The source moves on a circle if its distance from the axis changes by less than this share.
+# Relative change of the source's distance from the axis that still is a circle.
 _ROUND = 0.02
 
 CENTRE, DIRECTION = "centre", "direction of the angles"
 
 
 def probe_centre_and_direction(measured: Measured) -> list[Finding]:
-    """Compare rays with those along the same line in the other direction."""
+    """Compare rays with those that ran the same way backwards."""
     if measured.geometry.beam == "parallel":
         text = "a parallel beam cannot tell: turned angles give the mirror image of the object"
         return [_parallel_centre(measured), Finding(DIRECTION, "unknown", text)]
@@ -62,7 +62,7 @@ def _direction(mismatch: float, turned: float, numbers: dict[str, float]) -> Fin
 
 
 def _centre(offset: float, numbers: dict[str, float]) -> Finding:
-    """The finding on the axis; `offset` is its place in the data minus that in the geometry, in columns."""
+    """`offset` is where the axis is in the data, counted from where the geometry says, in columns."""
     if abs(offset) <= _TOLERATED:
         return Finding(
             CENTRE, "ok", f"within {abs(offset):.2f} columns of where the geometry has it", "", numbers
