@@ -36,8 +36,9 @@ LAYERS = (
     ("model",),
     ("render",),
     ("fit",),
+    ("plan",),
     ("result", "report"),
-    ("reconstruction",),
+    ("reconstruction", "viewer"),
     ("baselines", "bench", "cli", "doctor", "plugins"),
 )
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

@@ -17,7 +17,10 @@ _PUBLIC = {
     "Result": "tomo_polysplat.result.result",
     "Scan": "tomo_polysplat.scan.scan",
     "Spectrum": "tomo_polysplat.physics.spectrum",
+    "cone_geometry": "tomo_polysplat.scan.circular",
+    "compare": "tomo_polysplat.baselines.comparison",
     "load_scan": "tomo_polysplat.scan.io",
+    "parallel_geometry": "tomo_polysplat.scan.circular",
     "polysplat": "tomo_polysplat.plugins.tomopy_plugin",
     "reconstruct": "tomo_polysplat.reconstruction",
     "register": "tomo_polysplat.plugins.hosts",
@@ -25,7 +28,10 @@ _PUBLIC = {
     "simulate_scan": "tomo_polysplat.simulate.scenes",
 }
 
-__all__ = ["__version__", *sorted(_PUBLIC)]
+# Parts that are public as a whole.
+_PARTS = ("baselines",)
+
+__all__ = ["__version__", *sorted([*_PUBLIC, *_PARTS])]
 
 
 def __getattr__(name: str) -> Any:
@@ -33,6 +39,8 @@ def __getattr__(name: str) -> Any:
         value = getattr(import_module(_PUBLIC[name]), name)
         globals()[name] = value
         return value
+    if name in _PARTS:
+        return import_module(f"{__name__}.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

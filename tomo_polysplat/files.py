@@ -230,6 +230,9 @@ def require_plausible_size(name: str, declared_bytes: int, stored_bytes: int) ->
 def existing_file(path: str | os.PathLike, argument: str = "path") -> Path:
     """`path` as a Path to a file that exists and is not empty."""
     file = Path(path)
+    if file.is_dir():
+        remedy = "name a file in it; a scanner's folder becomes one file by `tomo-polysplat import`"
+        raise fail(argument, "a file", f"{file}, which is a folder", remedy, FileNotFoundError)
     if not file.is_file():
         raise fail(argument, "an existing file", str(file), error=FileNotFoundError)
     if file.stat().st_size == 0:

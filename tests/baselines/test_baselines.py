@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from tomo_polysplat.baselines.fdk import fdk
-from tomo_polysplat.baselines.limar import limar
-from tomo_polysplat.baselines.metal_trace import find_metal, forward_project
-from tomo_polysplat.baselines.mono_splat import mono_splat
-from tomo_polysplat.baselines.nmar import nmar
-from tomo_polysplat.baselines.sirt import sirt
-from tomo_polysplat.baselines.voxel_poly import voxel_poly
-from tomo_polysplat.baselines.water_bhc import water_bhc
+from tomo_polysplat.baselines.arrays.fdk import fdk
+from tomo_polysplat.baselines.arrays.limar import limar
+from tomo_polysplat.baselines.arrays.metal_trace import find_metal, forward_project
+from tomo_polysplat.baselines.arrays.mono_splat import mono_splat
+from tomo_polysplat.baselines.arrays.nmar import nmar
+from tomo_polysplat.baselines.arrays.sirt import sirt
+from tomo_polysplat.baselines.arrays.voxel_poly import voxel_poly
+from tomo_polysplat.baselines.arrays.water_bhc import water_bhc
 from tomo_polysplat.result.metrics import compare
 from tomo_polysplat.scan.geometry import VolumeGrid, from_astra, projections_from_astra
 from tomo_polysplat.simulate.scenes import simulate_scan

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from tomo_polysplat.baselines.sirt import sirt
+from tomo_polysplat.baselines.arrays.sirt import sirt
 from tomo_polysplat.scan.geometry import from_astra, projections_from_astra
 from tomo_polysplat.simulate.scenes import simulate_scan
 from tomo_polysplat.start.astra_pair import AstraPair

@@ -6,6 +6,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.report.figures import comparison_figure, history_figure, slices_figure
 from tomo_polysplat.report.slices import display_window, planes_through
 from tomo_polysplat.report.table import as_text, is_best
@@ -108,7 +109,7 @@ def test_the_page_stands_alone(tmp_path, flat):
         (truth + 0.01)[None],
         VolumeGrid(truth.shape, (-1, -1, -1), (1, 1, 1)),
         energy_kev=42.0,
-        plan={"channels": {"value": 1, "reason": "<no spectrum> & none wanted"}},
+        plan={"curves": Answer(1, "<no spectrum> & none wanted", Status.USUAL)},
         settings={"passes": 3.0},
         provenance={"scan": "wrist <left>", "device": "CPU"},
         history=[{"seconds": 1.0, "loss": 0.1, "held_out": 0.2}],
@@ -120,12 +121,14 @@ def test_the_page_stands_alone(tmp_path, flat):
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
     links = Links()
     links.feed(page)
-    assert links.tags.count("img") == 2 and all(s.startswith("data:image/png;base64,") for s in links.sources)
-    assert not {"script", "link", "iframe"} & set(links.tags)
+    assert links.tags.count("img") == (4 if flat else 5)
+    assert all(source.startswith("data:image/") for source in links.sources)
+    assert not {"link", "iframe", "object"} & set(links.tags)
+    assert not re.findall(r"https?:|@import|fetch\(", page)
     assert "&lt;no spectrum&gt; &amp; none wanted" in page and "<no spectrum>" not in page
-    assert "<title>tomo-polysplat reconstruction of wrist &lt;left&gt;</title>" in page
+    assert "<title>wrist &lt;left&gt; – tomo-polysplat</title>" in page
     assert "26.0" in page, "20 log10(0.2 / 0.01) dB against the truth"
-    assert "All slices are shown from 0 to 0.22 1/cm" in page
+    assert ">0.22 1/cm, the same in every picture" in page
 
 
 def test_a_volume_of_two_slices_has_a_page_without_the_comparison(tmp_path, caplog):

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from tomo_polysplat.baselines.fdk import fdk
-from tomo_polysplat.baselines.limar import limar
-from tomo_polysplat.baselines.mono_splat import mono_splat
-from tomo_polysplat.baselines.nmar import nmar
-from tomo_polysplat.baselines.sirt import sirt
-from tomo_polysplat.baselines.voxel_poly import voxel_poly
-from tomo_polysplat.baselines.water_bhc import water_bhc, water_corrected
+from tomo_polysplat.baselines.arrays.fdk import fdk
+from tomo_polysplat.baselines.arrays.limar import limar
+from tomo_polysplat.baselines.arrays.mono_splat import mono_splat
+from tomo_polysplat.baselines.arrays.nmar import nmar
+from tomo_polysplat.baselines.arrays.sirt import sirt
+from tomo_polysplat.baselines.arrays.voxel_poly import voxel_poly
+from tomo_polysplat.baselines.arrays.water_bhc import water_bhc, water_corrected
 from tomo_polysplat.bench import peers
 from tomo_polysplat.fit.fork import FEWEST_PASSES
 from tomo_polysplat.fit.optimise import FitState
@@ -163,7 +163,9 @@ def _polysplat(task: Task, options: Options) -> Outcome:
 
 
 def _told(result: Result) -> Outcome:
-    about = {key: result.plan.get(key) for key in ("kernel", "stop", "curves")}
+    about: dict[str, Any] = {
+        key: result.plan[key].to_dict() for key in ("kernel", "stop", "curves") if key in result.plan
+    }
     return result.volume, {"gaussians": result.counts.get("gaussians"), **about}
 
 

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import argparse
 import logging
 import sys
 from collections.abc import Sequence
 
 import tomo_polysplat
 from tomo_polysplat.checks import visible
-from tomo_polysplat.cli import bench, check, demo, doctor, recon, simulate
+from tomo_polysplat.cli import bench, check, demo, doctor, import_scan, recon, simulate, view
 from tomo_polysplat.cli.options import INTERRUPTED
+from tomo_polysplat.cli.parser import Parser
 
 __all__ = ["main"]
 
-COMMANDS = (demo, recon, simulate, check, bench, doctor)
+COMMANDS = (demo, import_scan, recon, view, simulate, check, bench, doctor)
 BAD_INPUT, FAILED = 2, 1
 
 
@@ -26,7 +26,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     int
         0 when all went well, 1 for a failure of ours, 2 for bad input, 130 when interrupted.
     """
-    arguments = build_parser().parse_args(argv)
+    arguments = build_parser().parse_all(argv)
     level = logging.DEBUG if arguments.debug else logging.INFO if arguments.verbose else logging.WARNING
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(_VisibleFormatter("%(levelname)s: %(message)s"))
@@ -43,15 +43,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _complain(f"{type(error).__name__}: {error} (run again with --debug to see where)", FAILED)
 
 
-def build_parser() -> argparse.ArgumentParser:
+def build_parser() -> Parser:
     """The parser of every subcommand."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="tomo-polysplat",
         description="CT reconstruction with Gaussians of matter and the physics of a real x-ray spectrum: "
         "no metal or beam-hardening artefacts, no metal mask.",
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {tomo_polysplat.__version__}")
-    common = argparse.ArgumentParser(add_help=False)
+    common = Parser(add_help=False)
     common.add_argument("-v", "--verbose", action="store_true", help="say what is being done")
     common.add_argument("--debug", action="store_true", help="say everything, and show tracebacks")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
@@ -63,7 +63,7 @@ def build_parser() -> argparse.ArgumentParser:
             description=f"{module.HELP[0].upper()}{module.HELP[1:]}.",
         )
         module.add_arguments(child)
-        child.set_defaults(run=module.run)
+        child.set_defaults(run=module.run, parser=child)
     return parser
 
 

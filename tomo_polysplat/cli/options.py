@@ -98,8 +98,10 @@ def _detector(text: str) -> Detector:
 
 
 def add_scan_options(parser: argparse.ArgumentParser) -> None:
-    """The scan, and what its file does not say."""
-    parser.add_argument("scan", metavar="SCAN", help="Data Exchange HDF5 file or .npz scan")
+    """The scan and what its file leaves open."""
+    parser.add_argument(
+        "scan", metavar="SCAN", help="Data Exchange HDF5 file, .npz scan, or a scanner's folder"
+    )
     group = parser.add_argument_group("what the file does not say")
     group.add_argument("--unit", help="unit of its lengths: cm (default), mm, um, m or pixel")
     group.add_argument(
@@ -132,8 +134,8 @@ def add_scan_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def scan_from(arguments: argparse.Namespace, spectrum: Spectrum | None = None) -> Any:
-    """The scan that the options name."""
+def scan_from(arguments: argparse.Namespace, spectrum: Spectrum | None = None, **more: Any) -> Any:
+    """The scan that the options name; `more` are arguments of ``load_scan`` that only some subcommands have."""
     from tomo_polysplat.scan.io import load_scan
 
     return load_scan(
@@ -145,6 +147,7 @@ def scan_from(arguments: argparse.Namespace, spectrum: Spectrum | None = None) -
         input=arguments.input,
         saturation=arguments.saturation,
         water_correction=arguments.water_correction,
+        **more,
     )
 
 

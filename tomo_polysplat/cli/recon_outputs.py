@@ -129,7 +129,7 @@ def _write_about(result: Result, scan: Scan, arguments: argparse.Namespace, fail
         _attempt(
             arguments.report,
             failures,
-            lambda: result.report(arguments.report, overwrite=overwrite, **known),
+            lambda: result.report(arguments.report, scan=scan, overwrite=overwrite, **known),
         )
     if errors is not None:
         print(as_text([errors], result.unit))

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["comparison_figure", "history_figure", "png_bytes", "slices_figure"]
+__all__ = ["comparison", "comparison_figure", "history_figure", "png_bytes", "slices_figure"]
 
 PANEL = 2.35  # inches
 
@@ -37,12 +37,25 @@ def comparison_figure(
     title: str = "One scan, several reconstructions, one grey scale",
     overwrite: bool = False,
 ) -> None:
-    """Write a picture of several reconstructions beside the truth: slices through the metal, errors, a table.
+    """Write what `comparison` draws to an image, by its ending (``.png``, ``.pdf``, ``.svg``)."""
+    figure = comparison(panels, truth, metal_mask, unit, energy, table, title=title)
+    _write(figure, path, overwrite)
+
+
+def comparison(
+    panels: Sequence[tuple[str, np.ndarray]],
+    truth: np.ndarray,
+    metal_mask: np.ndarray | None,
+    unit: str,
+    energy: float | None,
+    table: tables.Table,
+    *,
+    title: str,
+) -> Figure:
+    """Several reconstructions beside the truth: slices through the metal, errors, a table.
 
     Parameters
     ----------
-    path : path
-        The image, by its ending (``.png``, ``.pdf``, ``.svg``).
     panels : sequence of (name, volume)
         Volumes (z, y, x) like `truth`; ``"fdk"``, ``"fdk-water"``, ``"mono"`` and ``"polysplat"`` get a full
         name.
@@ -78,7 +91,7 @@ def comparison_figure(
     upper.colorbar(grey, ax=axes[:-1], fraction=0.02, pad=0.01, label=f"attenuation{scale} (1/{unit})")
     upper.colorbar(red_blue, ax=axes[-1], fraction=0.02, pad=0.01, label=f"error (1/{unit})")
     tables.draw(lower.subplots(), table, unit)
-    _write(figure, path, overwrite)
+    return figure
 
 
 def _height(plane: Plane, shape: tuple[int, ...]) -> float:

@@ -1,59 +1,44 @@
-"""One self-contained page about a reconstruction: no script, no link, images inside."""
+"""The page about a reconstruction that a scientist sends to a colleague: one file, nothing loaded from elsewhere."""
 
 from __future__ import annotations
 
-import base64
-import html
 import logging
 import os
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tomo_polysplat.checks import require_shape, visible
+from tomo_polysplat.checks import require_shape
 from tomo_polysplat.files import write_text
 from tomo_polysplat.report import table as tables
+from tomo_polysplat.report.browse import browser
+from tomo_polysplat.report.classical import standard_volume
+from tomo_polysplat.report.decided import decisions, in_words, rest_of_plan
+from tomo_polysplat.report.evidence import by_pixel_figure, by_view_figure
 from tomo_polysplat.report.figures import history_figure, png_bytes, slices_figure
-from tomo_polysplat.report.slices import display_window, planes_through
-from tomo_polysplat.report.style import ACCENT, INK, OURS, QUIET
+from tomo_polysplat.report.materials import histogram_figure
+from tomo_polysplat.report.page import folded, image, page, section, text
+from tomo_polysplat.report.residuals import Residuals, residuals_of
+from tomo_polysplat.report.slices import Plane, display_window, planes_through
+from tomo_polysplat.report.style import OURS, full_name
+from tomo_polysplat.report.verdict import verdict
 
 if TYPE_CHECKING:
     from tomo_polysplat.result.result import Result
+    from tomo_polysplat.scan.scan import Scan
 
-__all__ = ["image", "page", "write_report"]
+__all__ = ["image", "page", "title_of", "told", "write_report"]
 
 logger = logging.getLogger(__name__)
 
-PAGE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width">
-<title>{title}</title>
-<style>
-body {{ font: 16px/1.5 system-ui, sans-serif; color: {ink};
-       max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }}
-h1 {{ font-size: 1.6rem; margin-bottom: 0; }}
-h2 {{ font-size: 1.1rem; margin: 2.2rem 0 0.4rem; color: {accent}; }}
-img {{ max-width: 100%; }}
-table {{ border-collapse: collapse; }}
-th, td {{ text-align: left; vertical-align: top; padding: 0.15rem 1.2rem 0.15rem 0; }}
-th {{ font-weight: normal; color: {quiet}; }}
-.note {{ color: {quiet}; margin-top: 0; }}
-</style>
-</head>
-<body>
-{body}
-</body>
-</html>
-"""
+Volumes = list[tuple[str, np.ndarray]]
 
 
 def write_report(
     result: Result,
     path: str | os.PathLike,
     *,
+    scan: Scan | None = None,
     truth: np.ndarray | None = None,
     metal_mask: np.ndarray | None = None,
     overwrite: bool = False,
@@ -62,42 +47,70 @@ def write_report(
     volume = _spatial(result, result.volume)
     true = None if truth is None else _spatial(result, truth)
     metal = None if metal_mask is None else _spatial(result, metal_mask).astype(bool)
-    title = f"tomo-polysplat reconstruction{_of_what(result)}"
+    residuals = None if scan is None or not result.gaussians else residuals_of(result, scan)
+    shown = [] if scan is None else [_beside(scan)]
+    shown += [(full_name(OURS), volume), *([] if true is None else [("truth", true)])]
+    title = title_of(result, scan)
     body = [
-        f"<h1>{_text(title)}</h1>",
-        f'<p class="note">{_text(repr(result))}</p>',
-        *_slices(result, volume, true, metal),
+        f"<h1>{text(title)}</h1>",
+        f'<p class="note">{text(_about(result))}</p>',
+        *_verdict(result, residuals),
+        *_slices(result, shown, true, metal),
         *_errors(result, volume, true, metal),
-        "<h2>Speed against error</h2>",
-        image(png_bytes(history_figure(result.history)), "error of the projections against seconds"),
-        *_section("What was modelled and why", result.plan),
-        *_section("Left out or limited", result.counts),
-        *_section("Settings", result.settings),
-        *_section("Made from and with", result.provenance),
+        *_rays(residuals),
+        "<h2>What the voxels hold</h2>",
+        image(png_bytes(histogram_figure(result)), "histogram of the attenuation with the materials named"),
+        *_speed(result),
+        *_decided(result),
+        *_folded(result),
     ]
-    write_text(path, page(title, body), overwrite=overwrite)
+    write_text(path, page(f"{title} – tomo-polysplat", body), overwrite=overwrite)
 
 
-def page(title: str, body: Sequence[str]) -> str:
-    """A whole page of these parts, which are HTML."""
-    return PAGE.format(title=_text(title), body="\n".join(body), ink=INK, accent=ACCENT, quiet=QUIET)
+def told(result: Result, residuals: Residuals | None) -> list[str]:
+    """Pieces of HTML on how well the rays are explained and what was decided, without slices and for another page."""
+    return [
+        f'<p class="note">{text(_about(result))}</p>',
+        *_verdict(result, residuals),
+        *_rays(residuals),
+        *_speed(result),
+        *_decided(result),
+    ]
 
 
-def _text(words: Any) -> str:
-    """Words as they stand in HTML."""
-    return html.escape(visible(words))
+def _verdict(result: Result, residuals: Residuals | None) -> list[str]:
+    sentences = "".join(f"<p>{text(words)}</p>" for words in verdict(result, residuals))
+    return [f'<div class="verdict">{sentences}</div>']
 
 
-def _of_what(result: Result) -> str:
+def _speed(result: Result) -> list[str]:
+    figure = history_figure(result.history)
+    return [
+        "<h2>Speed against error</h2>",
+        image(png_bytes(figure), "error of the projections against seconds"),
+    ]
+
+
+def title_of(result: Result, scan: Scan | None) -> str:
     """The scan's name, where somebody has told it."""
-    name = result.provenance.get("scan")
-    return f" of {name}" if name else ""
+    told = result.provenance.get("scan") or ("" if scan is None else scan.name)
+    return str(told or "Reconstruction")
 
 
-def image(png: bytes, description: str) -> str:
-    """A picture inside the page."""
-    data = base64.b64encode(png).decode("ascii")
-    return f'<img alt="{_text(description)}" src="data:image/png;base64,{data}">'
+def _about(result: Result) -> str:
+    nz, ny, nx = result.grid.shape
+    size = " x ".join(f"{edge:.4g}" for edge in result.grid.voxel_size)
+    energy = "" if result.energy_kev is None else f" at {result.energy_kev:.1f} keV"
+    number = len(result.gaussians.get("density", ()))
+    return (
+        f"Attenuation in 1/{result.unit}{energy}; {nx} x {ny} x {nz} voxels of {size} {result.unit} (x, y, z); "
+        f"{number} Gaussians, {result.seconds:.1f} s"
+    )
+
+
+def _beside(scan: Scan) -> tuple[str, np.ndarray]:
+    name, volume = standard_volume(scan)
+    return full_name(name.lower()) if name == "FDK" else name, volume
 
 
 def _spatial(result: Result, volume: np.ndarray) -> np.ndarray:
@@ -107,19 +120,20 @@ def _spatial(result: Result, volume: np.ndarray) -> np.ndarray:
     return volume[None, ::-1] if result.flipped_2d else volume
 
 
-def _slices(
-    result: Result, volume: np.ndarray, truth: np.ndarray | None, metal: np.ndarray | None
+def _slices(result: Result, shown: Volumes, truth: np.ndarray | None, metal: np.ndarray | None) -> list[str]:
+    """The browser of axial slices, and the other two planes below it."""
+    ours = dict(shown)[full_name(OURS)]
+    window = display_window(ours if truth is None else truth, metal)
+    axial, *others = planes_through(ours if metal is None else metal)
+    parts = [browser(shown, window, axial.index, float(result.grid.voxel_size[2]), result.unit)]
+    return parts + (_other_planes(result, shown, window, others) if others else [])
+
+
+def _other_planes(
+    result: Result, shown: Volumes, window: tuple[float, float], planes: list[Plane]
 ) -> list[str]:
-    window = display_window(volume if truth is None else truth, metal)
-    planes = planes_through(volume if metal is None else metal)
-    volumes = [("reconstruction", volume), *([] if truth is None else [("truth", truth)])]
-    figure = slices_figure(volumes, result.unit, result.energy_kev, window, planes)
-    note = f"All slices are shown from {window[0]:.3g} to {window[1]:.3g} 1/{result.unit}; brighter is white."
-    return [
-        "<h2>Slices</h2>",
-        f'<p class="note">{_text(note)}</p>',
-        image(png_bytes(figure), "orthogonal slices"),
-    ]
+    figure = slices_figure(shown, result.unit, result.energy_kev, window, planes)
+    return ["<h2>The other two planes</h2>", image(png_bytes(figure), "coronal and sagittal slices")]
 
 
 def _errors(
@@ -133,23 +147,40 @@ def _errors(
         entry = {"name": OURS, "seconds": result.seconds, **compare(volume, truth, metal)}
     except ValueError as error:  # of a volume two voxels high, say, which the page still shows
         logger.warning("Not compared with the truth: %s", error)
-        return _section("Against the truth", {"not compared": str(error)})
-    rows = dict(zip(tables.headings(result.unit)[1:], tables.cells(entry)[1:]))
-    return _section("Against the truth", rows)
+        return section("Against the truth", {"not compared": str(error)})
+    return section("Against the truth", dict(zip(tables.headings(result.unit)[1:], tables.cells(entry)[1:])))
 
 
-def _section(heading: str, content: Mapping[str, Any]) -> list[str]:
-    return [f"<h2>{heading}</h2>", _rows(content)] if content else []
+def _rays(residuals: Residuals | None) -> list[str]:
+    if residuals is None:
+        return []
+    note = (
+        f"Residuals of {residuals.rays} rays of {len(residuals.views)} views, in {residuals.unit}. "
+        "A view that stands out has moved or was disturbed; a pixel that stands out has a gain of its own."
+    )
+    return [
+        "<h2>How well the rays are explained</h2>",
+        f'<p class="note">{text(note)}</p>',
+        image(png_bytes(by_view_figure(residuals)), "rms residual by view"),
+        image(png_bytes(by_pixel_figure(residuals)), "rms and mean residual by pixel of the detector"),
+    ]
 
 
-def _rows(content: Mapping[str, Any]) -> str:
-    lines = (f"<tr><th>{_text(key)}</th><td>{_value(item)}</td></tr>" for key, item in content.items())
-    return f"<table>{''.join(lines)}</table>"
+def _decided(result: Result) -> list[str]:
+    """The decisions that mattered, each with its evidence."""
+    told = []
+    for subject, one in decisions(result.plan):
+        status = f'<span class="status">{text(one.status.value)}</span>'
+        words = in_words(one)
+        told.append(f"<dt>{text(subject)}{status}</dt><dd>{text(words[:1].upper() + words[1:])}.</dd>")
+    return ["<h2>What was decided, and why</h2>", f"<dl>{''.join(told)}</dl>"] if told else []
 
 
-def _value(item: Any) -> str:
-    if isinstance(item, Mapping):
-        return _rows(item)
-    if isinstance(item, (list, tuple)):
-        return "<br>".join(_value(part) for part in item)
-    return _text(f"{item:.6g}" if isinstance(item, (float, np.floating)) else item)
+def _folded(result: Result) -> list[str]:
+    parts = [
+        *folded("The rest of the plan", rest_of_plan(result.plan)),
+        *folded("Left out or limited: counts", result.counts),
+        *folded("Settings", result.settings),
+        *folded("Made from and with", result.provenance),
+    ]
+    return ["<h2>For the record</h2>", *parts] if parts else []

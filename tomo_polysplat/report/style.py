@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from matplotlib.axis import Axis
 
-__all__ = ["ACCENT", "INK", "OURS", "QUIET", "full_name", "plain_log"]
+__all__ = ["ACCENT", "INK", "OURS", "QUIET", "SAFE", "full_name", "plain_log"]
 
 INK, QUIET, ACCENT = "#1a1a1a", "#6b6b6b", "#0a6e5c"
+# Told apart by readers of every kind of colour vision (Okabe and Ito 2008): blue, orange, vermilion, green.
+SAFE = ("#0072b2", "#e69f00", "#d55e00", "#009e73")
 OURS = "polysplat"
 NAMES = {
     "fdk": "FDK (the standard)",

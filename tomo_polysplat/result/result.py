@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,8 +14,12 @@ from tomo_polysplat.checks import fail, require_array, require_number, require_s
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.materials import require_energies
 from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.plan.answer import Answer
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.units import cm_per
+
+if TYPE_CHECKING:
+    from tomo_polysplat.scan.scan import Scan
 
 __all__ = ["Result"]
 
@@ -47,8 +51,10 @@ class Result:
         ``density`` (n,) in g/cm3 (1/`unit` when monochromatic), ``u`` (n,) material, -0.1 to 1.
     history : list of dict
         ``seconds``, ``iteration``, ``loss``, ``held_out``, ``gaussians``, ``stage``: speed against error.
-    plan, counts, settings : dict
-        What was modelled and why; how many rays or Gaussians were masked, skipped or clamped; every tunable.
+    plan : dict of str to Answer
+        What was decided and found, by name, with the value, why, where it comes from, and its evidence.
+    counts, settings : dict
+        How many rays or Gaussians were masked, skipped or clamped; every tunable.
     provenance : dict
         Words on what it was made from and with: scanner, volume, spectrum, device and software.
     seconds : float
@@ -65,7 +71,7 @@ class Result:
     spectrum: Spectrum | None = None
     gaussians: Mapping[str, np.ndarray] = field(default_factory=dict)
     history: list[dict[str, Any]] = field(default_factory=list)
-    plan: dict[str, Any] = field(default_factory=dict)
+    plan: dict[str, Answer] = field(default_factory=dict)
     counts: dict[str, Any] = field(default_factory=dict)
     settings: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
@@ -241,19 +247,21 @@ class Result:
         self,
         path: str | os.PathLike,
         *,
+        scan: Scan | None = None,
         truth: np.ndarray | None = None,
         metal_mask: np.ndarray | None = None,
         overwrite: bool = False,
     ) -> None:
-        """Write one self-contained HTML page: slices, speed against error, the plan, the
-        settings, and what it was made from and with.
+        """Write one self-contained HTML page for a colleague: a verdict, slices, residuals, decisions, the record.
 
         Parameters
         ----------
         path : str or path
+        scan : Scan, optional
+            What this was made from: the page then has FDK beside the result, and how well the rays are explained in
+            units of their noise, by view and by pixel. It takes the time of FDK and of one look at 180 views.
         truth, metal_mask : array shaped like :attr:`volume`, or None
-            True attenuation in 1/`unit` at :attr:`energy_kev`, and voxels of metal, for an error map and
-            figures of merit.
+            True attenuation in 1/`unit` at :attr:`energy_kev`, and voxels of metal, for figures of merit.
         overwrite : bool
             Whether an existing file is replaced.
 
@@ -262,11 +270,47 @@ class Result:
         FileExistsError
             If the file exists and `overwrite` is false.
         ValueError
-            If truth or mask have another shape than the volume.
+            If truth or mask have another shape than the volume, or the scan another volume.
         """
         from tomo_polysplat.report.html import write_report
 
-        write_report(self, path, truth=truth, metal_mask=metal_mask, overwrite=overwrite)
+        write_report(self, path, scan=scan, truth=truth, metal_mask=metal_mask, overwrite=overwrite)
+
+    def show(
+        self,
+        others: Mapping[str, Any] | Result | np.ndarray | None = None,
+        *,
+        window: tuple[float, float] | None = None,
+    ) -> Any:
+        """Linked slices in a notebook, with sliders, one window for all volumes, a difference, and a scale bar.
+
+        Parameters
+        ----------
+        others : Result, array or mapping of names to these, optional
+            What is shown below this result, such as ``{"FDK": tps.baselines.fdk(scan)}``; shaped like :attr:`volume`.
+        window : pair of float, optional
+            Attenuation in 1/`unit` that is black, and white, to begin with.
+
+        Returns
+        -------
+        ipywidgets.Widget
+            Shown where it is the last line of a cell.
+
+        Raises
+        ------
+        ImportError
+            Without ipywidgets: ``pip install "tomo-polysplat[notebook]"``.
+        ValueError
+            For volumes of another shape.
+        """
+        from tomo_polysplat.report.show import show
+
+        return show(self, others, window)
+
+    def _repr_html_(self) -> str:
+        from tomo_polysplat.report.show import snippet
+
+        return snippet(self)
 
     def __repr__(self) -> str:
         energy = "unknown energy" if self.energy_kev is None else f"{self.energy_kev:.1f} keV"

@@ -1,0 +1,155 @@
+"""Residuals in units of noise, from projections known in closed form, and the verdict that is drawn from them."""
+
+import numpy as np
+import pytest
+
+from tomo_polysplat.plan.answer import Answer
+from tomo_polysplat.report.residuals import residuals_of
+from tomo_polysplat.report.verdict import verdict
+from tomo_polysplat.result.result import Result
+from tomo_polysplat.scan.geometry import VolumeGrid, from_astra
+from tomo_polysplat.scan.scan import Scan
+
+WIDTH, HEIGHT, PHOTONS = 0.5, 0.2, 5e3
+CENTRE = np.array([0.3, -0.2, 0.1])
+VIEWS, ROWS, COLUMNS = 21, 25, 33
+VOLUME = {
+    "GridColCount": 9,
+    "GridRowCount": 11,
+    "GridSliceCount": 7,
+    "option": {
+        "WindowMinX": -2.0,
+        "WindowMaxX": 2.0,
+        "WindowMinY": -2.0,
+        "WindowMaxY": 2.0,
+        "WindowMinZ": -1.5,
+        "WindowMaxZ": 1.5,
+    },
+}
+CONE = {
+    "type": "cone",
+    "DetectorSpacingX": 0.3,
+    "DetectorSpacingY": 0.3,
+    "DetectorRowCount": ROWS,
+    "DetectorColCount": COLUMNS,
+    "ProjectionAngles": np.linspace(0, 2 * np.pi, VIEWS, endpoint=False),
+    "DistanceOriginSource": 9.0,
+    "DistanceOriginDetector": 6.0,
+}
+
+
+def line_integrals():
+    """(views, rows, columns) of one round Gaussian: HEIGHT sqrt(2 pi) WIDTH exp(-d^2 / 2 WIDTH^2)."""
+    geometry, _ = from_astra(CONE, VOLUME)
+    images = []
+    for view in range(VIEWS):
+        origins, directions = geometry.rays(view)
+        distance = np.linalg.norm(np.cross(CENTRE - origins, directions), axis=-1)
+        images.append(HEIGHT * np.sqrt(2 * np.pi) * WIDTH * np.exp(-0.5 * (distance / WIDTH) ** 2))
+    return np.array(images)
+
+
+def scan_of(values, noise=True):
+    rng = np.random.default_rng(3)
+    if noise:
+        values = -np.log(rng.poisson(PHOTONS * np.exp(-values)) / PHOTONS)
+    return Scan(values.swapaxes(0, 1), CONE, VOLUME, name="ball")
+
+
+def ball(plan=None):
+    gaussians = {
+        "position": CENTRE[None],
+        "scale": np.full((1, 3), WIDTH),
+        "rotation": np.array([[1.0, 0, 0, 0]]),
+        "density": np.array([HEIGHT]),
+        "u": np.zeros(1),
+    }
+    grid = VolumeGrid((7, 11, 9), (-2.0, -2.0, -1.5), (2.0, 2.0, 1.5))
+    return Result(np.full((1, 7, 11, 9), 0.01), grid, gaussians=gaussians, plan=plan or {})
+
+
+def ball_of(result):
+    result.gaussians = ball().gaussians
+    return result
+
+
+def test_the_right_model_leaves_noise():
+    found = residuals_of(ball(), scan_of(line_integrals()))
+    # Read off few rays, the photons are uncertain by some per cent.
+    assert found.photons == pytest.approx(PHOTONS, rel=0.15)
+    assert found.rms == pytest.approx(
+        (found.photons / PHOTONS) ** 0.5, abs=0.02
+    ) and found.within == pytest.approx(0.997, abs=0.003)
+    assert found.rays == VIEWS * ROWS * COLUMNS
+    assert np.abs(found.bias).mean() == pytest.approx(np.sqrt(2 / np.pi / VIEWS), rel=0.1), "normal means"
+    assert verdict(ball(), found)[0].startswith("The model explains the rays to 1.1 times their noise: 99.")
+    assert verdict(ball(), found)[2] == "Nothing stands out that ought to be distrusted."
+
+
+def test_a_view_and_a_pixel_that_are_off_stand_out():
+    values = line_integrals()
+    values[6] += 0.06  # four deviations of noise
+    values[:, 4, 20] += 0.1
+    values[:, 17, 9] += 0.1
+    found = residuals_of(ball(), scan_of(values))
+    assert found.by_view.argmax() == 6 and found.by_view[6] > 3 * np.median(found.by_view)
+    worst = np.argsort(np.abs(found.bias), axis=None)[-2:]
+    assert {tuple(map(int, np.unravel_index(k, found.bias.shape))) for k in worst} == {(4, 20), (17, 9)}
+    told = verdict(ball(), found)[2]
+    assert "view 6, explained up to" in told and "whose pixels are off by the same amount" in told
+
+
+def test_what_is_missing_is_placed():
+    """Matter that the model lacks is where the rays meet that miss."""
+    place = np.array([-0.9, 0.9, -0.4])
+    geometry, _ = from_astra(CONE, VOLUME)
+    values = line_integrals()
+    for view in range(VIEWS):
+        origins, directions = geometry.rays(view)
+        distance = np.linalg.norm(np.cross(place - origins, directions), axis=-1)
+        values[view] += 0.3 * np.exp(-0.5 * (distance / 0.15) ** 2)
+    found = residuals_of(ball(), scan_of(values))
+    np.testing.assert_allclose(found.worst, place, atol=0.3)
+    assert found.worst_value > 3 * found.usual_value
+    assert verdict(ball(), found)[2].startswith("Distrust what lies around x, y, z = ")
+
+
+def test_scatter_of_the_plan_belongs_to_the_model():
+    scan = scan_of(-np.log(np.exp(-line_integrals()) + 0.05))
+    told = {"calibration": Answer.found({"fitted": {"scatter": 0.05}}), "fitted_blur": Answer.found(0.0)}
+    assert residuals_of(ball(told), scan).rms == pytest.approx(1.0, abs=0.1)
+    assert residuals_of(ball(), scan).rms > 3
+
+
+def test_rays_that_are_not_valid_do_not_count():
+    values = line_integrals()
+    values[3] += 1.0
+    scan = scan_of(values)
+    scan.valid = np.ones(scan.projections.shape, bool)
+    scan.valid[:, 3] = False
+    found = residuals_of(ball(), scan)
+    assert np.isnan(found.by_view[3]) and found.rms == pytest.approx(1.0, abs=0.1)
+
+
+def test_another_scan_is_refused():
+    other = Result(np.zeros((1, 3, 4, 5)), VolumeGrid((3, 4, 5), (-1, -1, -1), (1, 1, 1)))
+    with pytest.raises(ValueError, match="with its Gaussians"):
+        residuals_of(other, scan_of(line_integrals()))
+    with pytest.raises(ValueError, match="scan: expected the scan of the result"):
+        residuals_of(ball_of(other), scan_of(line_integrals()))
+
+
+def test_without_any_gaussian_all_is_residual():
+    values = np.full((VIEWS, ROWS, COLUMNS), 0.5)
+    nothing = ball()
+    nothing.gaussians = {name: part[:0] for name, part in nothing.gaussians.items()}
+    found = residuals_of(nothing, scan_of(values))
+    assert found.rms == pytest.approx(0.5 * found.photons**0.5, rel=0.01)
+
+
+def test_the_page_of_a_scan_has_fdk_and_the_residuals(tmp_path):
+    ball().report(tmp_path / "page.html", scan=scan_of(line_integrals()))
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert page.count("<figure>") == 2 and "FDK (the standard)" in page
+    assert "rms residual by view" in page and "<h1>ball</h1>" in page
+    assert page.index("The model explains") < page.index("<figure>"), "the verdict comes first"

@@ -1,0 +1,125 @@
+"""What a result's plan says, for people: the only file of the report that reads ``Result.plan``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from tomo_polysplat.plan.answer import Answer, Status
+
+__all__ = [
+    "RayPhysics",
+    "decisions",
+    "found_about_the_scanner",
+    "how_it_ended",
+    "in_words",
+    "ray_physics",
+    "rest_of_plan",
+]
+
+
+@dataclass(frozen=True)
+class RayPhysics:
+    """What the plan found about how rays are measured, beside the spectrum.
+
+    Attributes
+    ----------
+    blur : float
+        Variance of the detector's blur in squared pixels.
+    pixel_rays : int
+        Rays a pixel and axis over which the light is averaged.
+    scatter, of_light : float
+        Scattered signal as a fraction of the open beam, and its part that goes with the light around a ray.
+    beam : float
+        Brightness of the beam, in those of the open field.
+    """
+
+    blur: float = 0.0
+    pixel_rays: int = 1
+    scatter: float = 0.0
+    of_light: float = 0.0
+    beam: float = 1.0
+
+
+# What mattered, in the order in which a reader asks; and a sentence's subject for each.
+_TOLD = {
+    "model": "The rays",
+    "spectrum": "The spectrum",
+    "water_correction": "The scanner's water correction",
+    "scatter": "Scatter",
+    "detector_blur": "The detector's blur",
+    "fitted_blur": "The blur that was found",
+    "pixel_rays": "Rays a pixel and axis",
+    "photons_per_ray": "The noise (photons of an open ray)",
+    "hardening": "Beam hardening (the largest -log(I/I0))",
+    "curves": "Material curves",
+    "soft_reference": "The object's main matter",
+    "soft_material": "The material number of soft matter",
+    "light": "Less dense soft matter",
+    "start": "The start",
+    "window": "The edge of the volume",
+    "edges": "Edges",
+    "growth": "The number of Gaussians, in those of the seeds",
+    "tv_factor": "Smoothing, in times the usual",
+    "passes": "Passes over the views",
+    "stop": "The end",
+}
+
+
+def decisions(plan: Mapping[str, Answer]) -> list[tuple[str, Answer]]:
+    """Subject and answer of all that a reader asks for, in that order."""
+    return [(_TOLD[name], plan[name]) for name in _TOLD if name in plan]
+
+
+def in_words(answer: Answer) -> str:
+    """Its value, if that is short, and why."""
+    value = answer.value
+    if isinstance(value, (Mapping, list, tuple)) or value == "":
+        return answer.why
+    return str(answer)
+
+
+def found_about_the_scanner(plan: Mapping[str, Answer]) -> str:
+    """One sentence on what the fit took from the rays about how they were measured."""
+    rays = ray_physics(plan)
+    found = []
+    if "water_correction" in plan:
+        found.append(f"a water correction, undone ({plan['water_correction'].why})")
+    if rays.scatter or rays.of_light:
+        found.append(f"scatter of {rays.scatter:.2g} of the open beam")
+    if rays.beam != 1.0:
+        found.append(f"a beam {rays.beam:.4g} times as bright as the open field")
+    if rays.blur and plan["detector_blur"].status is Status.ASKED:
+        found.append(f"a detector that blurs by {rays.blur**0.5:.2g} pixels (standard deviation)")
+    if rays.pixel_rays > 1:
+        found.append("pixels that average the light")
+    if not found:
+        return "About the scanner nothing was found that the geometry and the spectrum had not said."
+    return f"About the scanner was found: {'; '.join(found)}."
+
+
+def how_it_ended(plan: Mapping[str, Answer]) -> str:
+    """Why the run ended."""
+    return plan["stop"].why if "stop" in plan else ""
+
+
+def rest_of_plan(plan: Mapping[str, Answer]) -> dict[str, Any]:
+    """The entries that `decisions` leaves out."""
+    return {
+        name: answer.value if isinstance(answer.value, Mapping) and not answer.why else in_words(answer)
+        for name, answer in plan.items()
+        if name not in _TOLD
+    }
+
+
+def ray_physics(plan: Mapping[str, Answer]) -> RayPhysics:
+    """The numbers of the plan that a prediction of the rays needs."""
+    found = plan["calibration"].value["fitted"] if "calibration" in plan else {}
+    return RayPhysics(
+        blur=float(plan["fitted_blur"].value) if "fitted_blur" in plan else 0.0,
+        pixel_rays=max(1, plan["pixel_rays"].value) if "pixel_rays" in plan else 1,
+        scatter=float(found.get("scatter", 0.0)),
+        of_light=float(found.get("scatter_of_light", 0.0)),
+        beam=float(found.get("beam", 1.0)),
+    )

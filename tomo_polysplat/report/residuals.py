@@ -1,0 +1,220 @@
+"""How well a result explains the rays it was made from: residuals in units of each ray's noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from tomo_polysplat.checks import fail
+from tomo_polysplat.kernels.project.autograd import project
+from tomo_polysplat.kernels.select import choose, pick_fast_device
+from tomo_polysplat.kernels.views import DetectorViews
+from tomo_polysplat.physics.base_materials import Materials
+from tomo_polysplat.physics.detector_blur import LARGEST_BLUR, blurred
+from tomo_polysplat.physics.pixel_light import averaged_light
+from tomo_polysplat.physics.scatter import light_around
+from tomo_polysplat.render.renderer import detector_views
+from tomo_polysplat.report.decided import RayPhysics, ray_physics
+from tomo_polysplat.report.where import MisfitMap
+from tomo_polysplat.scan.geometry import from_astra, is_planar_geometry
+from tomo_polysplat.scan.noise import photons_per_ray
+from tomo_polysplat.scan.usable import usable_rays
+from tomo_polysplat.units import cm_per
+
+if TYPE_CHECKING:
+    from tomo_polysplat.result.result import Result
+    from tomo_polysplat.scan.scan import Scan
+
+__all__ = ["MOST_VIEWS", "Residuals", "residuals_of"]
+
+# Views that are looked at, evenly spread over the scan, and together; and pixels of the map along an edge.
+MOST_VIEWS, _AT_ONCE, _MAP = 180, 4, 192
+# Where a Gaussian's projection ends, in deviations; as in the fit.
+_CUTOFF = 3.0
+# A ray this many deviations off is not explained.
+_FAR = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """What the model says of the rays, less what was measured.
+
+    Attributes
+    ----------
+    views : (n,) int array
+        The views looked at.
+    by_view : (n,) array
+        Root mean square of the residuals of each, in units of noise; NaN where no ray of it is usable.
+    by_pixel : (rows, columns) array
+        The same of each pixel over the views; blocks of pixels where there are many, NaN where none is usable.
+    bias : (rows, columns) array
+        Mean residual, model less measurement, in units of noise: what noise alone would average out.
+    rms, within : float
+        Root mean square over all rays, and the share of them that is off by less than three deviations.
+    rays : int
+        Usable rays looked at.
+    photons : float
+        Of an unattenuated ray, from which the noise follows; infinity for data without noise, whose residuals are
+        those of -log(I/I0) themselves.
+    worst : (3,) array
+        Where in the volume the rays meet that are explained worst, (x, y, z); see ``report.where``.
+    worst_value, usual_value : float
+        Root mean square of the rays through there, and through the middling point of the volume.
+    block : int
+        Pixels along an edge of a block of the maps.
+    """
+
+    views: np.ndarray
+    by_view: np.ndarray
+    by_pixel: np.ndarray
+    bias: np.ndarray
+    rms: float
+    within: float
+    rays: int
+    photons: float
+    worst: np.ndarray
+    worst_value: float
+    usual_value: float
+    block: int = 1
+
+    @property
+    def unit(self) -> str:
+        """What the numbers are in."""
+        return "deviations of the noise" if np.isfinite(self.photons) else "units of -log(I/I0)"
+
+
+def residuals_of(
+    result: Result, scan: Scan, *, device: str = "auto", most_views: int = MOST_VIEWS
+) -> Residuals:
+    """Project the Gaussians of a result along the rays of its scan, and compare.
+
+    The variance of -log(I/I0) of Poisson counts is exp(P)/I0, with P as the model has it and I0 from the scatter of
+    neighbouring pixels. The detector's blur and scatter count as the plan tells of them.
+
+    Parameters
+    ----------
+    result : Result
+    scan : Scan
+        What it was made from.
+    device : {"auto", "cpu", "cuda", "cuda:N"}
+    most_views : int
+        At most so many, evenly spread.
+
+    Raises
+    ------
+    ValueError
+        If the scan has another volume or unit than the result, or this has no Gaussians.
+    """
+    if not result.gaussians:
+        raise fail("result", "one with its Gaussians", "a volume alone")
+    if scan.volume_shape != result.grid.shape or scan.unit != result.unit:
+        got = f"a volume of {scan.volume_shape} in {scan.unit}"
+        wanted = f"the scan of the result, {result.grid.shape} in {result.unit}"
+        raise fail("scan", wanted, got)
+    spectrum = result.spectrum if result.materials is not None else None
+    correction = scan.water_correction if spectrum is not None else None
+    values, _ = usable_rays(scan.projections, scan.proj_geom, scan.usable, correction, spectrum)
+    geometry, grid = from_astra(scan.proj_geom, scan.vol_geom)
+    count = min(most_views, geometry.views)
+    chosen = np.unique(np.linspace(0, geometry.views - 1, count).round().astype(int))
+    some = geometry.select(chosen)
+    planar = is_planar_geometry(scan.proj_geom) or geometry.planar
+    model = _Model(result, detector_views(some, planar), pick_fast_device(device))
+    return _collected(model, values[chosen], chosen, photons_per_ray(values), MisfitMap(some, grid))
+
+
+class _Model:
+    """Predicts -log(I/I0) of some views from the Gaussians of a result."""
+
+    def __init__(self, result: Result, views: DetectorViews, device: torch.device) -> None:
+        self.views, self.device = views, device
+        self.kernel, _ = choose(device)
+        self.physics: RayPhysics = ray_physics(result.plan)
+        parts = {name: np.asarray(part, np.float32) for name, part in result.gaussians.items()}
+        density, u = parts["density"], parts["u"]
+        shares = np.ones((1, len(u))) if result.materials is None else Materials.mixture(u)
+        dims = 2 if views.planar else 3
+        arrays = (parts["position"], parts["scale"][:, :dims], parts["rotation"], density * shares)
+        self.gaussians = [torch.from_numpy(np.ascontiguousarray(a, np.float32)).to(device) for a in arrays]
+        self.lines = self._spectral_lines(result)
+
+    def _spectral_lines(self, result: Result) -> tuple[torch.Tensor, torch.Tensor] | None:
+        """Logarithm of the weights, and attenuation (energies, curves) of densities times lengths in the unit."""
+        if result.materials is None or result.spectrum is None:
+            return None
+        curves = result.materials.mass_attenuation(result.spectrum.energies).T * cm_per(result.unit)
+        logs = np.log(np.maximum(result.spectrum.weights / result.spectrum.weights.sum(), 1e-30))
+        tensors = (torch.from_numpy(np.asarray(a, np.float32)).to(self.device) for a in (logs, curves))
+        return next(tensors), next(tensors)
+
+    @torch.no_grad()
+    def predict(self, some: np.ndarray, measured: torch.Tensor) -> torch.Tensor:
+        """(views, rows, columns) of the views `some`, whose measured values tell how scatter varies."""
+        views, parts = self.views.select(some), self.physics.pixel_rays
+        fine = views if parts == 1 else views.finer(parts)
+        position, scale, rotation, weight = self.gaussians
+        areal, _ = project(position, scale, rotation, weight, fine, kernel=self.kernel, cutoff=_CUTOFF)
+        if self.lines is None:
+            values = areal[0]
+        else:
+            logs, curves = self.lines
+            exponents = logs[:, None] - curves @ areal.reshape(areal.shape[0], -1)
+            values = -torch.logsumexp(exponents, dim=0).reshape(areal.shape[1:])
+        if parts > 1:
+            values = averaged_light(values, views.rows, views.columns)
+        if self.physics.scatter or self.physics.of_light:
+            scatter = self.physics.scatter + self.physics.of_light * light_around(measured)
+            values = -torch.log(torch.exp(-values) + scatter.clamp(min=0))
+        if self.physics.beam != 1.0:
+            values = values - float(np.log(self.physics.beam))
+        variance = values.new_tensor([min(max(self.physics.blur, 0.0), LARGEST_BLUR)])
+        return blurred(values, variance) if self.physics.blur > 0 else values
+
+
+def _collected(
+    model: _Model, values: np.ndarray, chosen: np.ndarray, photons: float, where: MisfitMap
+) -> Residuals:
+    pixels = np.zeros((3, *values.shape[1:]))  # how many, their sum, the sum of their squares
+    by_view, near = np.full(len(chosen), np.nan), 0
+    for first in range(0, len(chosen), _AT_ONCE):
+        some = np.arange(first, min(first + _AT_ONCE, len(chosen)))
+        scaled, good = _scaled(model, some, values[some], photons)
+        squares = scaled**2
+        pixels += np.stack([part.sum(axis=0) for part in (good, scaled, squares)])
+        where.add(some, squares, good)
+        by_view[some] = _root_mean(squares.sum(axis=(1, 2)), good.sum(axis=(1, 2)))
+        near += int((np.abs(scaled[good]) < _FAR).sum())
+    rays = int(pixels[0].sum())
+    block = max(1, -(-max(values.shape[1:]) // _MAP))
+    number, total, squares = (_blocks(part, block) for part in pixels)
+    bias = np.divide(total, number, out=np.full(number.shape, np.nan), where=number > 0)
+    rms, within = float(np.sqrt(pixels[2].sum() / max(rays, 1))), near / max(rays, 1)
+    maps = by_view, _root_mean(squares, number), bias
+    return Residuals(chosen, *maps, rms, within, rays, photons, *where.worst(), block)
+
+
+def _scaled(
+    model: _Model, some: np.ndarray, values: np.ndarray, photons: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals of some views in units of noise, 0 where a ray is not usable, and where one is."""
+    measured = torch.from_numpy(np.ascontiguousarray(values)).to(model.device)
+    predicted = model.predict(some, measured)
+    noise = torch.exp(0.5 * predicted) / photons**0.5 if np.isfinite(photons) else 1.0
+    scaled = ((predicted - measured) / noise).cpu().numpy().astype(np.float64)
+    good = np.isfinite(scaled)
+    return np.where(good, scaled, 0.0), good
+
+
+def _root_mean(squares: np.ndarray, number: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.divide(squares, number, out=np.full(number.shape, np.nan), where=number > 0))
+
+
+def _blocks(image: np.ndarray, block: int) -> np.ndarray:
+    """Sums over square blocks of pixels; the last ones may be smaller."""
+    if block == 1:
+        return image
+    rows, columns = (np.arange(0, length, block) for length in image.shape)
+    return np.add.reduceat(np.add.reduceat(image, rows, axis=0), columns, axis=1)
