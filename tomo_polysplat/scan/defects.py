@@ -1,4 +1,4 @@
-"""From counts to line integrals, keeping account of the rays that were not measured properly."""
+"""Convert counts to line integrals, and count the rays that were not measured properly."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def attenuation(
     dark: np.ndarray | None = None,
     saturation: float | None = None,
 ) -> tuple[np.ndarray, np.ndarray, dict[str, int]]:
-    """Line integrals and which of them can be trusted.
+    """Line integrals, and which of them are valid.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def attenuation(
     Returns
     -------
     projections : float32 array, shape of `values`
-        ``-log((values - dark) / (flat - dark))``; where it is not valid infinite if no light was seen, else 0.
+        ``-log((values - dark) / (flat - dark))``. An invalid ray is infinite if no light was seen, else 0.
     valid : bool array, shape of `values`
         False for rays without light, of dead pixels, saturated, or not finite. Nothing is clipped.
     counts : dict
@@ -76,7 +76,7 @@ def attenuation(
     usable = np.isfinite(values)
     counts = {"not_finite": int(values.size - np.count_nonzero(usable))}
     if kind == "attenuation":
-        # What float32 cannot hold is as infinite as what the file calls so.
+        # Values beyond float32 count as infinite.
         with np.errstate(over="ignore"):
             narrow = np.where(usable, values, 0).astype(np.float32)
         usable &= np.isfinite(narrow)
@@ -115,8 +115,8 @@ def _drop(usable: np.ndarray, bad: np.ndarray) -> int:
 def fill_invalid(projections: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
     """Projections with every invalid ray replaced, linearly between the valid ones of its detector row.
 
-    For methods that cannot leave a ray out, such as filtered backprojection. The last axis is the detector
-    column; beyond the outermost valid ray a row goes on as it ends, and rows without one become 0.
+    It is for methods that cannot leave a ray out, such as filtered backprojection. The last axis is the detector
+    column. Beyond the outermost valid ray a row is constant; rows without a valid ray become 0.
 
     Parameters
     ----------

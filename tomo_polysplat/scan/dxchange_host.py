@@ -1,9 +1,8 @@
 """Arrays of Data Exchange files through dxchange where it is installed, through h5py otherwise.
 
-Only whole arrays and blocks of views go through dxchange, and only when they are read: on a full disk its
-writer ends the process. Its readers of complete scans make up the angles 0 to
-180 degrees, end point included, when a file has none, and leave out what they do not find; these choices are
-made in the open by `data_exchange`.
+dxchange only reads, and only whole arrays and blocks of views: on a full disk its writer ends the process. Its
+readers of complete scans invent the angles 0 to 180 degrees, end point included, if a file has none, and leave out
+what they do not find. Here `data_exchange` makes these choices and tells them.
 """
 
 from __future__ import annotations

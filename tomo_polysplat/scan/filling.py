@@ -1,4 +1,4 @@
-"""Rows with holes filled in place, compiled: a dead column of a large scan spoils millions of rows."""
+"""Fill holes in rows in place. It is compiled, because a dead column of a large scan spoils millions of rows."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["fill_rows_in_place"]
 
 @njit(nogil=True, cache=True)
 def fill_rows_in_place(rows: np.ndarray, valid: np.ndarray) -> None:
-    """Replace what is not valid, linearly between valid neighbours and constant beyond the outermost.
+    """Replace invalid values, linearly between valid neighbours and constant beyond the outermost ones.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def fill_rows_in_place(rows: np.ndarray, valid: np.ndarray) -> None:
 
 @njit(nogil=True, cache=True)
 def _bridge(values, before, after):
-    """Fill what lies between two valid columns, the first -1 and the second the end where there is none."""
+    """Fill the values between two valid columns; -1 or the row's length stand for a missing one."""
     if before < 0 and after == len(values):
         values[:] = 0
     elif before < 0:

@@ -1,8 +1,8 @@
-"""Writing HDF5 files so that a full disk is an error and not the end of the process.
+"""Write HDF5 files so that a full disk is an error and not the end of the process.
 
-HDF5 keeps parts of a file in memory until it is closed. When they cannot be written then, it goes on with what
-it has half freed, and the process may die. So it never learns of it here: it writes to a file object that keeps
-the first error for later, and the room for the arrays is taken before it begins.
+HDF5 keeps parts of a file in memory until it is closed. If they cannot be written then, it goes on with memory that is
+half freed, and the process may die. So HDF5 writes to a file object here that hides errors from it and keeps the first
+one for later. The room for the arrays is taken before HDF5 begins.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def new_hdf5(path: str | os.PathLike, *, overwrite: bool, needed_bytes: int) -> 
     path, overwrite
         See :func:`tomo_polysplat.files.replacing`, whose errors are raised too.
     needed_bytes : int
-        Of the arrays; their room is taken first.
+        Bytes of the arrays. Their room is taken first.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def _too_full(error: OSError, size: int) -> Exception:
 
 
 class _PatientFile:
-    """A file object for HDF5: after a write that fails it only pretends, and `finish` raises what had happened."""
+    """A file object for HDF5. After a failed write it ignores further writes, and `finish` raises the first error."""
 
     def __init__(self, file: int) -> None:
         self.error: Exception | None = None
@@ -91,13 +91,13 @@ class _PatientFile:
         view = memoryview(buffer).cast("B")
         got = os.pread(self._file, len(view), self._at)
         view[: len(got)] = got
-        # Beyond what is written a file holds zeros, and HDF5 takes fewer bytes for an error.
+        # HDF5 takes fewer bytes for an error, so zeros stand for what is not written yet.
         view[len(got) :] = bytes(len(view) - len(got))
         self._at += len(view)
         return len(view)
 
     def read(self, size: int) -> bytes:
-        """What h5py knows a file object by; it reads by `readinto`."""
+        """Needed because h5py recognises a file object by it; h5py reads with `readinto`."""
         buffer = bytearray(size)
         self.readinto(buffer)
         return bytes(buffer)
@@ -119,7 +119,7 @@ class _PatientFile:
         return self._end
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Nothing is buffered here."""
 
     def finish(self) -> None:
         """Cut off the room that was not needed."""

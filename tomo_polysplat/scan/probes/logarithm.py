@@ -24,7 +24,7 @@ _BORDER = 0.04
 
 
 def probe_logarithm(measured: Measured) -> Finding:
-    """Tell -log(I/I0) from I/I0 and from counts: an object adds to the first and takes away from the others."""
+    """Tell -log(I/I0) from I/I0 and from counts: an object raises the first and lowers the others."""
     values = measured.filled
     low, high = (float(value) for value in np.percentile(values, [1, 99]))
     width = max(1, int(_BORDER * values.shape[2]))

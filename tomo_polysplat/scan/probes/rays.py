@@ -12,13 +12,13 @@ from tomo_polysplat.scan.probes.measured import Measured
 
 __all__ = ["DEAD", "RAYS", "bad_rays", "probe_rays"]
 
-# Shares of rays, and of the views of a pixel, from which they count as a defect of the detector.
+# Shares of bad rays, and of bad views of a pixel, from which they are a defect of the detector.
 _TOLERATED, _MOSTLY = 0.002, 0.5
 # Share of the views in which a pixel must stand out.
 _ALMOST_ALL = 0.8
 # Deviation of a pixel from all its neighbours, as a share of the scan's large values.
 _STANDS_OUT = 0.1
-# Around rays without light there is almost none: their neighbours' share of the scan's large values.
+# Rays without light have dark neighbours: these have at least this share of the scan's large values.
 _OPAQUE = 0.6
 # Share of the scan's large values that a ray through the object has.
 _THROUGH = 0.1
@@ -27,7 +27,7 @@ _THROUGH = 0.1
 RAYS = "bad rays"
 DEAD, ZERO = "of dead pixels", "zero in the middle of the object"
 STARVED = "without light behind dense matter"
-# Rays looked at, of so many views at least.
+# How many rays to look at, and the least number of views.
 _MOST_RAYS, _FEWEST_VIEWS = 8_000_000, 12
 
 
@@ -86,15 +86,15 @@ def _starved(projections: np.ndarray, valid: np.ndarray, level: float) -> np.nda
 def _dead_pixels(projections: np.ndarray, valid: np.ndarray, level: float) -> np.ndarray:
     """Pixels above or below all their neighbours in four views of five, or that never change, (rows, columns).
 
-    What turns with the object does not stay in one pixel; what is round about the axis goes on into the next
-    rows. A detector of one or two rows has no such neighbours, and its pixels must stand out by more.
+    Matter that turns with the object does not stay in one pixel. Matter that is round about the axis goes on into
+    the next rows. A detector of one or two rows has no such neighbours, so its pixels must differ by more.
     """
     rows, views, columns = projections.shape
     if columns < 5 or views < 5:
         return np.zeros((rows, columns), bool)
     values = np.where(valid, projections, np.nan)
     near = _neighbours(values)
-    # One neighbour after the other: a copy of the scan for each of the eight would be too many.
+    # One neighbour after the other: eight copies of the scan would need too much memory.
     highest, lowest = reduce(np.fmax, near), reduce(np.fmin, near)
     off = np.nan_to_num(np.fmax(values - highest, 0) - np.fmax(lowest - values, 0))
     limit = (_STANDS_OUT if rows > 2 else 3 * _STANDS_OUT) * level
@@ -114,7 +114,7 @@ def _neighbours(values: np.ndarray) -> list[np.ndarray]:
 
 
 def _at_a_limit(projections: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Rays that share the very largest, or the very smallest but for zero, value with many others."""
+    """Rays whose value, the largest or the smallest above zero, is also that of many other rays."""
     values = projections[valid]
     limits = [] if not values.size else [values.max(), values.min()]
     masks = [valid & (projections == limit) for limit in limits if limit != 0]
