@@ -116,6 +116,25 @@ def test_what_rays_cannot_tell_is_not_fitted_and_said():
     assert Alignment(orbit(), 1.0, names=("v",)).names == ("v",)
 
 
+def test_a_scan_of_one_plane_stays_in_it():
+    told = orbit(rows=1)
+    alignment = Alignment(told, 1.0)
+    assert told.planar and alignment.names == ("u", "views")
+    views = detector_views(told, True)
+    position, scale, rotation, weight = cloud(9)
+    position[:, 2], scale[:, 2], rotation[:, 1:3] = 0.0, float("inf"), 0.0
+    vectors = alignment.vectors(np.arange(21)).requires_grad_()
+    scene = (position, scale, rotation, weight)
+    image, _ = project(*scene, views, kernel="numba", cutoff=4.0, vectors=vectors)
+    image.square().sum().backward()
+    alignment.step(np.arange(21), alignment.gradient(np.arange(21), vectors.grad), 0.5)
+    alignment.hold_gauge()
+    assert (alignment.values["views"][:, 0] != 0).any() and alignment.values["views"][
+        :, 1
+    ].abs().max() < 1e-12
+    assert alignment.geometry().planar
+
+
 def test_an_unknown_move_is_refused():
     with pytest.raises(ValueError, match="align: expected 'auto' or names among u, v"):
         Alignment(orbit(), 1.0, names=("rol",))

@@ -18,10 +18,12 @@ from tomo_polysplat.scan.gauges import effects, view_gauge, without_gauge
 from tomo_polysplat.scan.moves import MOVES, MovedViews, Scanner, moved_geometry
 from tomo_polysplat.scan.view_geometry import Geometry
 
-__all__ = ["USUAL", "Alignment", "Schedule", "levels", "schedule", "worth_it"]
+__all__ = ["IN_PLANE", "USUAL", "Alignment", "Schedule", "levels", "schedule", "worth_it"]
 
 # What is moved where the rays tell it. Offsets along v and distances are left: the object takes their place.
 USUAL = ("u", "roll", "tilt", "skew", "views")
+# In a scan of one plane, out of which nothing may move.
+IN_PLANE = ("u", "views")
 # Angles beyond these, and per cent, are no misalignments: a fit that goes there follows something else.
 _LARGEST = {"roll": 10.0, "tilt": 10.0, "slant": 10.0, "skew": 10.0, "distance": 10.0}
 # A move is fitted where the object leaves this share of what it does, and where a move by _COMMON of its unit shifts
@@ -87,7 +89,7 @@ class Alignment:
     radius : float
         Of the object, likewise.
     names : sequence of names of `MOVES`, or "auto"
-        What is moved; "auto" is what of `USUAL` the rays tell.
+        What is moved; "auto" is what of `USUAL`, or of `IN_PLANE`, the rays tell.
     pivot : (3,) array, optional
         A point on the axis of rotation, the origin by default.
     start : mapping of name to number, optional
@@ -118,7 +120,8 @@ class Alignment:
         start: Mapping[str, float] | None = None,
     ) -> None:
         self.scanner = Scanner(geometry, pivot)
-        wanted = USUAL if isinstance(names, str) and names == "auto" else tuple(names)
+        usual = IN_PLANE if geometry.planar else USUAL
+        wanted = usual if isinstance(names, str) and names == "auto" else tuple(names)
         for name in (*wanted, *(start or {})):
             if name not in MOVES:
                 raise fail("align", f"'auto' or names among {', '.join(MOVES)}", repr(name))
