@@ -32,6 +32,7 @@ LAYERS = (
     ("kernels",),
     ("physics",),
     ("scan",),
+    ("nuisances",),
     ("simulate", "start"),
     ("model",),
     ("render",),

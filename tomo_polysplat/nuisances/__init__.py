@@ -1,0 +1,1 @@
+"""What the scanner did that is not the object, as parameters that are fitted beside it."""
