@@ -12,7 +12,7 @@ from tomo_polysplat.simulate.folders.write import KINDS, write_folder
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_folder_gives_the_volume_of_our_own_file(kind, tmp_path):
-    own = write_folder(kind, tmp_path / "folder", marked())
+    own = write_folder(kind, tmp_path / "folder")
     tps.save_scan(own, tmp_path / "own.h5")
     scan = tps.load_scan(tmp_path / "folder")
     require_the_same_volume(scan, tps.load_scan(tmp_path / "own.h5"))
