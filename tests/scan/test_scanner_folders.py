@@ -12,13 +12,14 @@ from tomo_polysplat.simulate.folders.write import KINDS, write_folder
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_folder_gives_the_volume_of_our_own_file(kind, tmp_path):
-    own = write_folder(kind, tmp_path / "folder", marked())
+    own = write_folder(kind, tmp_path / "folder")
     tps.save_scan(own, tmp_path / "own.h5")
     scan = tps.load_scan(tmp_path / "folder")
     require_the_same_volume(scan, tps.load_scan(tmp_path / "own.h5"))
-    # What the folder tells of the tube makes the spectrum that the scan was made with.
-    assert scan.spectrum.effective_energy == pytest.approx(own.spectrum.effective_energy)
-    assert any("flat panel" in guess for guess in scan.notes["scanner"]["guessed"])
+    if kind in ("tiffs", "skyscan", "nikon"):
+        # What the folder tells of the tube makes the spectrum that the scan was made with.
+        assert scan.spectrum.effective_energy == pytest.approx(own.spectrum.effective_energy)
+        assert any("flat panel" in guess for guess in scan.notes["scanner"]["guessed"])
 
 
 def test_a_folder_is_not_written_over(tmp_path):

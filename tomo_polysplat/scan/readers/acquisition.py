@@ -33,6 +33,9 @@ class Setup:
         Of the detector's middle from the foot of the ray through the axis, to the right and up.
     roll : float
         Degrees by which the detector is turned about its middle, counterclockwise.
+    axis : float
+        How far to the right of the line from the source to the foot the axis stands, source and detector facing each
+        other. A turntable that was moved aside is that; a detector that was, `offset`.
     """
 
     degrees: np.ndarray
@@ -41,6 +44,7 @@ class Setup:
     source_detector: float | None = None
     offset: tuple[float, float] = (0.0, 0.0)
     roll: float = 0.0
+    axis: float = 0.0
 
     def geometry(self, rows: int, columns: int) -> Geometry:
         """Of a detector whose rows ascend with z."""
@@ -51,7 +55,16 @@ class Setup:
         else:
             known |= {"source_object": self.source_object, "source_detector": self.source_detector}
             proj_geom, _ = cone_geometry(**known)
-        return _rolled(geometry_from_astra(proj_geom), self.roll)
+        return _rolled(_moved(geometry_from_astra(proj_geom), -self.axis), self.roll)
+
+
+def _moved(geometry: Geometry, right: float) -> Geometry:
+    """Source and detector moved along the columns together."""
+    if not right:
+        return geometry
+    step = right * geometry.u / np.linalg.norm(geometry.u, axis=1, keepdims=True)
+    origin = geometry.origin + step if geometry.beam == "cone" else geometry.origin
+    return replace(geometry, origin=origin, corner=geometry.corner + step)
 
 
 def _rolled(geometry: Geometry, degrees: float) -> Geometry:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
@@ -12,7 +12,7 @@ import numpy as np
 from tomo_polysplat.checks import fail
 from tomo_polysplat.files import existing_file, require_plausible_size
 
-__all__ = ["ArrayFrames", "Frames", "TiffFrames"]
+__all__ = ["ArrayFrames", "Frames", "Hdf5Frames", "TiffFrames"]
 
 
 class Frames(Protocol):
@@ -33,7 +33,7 @@ class Frames(Protocol):
 class ArrayFrames:
     """Pictures of an array, which may be a memory map or a dataset of an open file, (pictures, rows, columns)."""
 
-    def __init__(self, array: Any, chosen: Sequence[int] | None = None) -> None:
+    def __init__(self, array: Any, chosen: np.ndarray | None = None) -> None:
         if array.ndim != 3 or 0 in array.shape or array.dtype.kind not in "fiu":
             got = f"{array.dtype} of shape {tuple(array.shape)}"
             raise fail("path", "pictures of numbers, (pictures, rows, columns)", got)
@@ -45,6 +45,41 @@ class ArrayFrames:
     def read(self, index: int, rows: slice, columns: slice) -> np.ndarray:
         """Part of one picture."""
         return np.asarray(self._array[int(self._chosen[index]), rows, columns])
+
+
+class Hdf5Frames:
+    """Some pictures of a dataset (pictures, rows, columns) of an HDF5 file, which is opened when they are asked for.
+
+    Parameters
+    ----------
+    path : Path
+        Of a file that has been looked through already.
+    name : str
+        Of the dataset.
+    chosen : array of int
+    """
+
+    def __init__(self, path: Path, name: str, chosen: np.ndarray) -> None:
+        self._path, self._name, self._chosen = path, name, chosen
+        self._frames: ArrayFrames | None = None
+        opened = self._opened()
+        self.shape, self.dtype = opened.shape, opened.dtype
+
+    def read(self, index: int, rows: slice, columns: slice) -> np.ndarray:
+        """Part of one picture."""
+        try:
+            return self._opened().read(index, rows, columns)
+        except (OSError, RuntimeError) as error:
+            remedy = "it is damaged, or needs a compression plugin (python -m pip install hdf5plugin)"
+            raise fail("path", "a readable HDF5 file", f"{self._path} ({error})", remedy) from error
+
+    def _opened(self) -> ArrayFrames:
+        if self._frames is None:
+            import h5py
+
+            # Closed with the last reference to its dataset.
+            self._frames = ArrayFrames(h5py.File(self._path, "r")[self._name], self._chosen)
+        return self._frames
 
 
 class TiffFrames:

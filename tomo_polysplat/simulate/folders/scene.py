@@ -15,7 +15,7 @@ from tomo_polysplat.simulate.scanner import Scanner
 from tomo_polysplat.simulate.scenes import scan_phantom
 from tomo_polysplat.simulate.shapes import cylinder, ellipsoid
 
-__all__ = ["MARKER", "SETTINGS", "Pictures", "marked_scan", "pictures_of"]
+__all__ = ["MARKER", "SETTINGS", "Pictures", "corrected", "marked_scan", "pictures_of"]
 
 # Where the marker is, in cm: on no axis, and higher than the middle.
 MARKER = (0.45, 0.2, 0.3)
@@ -31,7 +31,6 @@ class _Settings:
     kvp: float = 90.0
     filter_mm: float = 1.0
     columns_off: float = 1.5
-    """Columns by which the detector's middle is to the right of the axis' shadow."""
 
 
 SETTINGS = _Settings()
@@ -56,7 +55,14 @@ class Pictures:
 
 
 def marked_scan(
-    views: int = 48, rows: int = 33, columns: int = 37, *, beam: str = "cone", seed: int = 0
+    views: int = 48,
+    rows: int = 33,
+    columns: int = 37,
+    *,
+    beam: str = "cone",
+    columns_off: float = SETTINGS.columns_off,
+    aside: float = 0.0,
+    seed: int = 0,
 ) -> Scan:
     """A PMMA cylinder of 14 mm, a hole and an aluminium ball at `MARKER` in it, in mm.
 
@@ -64,16 +70,22 @@ def marked_scan(
     ----------
     views, rows, columns : int
     beam : {"cone", "parallel"}
+    columns_off : float
+        Columns by which the detector's middle is to the right of the axis' shadow.
+    aside : float
+        By how much source and detector are to the right of the axis, in mm.
     seed : int
         Of the noise.
     """
+    import astra
+
     at, degrees = SETTINGS, np.arange(views) * (360.0 / views)
     across = 1.0 if beam == "cone" else at.source_object / at.source_detector
     known = {
         "pixel": 0.1 * at.pixel * across,
         "detector": (rows, columns),
         "degrees": degrees,
-        "offset": (0.1 * at.pixel * across * at.columns_off, 0.0),
+        "offset": (0.1 * at.pixel * across * columns_off, 0.0),
     }
     if beam == "cone":
         distances = {
@@ -83,6 +95,12 @@ def marked_scan(
         proj_geom, vol_geom = cone_geometry(**known, **distances)  # type: ignore[arg-type]
     else:
         proj_geom, vol_geom = parallel_geometry(**known)  # type: ignore[arg-type]
+    if aside:
+        proj_geom = astra.geom_2vec(proj_geom)
+        vectors = proj_geom["Vectors"]
+        right = vectors[:, 6:9] / np.linalg.norm(vectors[:, 6:9], axis=1, keepdims=True)
+        vectors[:, :3] += 0.1 * aside * right
+        vectors[:, 3:6] += 0.1 * aside * right
     phantom = Phantom(
         [
             Part(cylinder((0.0, 0.0, 0.0), 0.7, 0.6), "pmma", 1.19),
@@ -94,6 +112,13 @@ def marked_scan(
         at.kvp, filters={"Al": 0.1 * at.filter_mm}, detector=Detector.energy_integrating("CsI", 0.06)
     )
     return scan_phantom(phantom, proj_geom, vol_geom, spectrum, Scanner(1e5, seed=seed), name="marker")
+
+
+def corrected(pictures: Pictures, white: float) -> np.ndarray:
+    """The projections with their flat field and dark pictures taken out, the open beam being `white`."""
+    light = (pictures.flats - pictures.darks.astype(np.float64)).mean(axis=0)
+    passed = (pictures.projections - pictures.darks[0].astype(np.float64)) / light
+    return np.clip(np.rint(white * passed), 0, 65535).astype(np.uint16)
 
 
 def pictures_of(scan: Scan, *, light: float = 40000.0, dark: float = 100.0, frames: int = 3) -> Pictures:

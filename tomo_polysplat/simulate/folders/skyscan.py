@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tomo_polysplat.simulate.folders.scene import SETTINGS, Pictures
+from tomo_polysplat.simulate.folders.scene import SETTINGS, Pictures, corrected
 from tomo_polysplat.simulate.folders.tiffs import write_pictures
 
 __all__ = ["write"]
@@ -17,11 +17,8 @@ REFERENCE = 57000
 
 def write(folder: Path, pictures: Pictures) -> None:
     """Fill an empty folder; the object turns counterclockwise, so that the views come in the other order."""
-    light = (pictures.flats - pictures.darks.astype(np.float64)).mean(axis=0)
-    passed = (pictures.projections - pictures.darks[0].astype(np.float64)) / light
-    corrected = np.clip(np.rint(REFERENCE * passed), 0, 65535).astype(np.uint16)
-    order = -np.arange(len(corrected)) % len(corrected)
-    write_pictures(folder, "marker_", corrected[order][:, :, ::-1])
+    order = -np.arange(len(pictures.projections)) % len(pictures.projections)
+    write_pictures(folder, "marker_", corrected(pictures, REFERENCE)[order][:, :, ::-1])
     # The picture of the whole height that is taken before, of another size.
     write_pictures(folder, "marker_spr", np.zeros((1, 5, 7), np.uint16), digits=1)
     text = log_text(pictures)

@@ -32,9 +32,9 @@ operator = "nobody"
     )
 
 
-def write_pictures(folder: Path, prefix: str, pictures: np.ndarray, digits: int = 4) -> None:
-    """One TIFF for each of the pictures, numbered from 0."""
+def write_pictures(folder: Path, prefix: str, pictures: np.ndarray, digits: int = 4, first: int = 0) -> None:
+    """One TIFF for each of the pictures, numbered from `first` on."""
     import tifffile
 
-    for index, picture in enumerate(pictures):
+    for index, picture in enumerate(pictures, first):
         tifffile.imwrite(folder / f"{prefix}{index:0{digits}d}.tif", picture)

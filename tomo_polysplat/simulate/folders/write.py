@@ -7,12 +7,14 @@ from pathlib import Path
 
 from tomo_polysplat.checks import fail, require_choice
 from tomo_polysplat.scan.scan import Scan
-from tomo_polysplat.simulate.folders import skyscan, tiffs
+from tomo_polysplat.simulate.folders import nikon, nxtomo, skyscan, tiffs
 from tomo_polysplat.simulate.folders.scene import marked_scan, pictures_of
 
 __all__ = ["KINDS", "write_folder"]
 
-KINDS = {"tiffs": tiffs.write, "skyscan": skyscan.write}
+KINDS = {"tiffs": tiffs.write, "skyscan": skyscan.write, "nikon": nikon.write, "nxtomo": nxtomo.write}
+# Scans of a geometry that a kind has of its own.
+_SCANS = {"nikon": nikon.make}
 
 
 def write_folder(kind: str, folder: str | os.PathLike, scan: Scan | None = None) -> Scan:
@@ -25,7 +27,7 @@ def write_folder(kind: str, folder: str | os.PathLike, scan: Scan | None = None)
     folder : path
         A new one.
     scan : Scan, optional
-        One that `marked_scan` made; a new one by default.
+        One that `marked_scan` made; by default one that suits the kind.
 
     Raises
     ------
@@ -37,6 +39,6 @@ def write_folder(kind: str, folder: str | os.PathLike, scan: Scan | None = None)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise fail("folder", "a new or empty folder", str(target), "name another", FileExistsError)
     target.mkdir(parents=True, exist_ok=True)
-    scan = marked_scan() if scan is None else scan
+    scan = _SCANS.get(kind, marked_scan)() if scan is None else scan
     KINDS[kind](target, pictures_of(scan))
     return scan

@@ -1,0 +1,67 @@
+"""NXtomo files: keys, units, and beams that are as good as parallel."""
+
+import h5py
+import numpy as np
+import pytest
+from folders import marked, require_the_same_volume
+
+import tomo_polysplat as tps
+from tomo_polysplat.simulate.folders.write import write_folder
+
+
+@pytest.fixture
+def path(tmp_path):
+    write_folder("nxtomo", tmp_path / "sample", marked())
+    return tmp_path / "sample" / "marker.nx"
+
+
+def test_the_file_alone_and_what_it_tells(path):
+    scan = tps.load_scan(path)
+    require_the_same_volume(scan, marked())
+    told = scan.notes["scanner"]
+    assert told["exposure_s"] == "0.1" and told["keys"] == {"title": "a marker"} and scan.name == "marker"
+    assert scan.views == 48 and scan.spectrum is None and told["guessed"] == []
+    part = tps.load_scan(path, views=(1, 9, 2), rows=(4, 20), columns=(3, 33))
+    np.testing.assert_array_equal(part.projections, scan.projections[33 - 20 : 33 - 4, 1:9:2, 3:33])
+
+
+def test_a_source_far_away_sends_a_parallel_beam(path):
+    own = marked("parallel")
+    path.unlink()
+    write_folder("nxtomo", path.parent, own)
+    with h5py.File(path, "a") as file:
+        entry = file["entry0000"]
+        entry["instrument/source/distance"][()] = 145.0
+        for axis in "xy":
+            entry[f"instrument/detector/{axis}_pixel_size"][()] = 640.0
+            entry[f"instrument/detector/{axis}_pixel_size"].attrs["units"] = "um"
+        entry["sample/rotation_angle"][()] = np.deg2rad(entry["sample/rotation_angle"][()])
+        entry["sample/rotation_angle"].attrs["units"] = "rad"
+    scan = tps.load_scan(path)
+    require_the_same_volume(scan, own)
+    assert any("parallel" in guess for guess in scan.notes["scanner"]["guessed"])
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("image_key", np.ones(55, int), "pictures of image_key 0"),
+        ("image_key", np.zeros(3, int), r"shape \(55,\)"),
+        ("data", np.zeros((55, 4)), "pictures in instrument/detector/data"),
+    ],
+)
+def test_files_that_cannot_be_meant(path, name, value, message):
+    with h5py.File(path, "a") as file:
+        del file[f"entry0000/instrument/detector/{name}"]
+        file[f"entry0000/instrument/detector/{name}"] = value
+    with pytest.raises(ValueError, match=message):
+        tps.load_scan(path)
+
+
+def test_an_unknown_unit_is_refused(path):
+    with h5py.File(path, "a") as file:
+        file["entry0000/instrument/detector/distance"].attrs["units"] = "furlong"
+    with pytest.raises(
+        ValueError, match="units of instrument/detector/distance: expected one of m, .*furlong"
+    ):
+        tps.load_scan(path)

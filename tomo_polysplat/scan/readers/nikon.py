@@ -1,0 +1,144 @@
+"""Nikon (X-Tek): an .xtekct file, TIFFs with one white level, and the measured angles.
+
+The sense of rotation, the side from which the pictures are seen and the signs of ``ObjectOffsetX`` and ``ObjectRoll``
+are those that the reader of the Core Imaging Library has found.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tomo_polysplat.checks import fail
+from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
+from tomo_polysplat.scan.readers.filter_text import filters_of
+from tomo_polysplat.scan.readers.frames import TiffFrames
+from tomo_polysplat.scan.readers.ini_text import IniText
+from tomo_polysplat.scan.readers.picture_names import has_word, in_order, tiffs_in
+from tomo_polysplat.scan.readers.stated import require_known, stated_over
+
+__all__ = ["KIND", "read", "recognises"]
+
+KIND = "Nikon (.xtekct)"
+# Degrees by which measured angles may be off the even steps before they are believed instead.
+_EVEN = 0.5
+_MOST_BYTES = 1 << 24
+
+
+def recognises(path: Path) -> bool:
+    """Whether it is an .xtekct file or a folder with one."""
+    return bool(_texts(path))
+
+
+def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
+    """See `tomo_polysplat.load_scan`; `stated` has its ``scanner``."""
+    texts = _texts(path)
+    if len(texts) > 1:
+        got = ", ".join(text.name for text in texts)
+        raise fail("path", "one scan in the folder", got, "name its .xtekct file")
+    folder, text = texts[0].parent, IniText(texts[0])
+    name = text.text("Name", otherwise=texts[0].stem)
+    frames = TiffFrames(_pictures(folder, text, name))
+    expected = int(text.number("Projections", otherwise=frames.shape[0]))
+    said = []
+    if frames.shape[0] != expected:
+        said.append(f"{frames.shape[0]} pictures are there, the .xtekct tells of {expected}")
+    setup, more = _setup(text, folder, frames.shape[0])
+    told = Acquisition(
+        KIND,
+        frames,
+        setup,
+        name=name,
+        white=text.number("WhiteLevel", otherwise=0.0) or None,
+        # White is corrected to a level below the largest number: air may be brighter.
+        saturates=False,
+        from_detector=True,
+        tube=_tube(text),
+    ).saying(*said, *more)
+    told = stated_over(told, require_known(stated, "scanner"), folder)
+    return replace(told, other=text.others())
+
+
+def _texts(path: Path) -> list[Path]:
+    files = [path] if path.is_file() else path.iterdir()
+    return sorted(file for file in files if file.suffix.lower() == ".xtekct" and file.is_file())
+
+
+def _pictures(folder: Path, text: IniText, name: str) -> list[Path]:
+    """TIFFs of that name and a number, in the folder or in the one that the text names."""
+    inner = folder / Path(text.text("InputFolderName").replace("\\", "/")).name
+    for place in (folder, inner):
+        tiffs = tiffs_in(place) if place.is_dir() else []
+        named = [f for f in tiffs if re.fullmatch(rf"{re.escape(name)}_*\d+", f.stem, re.I)]
+        numbered = [f for f in tiffs if re.search(r"\d+$", f.stem)]
+        rest = [f for f in numbered if not (has_word(f.stem, "flats") or has_word(f.stem, "darks"))]
+        if named or rest:
+            return in_order(named or rest)
+    raise fail("path", f"TIFFs named {name}_0001.tif and so on", f"none in {folder}")
+
+
+def _setup(text: IniText, folder: Path, views: int) -> tuple[Setup, list[str]]:
+    near, far = text.number("SrcToObject"), text.number("SrcToDetector")
+    pixel = (text.number("DetectorPixelSizeX"), text.number("DetectorPixelSizeY"))
+    height = pixel[1] * text.number("DetectorPixelsY", otherwise=0.0)
+    top, bottom = (text.number(f"CentreOfRotation{end}", otherwise=0.0) for end in ("Top", "Bottom"))
+    aside = text.number("ObjectOffsetX", otherwise=0.5 * (top + bottom) * near / far)
+    leaning = -np.degrees(np.arctan2(top - bottom, height)) if height else 0.0
+    roll = text.number("ObjectRoll", otherwise=float(leaning))
+    said = []
+    if "ObjectOffsetX" not in text and not (top or bottom):
+        said.append(
+            "no centre of rotation: the axis is taken to fall on the detector's middle; give offset= otherwise"
+        )
+    for key in ("ObjectTilt", "DetectorOffsetX", "DetectorOffsetY"):
+        if text.number(key, otherwise=0.0):
+            said.append(f"{key} = {text.text(key)} is not used")
+    degrees, more = _degrees(text, folder, views)
+    return Setup(degrees, pixel, near, far, roll=roll, axis=-aside), said + more
+
+
+def _degrees(text: IniText, folder: Path, views: int) -> tuple[np.ndarray, list[str]]:
+    """Even steps, unless angles were measured that differ from them; the steps tell the sense."""
+    step = text.number("AngularStep", otherwise=360.0 / views)
+    start = text.number("InitialAngle", otherwise=0.0)
+    even = step * np.arange(views)
+    for file in [*sorted(folder.glob("*_ctdata.txt")), *sorted(folder.glob("*.ang"))]:
+        measured = _measured(file)
+        if len(measured) != views:
+            return start + even, [
+                f"{file.name} has {len(measured)} angles for {views} pictures: even steps are taken"
+            ]
+        from_first = measured - measured[0]
+        if from_first[-1] * even[-1] < 0:
+            from_first = -from_first
+        if np.abs(from_first - even).max() > _EVEN:
+            return start + from_first, []
+        break
+    said = [] if "AngularStep" in text else [f"no AngularStep: {views} views are taken to make one full turn"]
+    return start + even, said
+
+
+def _measured(file: Path) -> np.ndarray:
+    """The second number of each line that begins with the number of a picture."""
+    if file.stat().st_size > _MOST_BYTES:
+        raise fail("path", f"angles in at most {_MOST_BYTES} bytes", f"{file.stat().st_size} in {file}")
+    found = []
+    for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
+        match = re.match(r"\s*(\d+)\s*[:,;\s]\s*([-+]?\d+(?:\.\d*)?)", line)
+        if match is not None:
+            found.append((int(match[1]), float(match[2])))
+    return np.array([angle for _, angle in sorted(found)])
+
+
+def _tube(text: IniText) -> Tube:
+    kvp = text.number("XraykV", otherwise=0.0) or None
+    material, size = text.text("Filter_Material"), text.number("Filter_ThicknessMM", otherwise=0.0)
+    if not material:
+        return Tube(kvp)
+    nothing = material.lower() == "none" or size == 0
+    return Tube(kvp, {} if nothing else filters_of(f"{material} {size}mm"))

@@ -1,0 +1,163 @@
+"""NXtomo: an HDF5 file of NeXus' in which ``image_key`` tells projections from flats and darks.
+
+Rows are taken to begin at the top, pictures to be as seen from the source, and ``rotation_angle`` to count as ASTRA's
+angles do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tomo_polysplat.checks import fail
+from tomo_polysplat.scan.hdf5 import find_array, find_group, opened, read_numbers, read_text, text_attribute
+from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup
+from tomo_polysplat.scan.readers.frames import Hdf5Frames
+from tomo_polysplat.scan.readers.stated import require_known, stated_over
+
+if TYPE_CHECKING:
+    import h5py
+
+__all__ = ["KIND", "read", "recognises"]
+
+KIND = "NXtomo (HDF5)"
+_SUFFIXES = (".nx", ".nxs", ".h5", ".hdf5", ".hdf")
+_KEYS = ("image_key", "image_key_control")
+_PROJECTION, _FLAT, _DARK = 0, 1, 2
+_DETECTOR, _SOURCE = "instrument/detector", "instrument/source/distance"
+_MM = {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3, "micron": 1e-3, "meter": 1e3, "metre": 1e3}
+# A source so many times as far from the object as the detector is sends a parallel beam.
+_FAR = 200.0
+_MOST_ENTRIES = 100
+
+
+def recognises(path: Path) -> bool:
+    """Whether it is such a file or a folder with one."""
+    return bool(_files(path))
+
+
+def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
+    """See `tomo_polysplat.load_scan`; `stated` has its ``scanner``."""
+    files = _files(path)
+    if len(files) > 1:
+        raise fail("path", "one scan in the folder", ", ".join(file.name for file in files), "name the file")
+    with opened(files[0]) as file:
+        entry = _entry(file)
+        assert entry is not None  # it was recognised by that
+        told = _told(files[0], entry)
+    return stated_over(told, require_known(stated, "scanner"), files[0].parent)
+
+
+def _files(path: Path) -> list[Path]:
+    if path.is_file():
+        return [path] if _is_nxtomo(path) else []
+    inside = [file for file in sorted(path.iterdir()) if file.suffix.lower() in _SUFFIXES and file.is_file()]
+    return [file for file in inside if _is_nxtomo(file)]
+
+
+def _is_nxtomo(file: Path) -> bool:
+    with open(file, "rb") as stream:
+        if stream.read(4) != b"\x89HDF":
+            return False
+    with opened(file) as handle:
+        return _entry(handle) is not None
+
+
+def _entry(file: h5py.File) -> h5py.Group | None:
+    """The first group with pictures and their keys."""
+    for name in list(file)[:_MOST_ENTRIES]:
+        try:
+            entry = find_group(file, name)
+        except ValueError:
+            continue
+        if entry is None or find_group(entry, _DETECTOR) is None:
+            continue
+        if any(find_array(entry, f"{_DETECTOR}/{key}") is not None for key in _KEYS):
+            return entry
+    return None
+
+
+def _told(path: Path, entry: h5py.Group) -> Acquisition:
+    data = find_array(entry, f"{_DETECTOR}/data")
+    if data is None or data.ndim != 3:
+        got = "none" if data is None else f"shape {data.shape}"
+        raise fail("path", f"pictures in {_DETECTOR}/data, (pictures, rows, columns)", got)
+    name = next(key for key in _KEYS if find_array(entry, f"{_DETECTOR}/{key}") is not None)
+    keys = read_numbers(entry, f"{_DETECTOR}/{name}", (len(data),))
+    angles = read_numbers(entry, "sample/rotation_angle", (len(data),)).astype(np.float64)
+    dataset = find_array(entry, "sample/rotation_angle")
+    if dataset is not None and (text_attribute(dataset, "units") or "").lower().startswith("rad"):
+        angles = np.rad2deg(angles)
+    frames = {key: np.flatnonzero(keys == key) for key in (_PROJECTION, _FLAT, _DARK)}
+    if not len(frames[_PROJECTION]):
+        raise fail(
+            "path", "pictures of image_key 0, the projections", f"keys {sorted(set(keys.tolist()))}"[:200]
+        )
+    stacks = {key: Hdf5Frames(path, data.name, chosen) for key, chosen in frames.items() if len(chosen)}
+    setup, unit, said = _setup(entry, angles[frames[_PROJECTION]])
+    told = Acquisition(
+        KIND,
+        stacks[_PROJECTION],
+        setup,
+        name=read_text(entry, "sample/name") or path.stem,
+        unit=unit,
+        flats=stacks.get(_FLAT),
+        darks=stacks.get(_DARK),
+        exposure=_first(entry, f"{_DETECTOR}/count_time"),
+        other=_others(entry),
+    )
+    if _DARK not in stacks:
+        said.append("no dark pictures: without light a pixel is taken to count 0")
+    return told.saying(*said)
+
+
+def _setup(entry: h5py.Group, degrees: np.ndarray) -> tuple[Setup, str, list[str]]:
+    sides = [_length(entry, f"{_DETECTOR}/{axis}_pixel_size") for axis in "xy"]
+    behind, before = _length(entry, f"{_DETECTOR}/distance"), _length(entry, _SOURCE)
+    width, height = (side or sides[1 - k] or 0.0 for k, side in enumerate(sides))
+    said, unit = [], "mm"
+    if not width:
+        width = height = 1.0
+        unit, before = "pixel", None
+        said.append("the pixel is not known: lengths are in pixels; give pixel=")
+    shift = _first(entry, f"{_DETECTOR}/x_rotation_axis_pixel_position")
+    if shift is None:
+        said.append("the axis is taken to fall on the detector's middle; give offset= if it does not")
+    setup = Setup(degrees, (width, height), offset=(-(shift or 0.0) * width, 0.0))
+    if not before or not behind or before > _FAR * behind:
+        said.append("the beam is taken to be parallel; give source_object= and source_detector= if it is not")
+        return setup, unit, said
+    return replace(setup, source_object=before, source_detector=before + behind), unit, said
+
+
+def _length(entry: h5py.Group, name: str) -> float | None:
+    """In mm; positions before the object are negative in some files."""
+    value, dataset = _first(entry, name), find_array(entry, name)
+    if value is None or dataset is None:
+        return None
+    unit = (text_attribute(dataset, "units") or "m").lower()
+    if unit not in _MM:
+        raise fail(f"units of {name}", f"one of {', '.join(_MM)}", repr(unit))
+    return abs(value) * _MM[unit]
+
+
+def _first(entry: h5py.Group, name: str) -> float | None:
+    dataset = find_array(entry, name)
+    if dataset is None or not dataset.size:
+        return None
+    value = float(np.asarray(dataset[()]).reshape(-1)[0])
+    return value if np.isfinite(value) else None
+
+
+def _others(entry: h5py.Group) -> dict[str, str]:
+    """Texts that somebody may want to see again."""
+    names = ("title", "start_time", "end_time", "instrument/name", f"{_DETECTOR}/field_of_view")
+    texts = {name: read_text(entry, name) for name in names}
+    energy = _first(entry, "instrument/beam/incident_energy") or _first(entry, "beam/incident_energy")
+    if energy is not None:
+        texts["incident_energy"] = f"{energy:g}"
+    return {name: text for name, text in texts.items() if text}
