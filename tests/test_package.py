@@ -19,6 +19,7 @@ BASICS = (
     "files",
     "folders",
     "file_lock",
+    "free_memory",
     "json_text",
     "plain_file",
     "units",
