@@ -20,6 +20,7 @@ BASICS = (
     "folders",
     "file_lock",
     "free_memory",
+    "quiet_imports",
     "json_text",
     "plain_file",
     "units",
