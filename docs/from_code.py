@@ -51,7 +51,11 @@ def way() -> list[tuple[str, str, list[tuple[str, str]]]]:
             words = ast.unparse(call.func)
             first = words.partition(".")[0]
             entry = (words, home.get(first, ""))
-            if entry[1] and entry not in called and not entry[1].startswith(("checks", "transfer", "progress")):
+            if (
+                entry[1]
+                and entry not in called
+                and not entry[1].startswith(("checks", "transfer", "progress"))
+            ):
                 called.append(entry)
         found.append((file, name, called))
     return found

@@ -19,6 +19,8 @@ BASICS = (
     "files",
     "folders",
     "file_lock",
+    "free_memory",
+    "quiet_imports",
     "json_text",
     "plain_file",
     "units",

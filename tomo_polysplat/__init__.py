@@ -9,6 +9,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
+from tomo_polysplat.quiet_imports import leaving_no_trace
+
 __version__ = "0.1.0"
 
 _PUBLIC = {
@@ -30,13 +32,18 @@ _PUBLIC = {
 
 # Parts that are public as a whole.
 _PARTS = ("baselines",)
+# What sets warning filters as it loads, which is else during the first call of a function.
+_SET_FILTERS = ("scipy.sparse", "scipy.special")
 
 __all__ = ["__version__", *sorted([*_PUBLIC, *_PARTS])]
 
 
 def __getattr__(name: str) -> Any:
     if name in _PUBLIC:
-        value = getattr(import_module(_PUBLIC[name]), name)
+        with leaving_no_trace():
+            value = getattr(import_module(_PUBLIC[name]), name)
+            for other in _SET_FILTERS:
+                import_module(other)
         globals()[name] = value
         return value
     if name in _PARTS:

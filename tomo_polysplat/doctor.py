@@ -10,7 +10,7 @@ import time
 from importlib.util import find_spec
 
 import tomo_polysplat
-from tomo_polysplat.files import available_memory
+from tomo_polysplat.free_memory import available_memory
 from tomo_polysplat.parallel import cpu_threads
 from tomo_polysplat.versions import installed_version
 

@@ -11,9 +11,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from tomo_polysplat.checks import fail
+from tomo_polysplat.free_memory import available_memory
 
 __all__ = [
-    "available_memory",
     "existing_file",
     "existing_parent",
     "flush_to_disk",
@@ -190,18 +190,6 @@ def require_room_for(needed: Mapping[Path, int]) -> None:
 def existing_parent(folder: Path) -> Path:
     """The folder, or the nearest one above it that exists."""
     return next(place for place in (folder, *folder.absolute().parents) if place.is_dir())
-
-
-def available_memory() -> int | None:
-    """Bytes of memory that a process may still take, or None where the system does not say."""
-    try:
-        with open("/proc/meminfo", encoding="ascii") as file:
-            for line in file:
-                if line.startswith("MemAvailable:"):
-                    return int(line.split()[1]) * 1024
-    except OSError:
-        pass
-    return None
 
 
 def require_plausible_size(name: str, declared_bytes: int, stored_bytes: int) -> None:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 
 from tomo_polysplat.checks import fail
+from tomo_polysplat.fit.memory import require_machine
 from tomo_polysplat.fit.optimise import FitOutcome, FitState
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.soft_matter import describe_soft
@@ -130,6 +133,9 @@ def reconstruct(
     ------
     ValueError, TypeError
         For input that does not fit together; the message names the argument and the remedy.
+    MemoryError
+        For a scan, a volume, a spectrum or a cloud of Gaussians that this machine has no room for; the message tells
+        bytes needed, bytes free, and the remedy.
     FileExistsError
         For a checkpoint that exists, without ``resume``.
     OSError
@@ -142,10 +148,14 @@ def reconstruct(
     spectrum = require_spectrum("spectrum", spectrum)
     geometry, grid = from_astra(proj_geom, vol_geom)
     widest, on = run_options.settings.surroundings, run_options.device
+    energies = 1 if spectrum is None else len(spectrum.energies)
+    require_machine(math.prod(np.shape(projections)), math.prod(grid.shape), energies, on)
     # What torch adds up depends on how many threads it has.
     with one_torch_thread(on):
         values, counts = usable_rays(projections, proj_geom, valid, water_correction, spectrum)
         problem = Problem.of(values, geometry, grid, unit, spectrum, materials, widest, on)
+    # Made wider where the object is, it may have many times the voxels.
+    require_machine(0, math.prod(problem.grid.shape), energies, on)
     # Sorted, they may be a copy: these would stay in memory beside it.
     del values
     wanted = Calibration.of(calibrate, soft_density, problem.spectrum)

@@ -1,4 +1,4 @@
-"""How much of a GPU's memory a fit takes, estimated before it starts, and what to do where there is too little."""
+"""How much memory a fit takes, estimated before it starts, and what to do where there is too little."""
 
 from __future__ import annotations
 
@@ -8,9 +8,16 @@ import math
 import torch
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.files import available_memory
+from tomo_polysplat.free_memory import available_memory, in_gigabytes, require_memory
 
-__all__ = ["free_bytes", "most_gaussians", "projections_stay", "require_room", "room_for_gaussians"]
+__all__ = [
+    "free_bytes",
+    "most_gaussians",
+    "projections_stay",
+    "require_machine",
+    "require_room",
+    "room_for_gaussians",
+]
 
 logger = logging.getLogger(__name__)
 
@@ -27,6 +34,9 @@ _PIXEL = 48
 _VOXEL, _SAMPLES = 110, 12 << 25
 # Copies of the projections that the first reconstruction makes: water equivalents, the filtered ones, ASTRA's.
 _COPIES = 4
+# Bytes of the host that a ray takes, and an energy, whose ray is traced through so many paths and kept three times
+# (peaks of runs of 1e7 rays and of 3000 and 12 000 energies); and a voxel of a volume that is made on a GPU.
+_RAY, _ENERGY, _VOXEL_OF_RESULT = 30, 3 * 8 * 2048, 24
 # Of what is free: the rest is the driver's, other programs', and lost between blocks.
 _SHARE = 0.9
 
@@ -40,6 +50,39 @@ def free_bytes(device: torch.device) -> int:
 def projections_stay(size: int, device: torch.device) -> bool:
     """Whether projections of ``size`` bytes fit on the device, with what is made of them at the start."""
     return device.type == "cpu" or _COPIES * size <= _SHARE * free_bytes(device)
+
+
+def require_machine(rays: int, voxels: int, energies: int, device: torch.device) -> None:
+    """Refuse a scan that cannot be fitted on this machine whatever the plan, before anything is made of it.
+
+    Parameters
+    ----------
+    rays, voxels, energies : int
+        Of the projections, the volume and the spectrum.
+    device : torch.device
+
+    Raises
+    ------
+    MemoryError
+        If the host, or a CUDA device, has too little memory left; with bytes needed, bytes free, and remedies.
+    """
+    remedies = {
+        "projections": "bin the detector's pixels, take fewer views, or crop its rows",
+        "vol_geom": "take fewer or larger voxels, or a smaller window of the object",
+        "spectrum": "rebin the spectrum: some hundreds of energies are as good",
+    }
+    a_voxel = _VOXEL if device.type == "cpu" else _VOXEL_OF_RESULT
+    needed = {
+        "projections": (f"{rays} rays", float(rays * _RAY)),
+        "vol_geom": (f"{voxels} voxels", float(voxels * a_voxel)),
+        "spectrum": (f"{energies} energies", float(energies * _ENERGY)),
+    }
+    require_memory(needed, remedies)
+    if device.type == "cuda" and voxels * _VOXEL > _SHARE * free_bytes(device):
+        expected = f"voxels that fit into the {in_gigabytes(free_bytes(device))} free on {device}"
+        got = f"{voxels} voxels, about {in_gigabytes(voxels * _VOXEL)}"
+        remedy = f"{remedies['vol_geom']}, or device='cpu'"
+        raise fail("vol_geom", expected, got, remedy, MemoryError)
 
 
 def require_room(
@@ -60,22 +103,28 @@ def require_room(
     ------
     ValueError
         If a CUDA device has too little memory left.
+    MemoryError
+        If the host has too little memory left for the Gaussians of a fit on a CPU.
     """
     parts = {"Gaussians": gaussians * _of_a_gaussian(views)} | _of_all(views, pixels, voxels)
     need = sum(parts.values())
-    words = ", ".join(f"{name} {_gigabytes(size)}" for name, size in parts.items())
-    words = f"about {_gigabytes(need)} ({words})"
+    words = ", ".join(f"{name} {in_gigabytes(size)}" for name, size in parts.items())
+    words = f"about {in_gigabytes(need)} ({words})"
     if device.type == "cpu":
+        # The volumes are there in part already.
+        cloud = {"settings": (words, float(need - parts["volumes"]))}
+        remedy = "lower max_gaussians or views_per_step, bin the detector's pixels, or take fewer voxels"
+        require_memory(cloud, {"settings": remedy})
         there = available_memory()
         if there is not None and need > there:
-            logger.warning("Memory: %s, and %s are free.", words, _gigabytes(there))
+            logger.warning("Memory: %s, and %s are free.", words, in_gigabytes(there))
         return words
     free = free_bytes(device)
-    where = f"on the GPU, {_gigabytes(projections)}" if projections else "streamed from the host"
+    where = f"on the GPU, {in_gigabytes(projections)}" if projections else "streamed from the host"
     if need > _SHARE * free:
         remedy = "lower settings max_gaussians or views_per_step, take fewer voxels, or device='cpu'"
-        raise fail("device", f"a GPU with {words} free", f"{_gigabytes(free)} on {device}", remedy)
-    words = f"{words} of {_gigabytes(free)} free; projections {where}"
+        raise fail("device", f"a GPU with {words} free", f"{in_gigabytes(free)} on {device}", remedy)
+    words = f"{words} of {in_gigabytes(free)} free; projections {where}"
     logger.info("Memory: %s.", words)
     return words
 
@@ -112,7 +161,3 @@ def _of_all(views: int, pixels: int, voxels: int) -> dict[str, int]:
         "images of a step": views * pixels * _PIXEL,
         "volumes": voxels * _VOXEL + min(_SAMPLES, 27 * 12 * voxels),
     }
-
-
-def _gigabytes(size: int) -> str:
-    return f"{size / 1e9:.2f} GB"

@@ -15,6 +15,7 @@ from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.similarity import dissimilarity
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.detector_blur import LARGEST_BLUR
+from tomo_polysplat.quiet_imports import leaving_no_trace
 from tomo_polysplat.settings import Settings
 
 __all__ = [
@@ -132,7 +133,8 @@ class EagerStep:
             {"name": name, "params": [parameters[name].requires_grad_()], "lr": rate, "rate": rate}
             for name, rate in rates.items()
         ]
-        self.optimiser = torch.optim.Adam(groups, eps=EPSILON, fused=True)
+        with leaving_no_trace():  # torch loads its compiler
+            self.optimiser = torch.optim.Adam(groups, eps=EPSILON, fused=True)
         self._turns = self.optimiser.param_groups[list(rates).index("rotation")]
         self.moments = new_moments(parameters)
         for name, tensor in parameters.items():

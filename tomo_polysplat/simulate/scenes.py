@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from tomo_polysplat.checks import fail, require_choice, require_number
+from tomo_polysplat.free_memory import require_memory
 from tomo_polysplat.parallel import run_tasks
 from tomo_polysplat.physics.detector import Detector
 from tomo_polysplat.physics.materials import density, mass_attenuation
@@ -62,6 +63,9 @@ SCENES = {
     "pepper": Scene(scene_pepper.parts, scene_pepper.HALF_WIDTH),
 }
 
+# Of a ray with its mark, and of a voxel of the truth with its own; that there is twice while it is put together.
+_BYTES = 5
+
 
 def scene_phantom(scene: str, metal: bool | str = True) -> Phantom:
     """The phantom of a named scene: with its metal (True), without (False) or with the metal named."""
@@ -79,7 +83,7 @@ def scan_bytes(size: int, views: int, geometry: str) -> int:
     """Bytes that `simulate_scan` makes by default: projections with their marks, the truth and its metal mask."""
     columns = _usual_pixels(size)
     rows, slices = (1, 1) if geometry == "fan" else (columns, size)
-    return 5 * (rows * views * columns + slices * size**2)
+    return _BYTES * (rows * views * columns + slices * size**2)
 
 
 def _usual_pixels(size: int) -> int:
@@ -149,6 +153,8 @@ def simulate_scan(
     ------
     ValueError
         For an unknown name, a size or number out of range; the message says which.
+    MemoryError
+        For a scan or a truth that this machine has no room for.
     """
     size = _count("size", size)
     chosen = SCENES[require_choice("scene", scene, SCENES)]
@@ -157,6 +163,7 @@ def simulate_scan(
     if arc_degrees is None:
         arc_degrees = 180.0 if geometry == "parallel" else 360.0
     arc = require_number("arc_degrees", arc_degrees, above=0.0)
+    _require_room(rows * _count("views", views) * columns, size**2 * (1 if geometry == "fan" else size))
     angles = np.deg2rad(arc) * np.arange(_count("views", views)) / views
     proj_geom, vol_geom = circular_orbit(geometry, chosen.half_width, size, rows, columns, angles)
     spectrum = require_spectrum("spectrum", spectrum)
@@ -251,6 +258,15 @@ def _measure(phantom, proj_geom, attenuation, weights, scanner, subrays):
 
 def _mass_attenuations(phantom: Phantom, energies: np.ndarray) -> np.ndarray:
     return np.stack([mass_attenuation(material, energies) for material in phantom.materials])
+
+
+def _require_room(rays: int, voxels: int) -> None:
+    """Refuse a scan, or its truth, that memory does not hold."""
+    needed = {
+        "views": (f"{rays} rays", float(rays * _BYTES)),
+        "size": (f"{voxels} voxels", float(voxels * 2 * _BYTES)),
+    }
+    require_memory(needed, {"views": "take fewer views, rows or columns", "size": "take fewer voxels"})
 
 
 def _count(argument: str, value: Any) -> int:

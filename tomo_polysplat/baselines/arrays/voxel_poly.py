@@ -25,6 +25,7 @@ from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.transmission import polychromatic_projection
 from tomo_polysplat.physics.water import areal_density, transmitted_energy
 from tomo_polysplat.plan.decisions.tv_corner import tv_corners
+from tomo_polysplat.quiet_imports import leaving_no_trace
 from tomo_polysplat.render.renderer import detector_views
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.scan.noise import photons_per_ray
@@ -145,7 +146,8 @@ class _Fit:
         self.parameters = [model.relative.requires_grad_(), model.own.requires_grad_()]
         rates = (RATE_ATTENUATION, RATE_MATERIAL)
         groups = [{"params": [p], "lr": r, "rate": r} for p, r in zip(self.parameters, rates)]
-        self.optimiser = torch.optim.Adam(groups, eps=1e-15, fused=True)
+        with leaving_no_trace():  # torch loads its compiler
+            self.optimiser = torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     def run(
         self,
