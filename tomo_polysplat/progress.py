@@ -42,14 +42,13 @@ def progress_reports(
     layout = "{l_bar}{bar}| {elapsed}{postfix}" if in_notebook else "{l_bar}{bar:24}| {elapsed}{postfix}"
     left = TimeLeft()
     options = {"bar_format": layout, "disable": not drawn, "leave": False}
-    # Left to itself tqdm draws after as much progress as it has seen in a while, which one slow step makes rare.
-    with _whole_log_lines(drawn and not in_notebook), tqdm(total=1.0, miniters=0, **options) as bar:
+    with _whole_log_lines(drawn and not in_notebook), tqdm(total=1.0, **options) as bar:
 
         def report(share: float, words: str = "") -> None:
             told = left.told(share, time.perf_counter())
             bar.set_postfix_str(", ".join(filter(None, (told, words))), refresh=False)
-            bar.update(min(share, 1.0) - bar.n)
-            # A stage that makes no progress of its own is shown all the same.
+            # Drawn at once: a stage that makes no progress of its own is shown all the same.
+            bar.n = min(share, 1.0)
             bar.refresh()
 
         yield report
