@@ -158,3 +158,11 @@ def test_the_page_of_a_scan_has_fdk_and_the_residuals(tmp_path):
     assert page.count("<figure>") == 2 and "FDK (the standard)" in page
     assert "rms residual by view" in page and "<h1>ball</h1>" in page
     assert page.index("The model explains") < page.index("<figure>"), "the verdict comes first"
+
+
+def test_a_page_does_without_a_scan_that_does_not_fit(tmp_path, caplog):
+    result = ball()
+    other = Scan(line_integrals().swapaxes(0, 1), CONE, VOLUME | {"GridColCount": 8})
+    result.report(tmp_path / "page.html", scan=other, overwrite=True)
+    assert "does without what the scan would tell" in caplog.text
+    assert "How well the rays are explained was not recorded" in (tmp_path / "page.html").read_text()

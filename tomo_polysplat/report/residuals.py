@@ -32,7 +32,7 @@ __all__ = ["MOST_VIEWS", "Residuals", "residuals_of"]
 
 # Views that are looked at, evenly spread over the scan, and together; and pixels of the map along an edge.
 MOST_VIEWS, _AT_ONCE, _MAP = 180, 4, 192
-# Where a Gaussian's projection ends, in deviations; as in the fit.
+# Where a Gaussian's projection ends, in deviations, unless the settings say.
 _CUTOFF = 3.0
 # A ray this many deviations off is not explained.
 _FAR = 3.0
@@ -132,6 +132,7 @@ class _Model:
     def __init__(self, result: Result, views: DetectorViews, device: torch.device) -> None:
         self.views, self.device = views, device
         self.kernel, _ = choose(device)
+        self.cutoff = float(result.settings.get("cutoff", _CUTOFF))
         self.physics: RayPhysics = ray_physics(result.plan)
         parts = {name: np.asarray(part, np.float32) for name, part in result.gaussians.items()}
         density, u = parts["density"], parts["u"]
@@ -156,7 +157,7 @@ class _Model:
         views, parts = self.views.select(some), self.physics.pixel_rays
         fine = views if parts == 1 else views.finer(parts)
         position, scale, rotation, weight = self.gaussians
-        areal, _ = project(position, scale, rotation, weight, fine, kernel=self.kernel, cutoff=_CUTOFF)
+        areal, _ = project(position, scale, rotation, weight, fine, kernel=self.kernel, cutoff=self.cutoff)
         if self.lines is None:
             values = areal[0]
         else:
