@@ -1,14 +1,16 @@
 """Sphinx settings: ``sphinx-build -W docs docs/_build``."""
 
 import shutil
+import sys
 from pathlib import Path
 
 HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))
 project = "tomo-polysplat"
 author = "The tomo-polysplat developers"
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 html_theme = "furo"
-exclude_patterns = ["_build", "jupyter_execute"]
+exclude_patterns = ["_build", "jupyter_execute", "generated/*.md"]
 myst_heading_anchors = 4
 # Notebooks are shown as they are in the repository: the tests run them.
 nb_execution_mode = "off"
@@ -23,3 +25,7 @@ shutil.rmtree(HERE / "gallery", ignore_errors=True)
 (HERE / "gallery").mkdir()
 for notebook in sorted((HERE.parent / "examples").glob("*.ipynb")):
     shutil.copy(notebook, HERE / "gallery" / notebook.name)
+
+from from_code import make  # noqa: E402  # it lies beside this file
+
+make(HERE / "generated")

@@ -2,6 +2,8 @@
 
 python -m pytest -n 2 --dist loadfile --junitxml suite.xml
 python scripts/figures.py suite.xml
+
+The saved output of pytest, ``suite.log``, serves as well.
 """
 
 from __future__ import annotations
@@ -30,9 +32,18 @@ def longest_line(folder: Path) -> tuple[int, str]:
     return max(lines)
 
 
-def suite_seconds(junit: Path) -> float:
-    """Wall time of a test run, in seconds, from pytest's ``--junitxml``."""
-    return sum(float(suite.get("time", 0)) for suite in ElementTree.parse(junit).iter("testsuite"))
+def suite_seconds(report: Path) -> float:
+    """Wall time of a test run, in seconds, from pytest's ``--junitxml`` or from its saved output (``in 271.3s``)."""
+    if report.suffix == ".xml":
+        return sum(float(suite.get("time", 0)) for suite in ElementTree.parse(report).iter("testsuite"))
+    ends = re.findall(
+        r"\d (?:passed|failed|error|skipped)\w*.* in ([\d.]+)s", report.read_text(encoding="utf-8")
+    )
+    if not ends:
+        raise SystemExit(
+            f"{report}: neither pytest's --junitxml (.xml) nor an output of pytest that ends with its seconds"
+        )
+    return float(ends[-1])
 
 
 def main() -> None:

@@ -98,11 +98,12 @@ def discs(noise: float, pixels: int = 61, views: int = 60) -> tuple[Any, Any, An
 
 def asked_of_small_volumes() -> None:
     """Have the question about fat asked of volumes that are small for it."""
-    for name in ("tomo_polysplat.plan.decisions.light", "tomo_polysplat.fit.fat"):
-        try:
-            importlib.import_module(name)._FEWEST_VOXELS = 10  # type: ignore[attr-defined]
-        except ModuleNotFoundError:
-            continue
+    # Another tree that is installed may have modules that this one lacks.
+    here = Path(tps.__file__).parent
+    for name in ("plan/decisions/light", "fit/fat"):
+        if (here / f"{name}.py").exists():
+            module = importlib.import_module(f"tomo_polysplat.{name.replace('/', '.')}")
+            module._FEWEST_VOXELS = 10  # type: ignore[attr-defined]
 
 
 @case

@@ -1,11 +1,16 @@
 """Scans of a few voxels, and what the plan makes of them."""
 
 import numpy as np
+import torch
 
-from tomo_polysplat.fit.plan import make_plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.plan.answer import Answer
+from tomo_polysplat.plan.first_volume import first_volume
+from tomo_polysplat.plan.lab import Lab
+from tomo_polysplat.plan.order import decide_start, plan_from_start
+from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.settings import Settings
 
@@ -45,4 +50,22 @@ def ball(of, density):
 
 
 def plan(of, start, device="cpu", **settings):
-    return make_plan(start, of, Settings(**settings), device)
+    return plan_from_start(torch.as_tensor(start), of, Settings(**settings), torch.device(device))
+
+
+def why(plan, name):
+    """What a plan says of a decision or a fact."""
+    return plan.told()[name].why
+
+
+def planned(**values):
+    """A plan of these values, by name."""
+    return Plan({name: Answer.found(value) for name, value in values.items()})
+
+
+def lab_of(of, budget=None, **settings):
+    """A lab of a scan, with what its start volume tells."""
+    device, chosen = torch.device("cpu"), Settings(**settings)
+    lab = Lab(of, first_volume(of, device, chosen)[0], chosen, device, time_budget=budget)
+    decide_start(lab)
+    return lab

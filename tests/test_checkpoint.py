@@ -10,7 +10,7 @@ import pytest
 from killed_runs import Killed
 from small_scans import QUICK, cone, fan, reconstruct
 
-from tomo_polysplat.fit.checkpoint import Checkpoint
+from tomo_polysplat.plan.checkpoint import Checkpoint
 
 # Relocation falls between the passes, metals are freed after two of five, and the state changes in all its parts.
 LONG = QUICK | {"passes": 5.0, "relocate_until": 1.0}
@@ -30,7 +30,7 @@ def killed_after(passes, scan, path, **options):
 @pytest.fixture(autouse=True)
 def every_pass(monkeypatch):
     """Small scans take less time than a file: write nevertheless."""
-    monkeypatch.setattr("tomo_polysplat.fit.checkpoint._LARGEST_SHARE", 1e9)
+    monkeypatch.setattr("tomo_polysplat.plan.checkpoint._LARGEST_SHARE", 1e9)
 
 
 def without_seconds(history):
@@ -81,15 +81,15 @@ def test_the_start_volume_is_made_once(tmp_path, monkeypatch):
     def again(*_):
         raise AssertionError("the start volume was made again")
 
-    monkeypatch.setattr("tomo_polysplat.fit.preparation.first_volume", again)
-    assert "passes" in reconstruct(fan(), checkpoint=path, resume=True, settings=LONG).plan["stop"]
+    monkeypatch.setattr("tomo_polysplat.plan.preparation.first_volume", again)
+    assert "passes" in reconstruct(fan(), checkpoint=path, resume=True, settings=LONG).plan["stop"].why
 
 
 def test_resuming_a_finished_run_only_makes_the_volume(tmp_path):
     path = tmp_path / "fit.npz"
     patient = {"settings": QUICK | {"passes": 40.0, "patience": 1}}
     whole = reconstruct(fan(), checkpoint=path, **patient)
-    assert "held-out" in whole.plan["stop"] and len(whole.history) < 40
+    assert "held-out" in whole.plan["stop"].why and len(whole.history) < 40
     seen = []
     again = reconstruct(fan(), checkpoint=path, resume=True, callbacks=[seen.append], **patient)
     assert not seen and np.array_equal(again.volume, whole.volume) and again.plan == whole.plan
@@ -99,7 +99,7 @@ def test_a_run_that_a_callback_ended_goes_on(tmp_path):
     path = tmp_path / "fit.npz"
     whole = reconstruct(fan(), settings=LONG)
     paused = reconstruct(fan(), settings=LONG, checkpoint=path, callbacks=[lambda state: state.share > 0.3])
-    assert "callback" in paused.plan["stop"] and len(paused.history) == 2
+    assert "callback" in paused.plan["stop"].why and len(paused.history) == 2
     resumed = reconstruct(fan(), settings=LONG, checkpoint=path, resume=True)
     assert np.array_equal(resumed.volume, whole.volume)
 
@@ -110,7 +110,7 @@ def test_the_time_budget_counts_both_parts(tmp_path):
     killed_after(1, fan(), path, **options)
     rewritten(path, about=with_numbers(path, seconds=2000.0))
     resumed = reconstruct(fan(), checkpoint=path, resume=True, **options)
-    assert "time budget" in resumed.plan["stop"] and len(resumed.history) == 1
+    assert "time budget" in resumed.plan["stop"].why and len(resumed.history) == 1
     assert resumed.seconds > 2000
 
 
@@ -166,6 +166,14 @@ def with_numbers(path, part="numbers", **changes):
     return np.frombuffer(json.dumps(about).encode(), np.uint8)
 
 
+def with_answer(path, **values):
+    with np.load(path) as file:
+        about = json.loads(file["about"].tobytes())
+    for name, value in values.items():
+        about["plan"]["answers"][name]["value"] = value
+    return np.frombuffer(json.dumps(about).encode(), np.uint8)
+
+
 @pytest.mark.parametrize(
     "damage",
     [
@@ -186,8 +194,12 @@ def with_numbers(path, part="numbers", **changes):
         lambda path: rewritten(path, about=with_numbers(path, history=[1])),
         lambda path: rewritten(path, about=with_numbers(path, history=[{"loss": 0.1}])),
         lambda path: rewritten(path, about=with_numbers(path, history=[{"loss": "low", "held_out": None}])),
-        lambda path: rewritten(path, about=with_numbers(path, "plan", tv_corners=[0.1])),
-        lambda path: rewritten(path, about=with_numbers(path, "plan", tv_corners=["a", "tenth"])),
+        lambda path: rewritten(path, about=with_answer(path, tv_corner=[0.1])),
+        lambda path: rewritten(path, about=with_answer(path, soft_reference=1.0)),
+        lambda path: rewritten(path, about=with_answer(path, seed_spacing=1e30)),
+        lambda path: rewritten(path, about=with_answer(path, curves=True)),
+        lambda path: rewritten(path, about=with_numbers(path, stop=["tired", "of it"])),
+        lambda path: rewritten(path, about=with_answer(path, tv_corner=["a", "tenth"])),
     ],
 )
 def test_a_damaged_file_is_refused(tmp_path, damage):
@@ -215,12 +227,12 @@ def test_a_disk_that_fills_up_ends_no_run(tmp_path, monkeypatch, caplog):
 
     monkeypatch.setattr("tomo_polysplat.files.require_room", full)
     result = reconstruct(fan(), checkpoint=path)
-    assert "passes" in result.plan["stop"] and "No space left" in caplog.text and not path.exists()
+    assert "passes" in result.plan["stop"].why and "No space left" in caplog.text and not path.exists()
 
 
 def test_writing_takes_a_small_share_of_the_time(tmp_path, monkeypatch):
     """With a clock of its own: passes of 1 s, files that take 0.13 s to write."""
-    import tomo_polysplat.fit.checkpoint as module
+    import tomo_polysplat.plan.checkpoint as module
 
     now, written = [100.0], []
     monkeypatch.setattr(module, "_LARGEST_SHARE", 0.05)

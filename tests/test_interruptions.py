@@ -38,7 +38,7 @@ def interrupting(function, times=1):
 def test_in_the_start_stage_it_says_that_there_is_no_result(monkeypatch, tmp_path):
     path = tmp_path / "fit.npz"
     start = interrupting(lambda *_: None)
-    monkeypatch.setattr("tomo_polysplat.fit.preparation.first_volume", start)
+    monkeypatch.setattr("tomo_polysplat.plan.preparation.first_volume", start)
     with pytest.raises(KeyboardInterrupt, match="no result yet"):
         reconstruct(fan(), checkpoint=path)
     assert os.listdir(tmp_path) == [] and signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -60,14 +60,14 @@ def test_at_any_moment_of_the_fit_it_returns_what_there_is(delay):
         fan(), settings=MANY, progress=lambda share, words: began.set() if share > 0 else None
     )
     thread.join()
-    assert result.plan["stop"] == "interrupted" and result.history
+    assert result.plan["stop"].value == "interrupted" and result.history
     assert np.isfinite(result.volume).all() and result.volume.max() > 0.1
 
 
 def test_in_the_first_pass_it_returns_a_physical_volume(monkeypatch):
     monkeypatch.setattr(FitScene, "projections", interrupting(FitScene.projections))
     result = reconstruct(fan())
-    assert result.plan["stop"] == "interrupted" and not result.history
+    assert result.plan["stop"].value == "interrupted" and not result.history
     assert result.volume.max() > 0.1 and result.volume.min() >= 0
 
 
@@ -76,7 +76,7 @@ def test_during_the_volume_the_volume_is_finished(monkeypatch, caplog):
     monkeypatch.setattr(FitScene, "basis", interrupting(FitScene.basis))
     result = reconstruct(fan())
     assert np.array_equal(result.volume, whole.volume)
-    assert result.plan["stop"] == whole.plan["stop"] + ", then interrupted"
+    assert result.plan["stop"].why == whole.plan["stop"].why + ", then interrupted"
     assert "the volume is finished first" in caplog.text
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
@@ -118,7 +118,7 @@ def test_tomopy_on_one_core_gets_the_best_slices():
     }
     centre = np.full(2, 36, np.float32)
     tps.polysplat(tomo, centre, recon, theta, num_gridx=72, num_gridy=72, options=options)
-    assert results[0].plan["stop"] == "interrupted" and recon.max() > 0
+    assert results[0].plan["stop"].value == "interrupted" and recon.max() > 0
 
 
 def test_tomopy_refuses_one_checkpoint_for_two_solves(tmp_path):
@@ -137,7 +137,7 @@ def test_the_command_saves_the_best_state_and_says_130(scan_file, tmp_path, monk
     monkeypatch.setattr(FitScene, "projections", interrupting(FitScene.projections))
     out = tmp_path / "volume.h5"
     assert main(["recon", str(scan_file), "-o", str(out), "--quality", "fast"]) == 130
-    assert tps.Result.load(out).plan["stop"] == "interrupted"
+    assert tps.Result.load(out).plan["stop"].value == "interrupted"
 
 
 def test_the_command_finishes_writing(scan_file, tmp_path, monkeypatch):

@@ -48,7 +48,7 @@ def test_a_checkpoint_is_complete_whenever_it_is_there(tmp_path, monkeypatch):
             file.truncate(100)
             raise OSError("killed here")
 
-    monkeypatch.setattr("tomo_polysplat.fit.checkpoint._LARGEST_SHARE", 1e9)
+    monkeypatch.setattr("tomo_polysplat.plan.checkpoint._LARGEST_SHARE", 1e9)
     monkeypatch.setattr(np, "savez", half_written)
     reconstruct(fan(), checkpoint=path, settings=QUICK | {"passes": 3.0})
     assert seen == [False, True, True]

@@ -36,6 +36,7 @@ LAYERS = (
     ("model",),
     ("render",),
     ("fit",),
+    ("plan",),
     ("result", "report"),
     ("reconstruction", "viewer"),
     ("baselines", "bench", "cli", "doctor", "plugins"),

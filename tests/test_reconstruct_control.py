@@ -30,14 +30,16 @@ def test_a_time_budget_is_kept():
     begun = time.perf_counter()
     result = reconstruct(fan(), settings=MANY, time_budget=1.0)
     assert 0.9 < time.perf_counter() - begun < 2.5
-    assert "time budget" in result.plan["stop"]
+    assert "time budget" in result.plan["stop"].why
     assert result.history and result.history[-1]["seconds"] < 1.5
 
 
 def test_a_budget_too_small_for_anything_still_returns_the_start_and_says_so(caplog):
     with caplog.at_level("WARNING"):
         result = reconstruct(fan(), time_budget=1e-6)
-    assert result.volume.max() > 0.1 and "time budget was used before the first step" in result.plan["stop"]
+    assert (
+        result.volume.max() > 0.1 and "time budget was used before the first step" in result.plan["stop"].why
+    )
     assert "no better than its start" in caplog.text
 
 
@@ -71,7 +73,7 @@ def test_a_fit_that_stops_being_finite_returns_its_best_state(metal, monkeypatch
 
     monkeypatch.setattr(EagerStep, "__call__", spoil)
     result = reconstruct(fan(), settings=QUICK | {"passes": 5.0})
-    assert result.plan["stop"] == "the fit stopped being finite"
+    assert result.plan["stop"].value == "not finite"
     assert len(result.history) == 2 and np.isfinite(result.volume).all() and result.volume.max() > 0.1
 
 
@@ -81,13 +83,13 @@ def test_a_callback_can_end_the_fit(answer):
         fan(), settings=MANY, callbacks=[lambda state: answer if state.iteration > 20 else False]
     )
     *before, last = [entry["iteration"] for entry in result.history]
-    assert "callback" in result.plan["stop"]
+    assert "callback" in result.plan["stop"].why
     assert before and max(before) <= 20 < last
 
 
 def test_what_a_callback_returns_by_chance_does_not_end_the_fit():
     result = reconstruct(fan(), callbacks=[lambda state: "done", lambda state: 1, lambda state: [True]])
-    assert "passes" in result.plan["stop"]
+    assert "passes" in result.plan["stop"].why
 
 
 def test_an_interruption_returns_the_best_so_far():
@@ -97,7 +99,7 @@ def test_an_interruption_returns_the_best_so_far():
 
     threads = torch.get_num_threads()
     result = reconstruct(fan(), settings=MANY, callbacks=[interrupt])
-    assert result.plan["stop"] == "interrupted" and len(result.history) == 1
+    assert result.plan["stop"].value == "interrupted" and len(result.history) == 1
     assert result.volume.max() > 0.1 and torch.get_num_threads() == threads
 
 

@@ -36,8 +36,8 @@ def fitted(region, **settings):
 def test_what_lies_around_is_fitted_and_cut_off(region):
     alone, both = fitted(region, surroundings=0.0), fitted(region)
     assert both.volume.shape == alone.volume.shape == (27, 27)
-    assert "voxels more on every side" in both.plan["window"]
-    assert "voxels more" not in alone.plan["window"]
+    assert "voxels more on every side" in both.plan["window"].why
+    assert "voxels more" not in alone.plan["window"].why
     place = (np.arange(27) - 13) / 13.5
     ring = np.hypot(place, place[:, None])
     ring = (ring > 0.75) & (ring < 0.95)

@@ -5,7 +5,7 @@ import pytest
 from small_scans import fan, reconstruct
 
 import tomo_polysplat as tps
-from tomo_polysplat.scan.layout import parallel_geometry
+from tomo_polysplat.scan.circular import parallel_geometry
 
 COLUMNS, VIEWS = 49, 60
 # x, y and deviation in pixels, attenuation in 1/pixel.
@@ -15,7 +15,7 @@ BLOBS = [(5.0, 3.0, 4.0, 0.05), (-8.0, -2.0, 3.0, 0.04), (1.0, -9.0, 5.0, 0.03)]
 def smooth_scan(rows):
     """Projections (rows, views, columns) and true slices, ascending in z by a fifth."""
     theta = np.linspace(0, np.pi, VIEWS, endpoint=False)
-    proj_geom, vol_geom = parallel_geometry(theta, rows, COLUMNS, COLUMNS / 2, 1.0)
+    proj_geom, vol_geom = parallel_geometry(pixel=1.0, radians=theta, detector=(rows, COLUMNS))
     s, height = np.arange(COLUMNS) + 0.5 - COLUMNS / 2, 1 + 0.2 * np.arange(rows)
     y, x = np.meshgrid(s, s, indexing="ij")
     rays, slices = np.zeros((VIEWS, COLUMNS)), np.zeros((COLUMNS, COLUMNS))
@@ -35,11 +35,11 @@ def test_values_of_a_smooth_object_are_true(rows):
     slope = np.polyfit(truth[inside], result.volume[inside], 1)[0]
     assert slope == pytest.approx(1, abs=0.02)
     assert np.sqrt(np.mean((result.volume - truth) ** 2)) < 0.005 * truth.max()
-    assert "without metal" in result.plan["detector_blur"]
+    assert "without metal" in result.plan["detector_blur"].why
 
 
 def test_blur_is_fitted_where_there_is_metal_and_held_where_asked():
-    assert "fitted" in reconstruct(fan()).plan["detector_blur"]
-    assert "without metal" in reconstruct(fan(metal=False)).plan["detector_blur"]
+    assert "fitted" in reconstruct(fan()).plan["detector_blur"].why
+    assert "without metal" in reconstruct(fan(metal=False)).plan["detector_blur"].why
     held = reconstruct(fan(metal=False), settings={"passes": 1, "blur": 0.3, "learning_rate_blur": 0})
-    assert "0.300" in held.plan["detector_blur"]
+    assert "0.300" in held.plan["detector_blur"].why

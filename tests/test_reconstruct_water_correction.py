@@ -29,7 +29,7 @@ def test_a_corrected_scan_gives_the_volume_of_the_uncorrected_one():
     ]
     assert errors[1] == pytest.approx(errors[0], abs=0.3)
     assert errors[2] < errors[0] - 3.0, "the correction must be large enough to matter"
-    assert "0.1 P^2" in told.plan["water_correction"]
+    assert "0.1 P^2" in told.plan["water_correction"].why
 
 
 def test_a_correction_that_the_values_exceed_is_refused():

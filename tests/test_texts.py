@@ -12,6 +12,7 @@ import tomo_polysplat as tps
 from tomo_polysplat.checks import fail, visible
 from tomo_polysplat.cli.main import main
 from tomo_polysplat.json_text import parse_json
+from tomo_polysplat.plan.answer import Answer
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.scan.io import load_scan, save_scan
@@ -68,7 +69,7 @@ def test_a_scan_with_a_hostile_name_is_harmless_in_terminal_log_and_report(tmp_p
 
 def test_a_hostile_result_is_harmless_in_its_report(tmp_path):
     grid = VolumeGrid((3, 4, 5), np.zeros(3), np.ones(3))
-    words = {HOSTILE: HOSTILE, "list": [HOSTILE, {"deep": HOSTILE}]}
+    words = {HOSTILE: Answer.found(HOSTILE), "deep": Answer.found({HOSTILE: HOSTILE}, HOSTILE)}
     result = Result(np.ones((1, *grid.shape)), grid, plan=words, provenance={"scan": HOSTILE})
     result.report(tmp_path / "r.html")
     assert harmless((tmp_path / "r.html").read_text(encoding="utf-8"))

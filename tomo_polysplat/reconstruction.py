@@ -11,15 +11,11 @@ from typing import Any
 import torch
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.fit.calibration import Calibration
-from tomo_polysplat.fit.checkpoint import Checkpoint
 from tomo_polysplat.fit.optimise import FitOutcome, FitState
-from tomo_polysplat.fit.preparation import PreparedFit, RunOptions
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.soft_matter import describe_soft
-from tomo_polysplat.fit.solver import Solver
+from tomo_polysplat.fit.stopping import StopReason
 from tomo_polysplat.fit.surroundings import cut_out
-from tomo_polysplat.fit.unit_check import tell_impossible
 from tomo_polysplat.interrupts import postponed_interrupts
 from tomo_polysplat.kernels.device import one_torch_thread, usual_modes
 from tomo_polysplat.parallel import kept_threads
@@ -27,6 +23,13 @@ from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.detector_blur import describe_blur
 from tomo_polysplat.physics.spectrum import Spectrum, require_spectrum
 from tomo_polysplat.physics.water_correction import describe_polynomial
+from tomo_polysplat.plan.answer import Answer
+from tomo_polysplat.plan.calibration import Calibration
+from tomo_polysplat.plan.checkpoint import Checkpoint
+from tomo_polysplat.plan.model import all_curves
+from tomo_polysplat.plan.preparation import PreparedFit, RunOptions
+from tomo_polysplat.plan.solver import Solver
+from tomo_polysplat.plan.unit_check import tell_impossible
 from tomo_polysplat.progress import progress_reports
 from tomo_polysplat.result.provenance import provenance
 from tomo_polysplat.result.result import Result
@@ -138,9 +141,11 @@ def reconstruct(
     run_options = RunOptions.of(quality, settings, time_budget, seed, device, callbacks)
     spectrum = require_spectrum("spectrum", spectrum)
     geometry, grid = from_astra(proj_geom, vol_geom)
-    values, counts = usable_rays(projections, proj_geom, valid, water_correction, spectrum)
     widest, on = run_options.settings.surroundings, run_options.device
-    problem = Problem.of(values, geometry, grid, unit, spectrum, materials, widest, on)
+    # What torch adds up depends on how many threads it has.
+    with one_torch_thread(on):
+        values, counts = usable_rays(projections, proj_geom, valid, water_correction, spectrum)
+        problem = Problem.of(values, geometry, grid, unit, spectrum, materials, widest, on)
     # Sorted, they may be a copy: these would stay in memory beside it.
     del values
     wanted = Calibration.of(calibrate, soft_density, problem.spectrum)
@@ -154,7 +159,8 @@ def reconstruct(
     with one_torch_thread(run_options.device), kept_threads(), progress_reports(progress) as report:
         solver = Solver(run_options, saved, started, flipped, report)
         problem, prepared, outcome = solver.solve(problem, wanted, ask_scatter=calibrate is None)
-        prepared.plan.reasons |= _undone(water_correction)
+        if water_correction is not None:
+            prepared.plan.note("water_correction", "undone", describe_polynomial(water_correction))
         with postponed_interrupts("the volume") as interruption:
             report(1.0, "volume")
             result = _result(
@@ -169,10 +175,19 @@ def reconstruct(
                 settings=run_options.settings.to_dict() | {"seed": run_options.seed, "quality": quality},
                 provenance=provenance(geometry, grid, unit, spectrum, run_options.device),
             )
-    result.plan["stop"] = outcome.reason + (", then interrupted" if interruption.asked else "")
+    result.plan["stop"] = _stopped(outcome, interruption.asked)
     result.seconds = time.perf_counter() - started
-    logger.info("Reconstructed in %.1f s: %s; %s", result.seconds, outcome.reason, result.counts)
+    logger.info("Reconstructed in %.1f s: %s; %s", result.seconds, result.plan["stop"].why, result.counts)
     return result
+
+
+def _stopped(outcome: FitOutcome, interrupted: bool) -> Answer:
+    """What ended the run, or the making of its volume."""
+    assert outcome.stop is not None
+    reason, words = outcome.stop.reason, outcome.stop.words
+    if interrupted and reason is not StopReason.INTERRUPTED:
+        reason, words = StopReason.INTERRUPTED, f"{words}, then interrupted"
+    return Answer.found(reason.value, words)
 
 
 def _checkpoint(
@@ -185,13 +200,6 @@ def _checkpoint(
     return Checkpoint(path, problem, options, resume=resume)
 
 
-def _undone(water_correction: Sequence[float] | None) -> dict[str, str]:
-    """What the plan tells of a scanner's water correction."""
-    if water_correction is None:
-        return {}
-    return {"water_correction": f"undone: {describe_polynomial(water_correction)}"}
-
-
 def _result(
     outcome: FitOutcome, prepared: PreparedFit, problem: Problem, grid: VolumeGrid, **about: Any
 ) -> Result:
@@ -199,10 +207,10 @@ def _result(
     plan, scene, gaussians, length = prepared.plan, prepared.scene, outcome.gaussians, problem.length
     if plan.blurred:
         fitted = about["settings"]["learning_rate_blur"] > 0
-        plan.reasons["detector_blur"] = describe_blur(float(gaussians.blur), fitted=fitted)
+        plan.note("fitted_blur", float(gaussians.blur), describe_blur(float(gaussians.blur), fitted=fitted))
     if plan.curves > 1 and len(gaussians):
         number, tunables = float(gaussians.shared_material[0]), about["settings"]
-        plan.reasons["soft_material"] = describe_soft(number, plan.soft_u, tunables["soft_gain"])
+        plan.note("soft_material", number, describe_soft(number, plan.soft_u, tunables["soft_gain"]))
     with torch.no_grad():
         own = cut_out(to_host(scene.basis(gaussians) * plan.reference), problem.margin)
         heights = gaussians.weights(scene.reference_curve).sum(dim=0)
@@ -213,11 +221,11 @@ def _result(
             "density": heights.cpu().numpy() * plan.reference,
             "u": gaussians.material().cpu().numpy(),
         }
-    curves = problem.all_curves(own, plan, about["settings"]["bone_level"])
+    curves = all_curves(problem, own, plan, about["settings"]["bone_level"])
     if problem.polychromatic:
         counts = about["counts"]
         lightless = (counts["rays_not_finite"] + counts["rays_opaque"]) / counts["rays"]
-        tell_impossible(curves, plan.reasons, lightless)
+        tell_impossible(curves, plan.facts, lightless)
     return Result(
         curves,
         grid,
@@ -225,6 +233,6 @@ def _result(
         materials=problem.materials,
         gaussians=parts,
         history=outcome.history,
-        plan=plan.reasons,
+        plan=plan.told(),
         **about,
     )

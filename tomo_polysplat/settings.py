@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
@@ -16,10 +17,22 @@ _RANGES: dict[str, dict[str, Any]] = {
     "light_u": {"at_least": -0.1, "at_most": 0.1},
     **dict.fromkeys(("seed_width", "largest_scale", "cutoff"), {"above": 0.0}),
     **dict.fromkeys(("model_error", "huber_corner", "final_rate"), {"above": 0.0}),
+    **dict.fromkeys(("passes", "seed_spacing", "smallest_scale", "metal_rim"), {"above": 0.0}),
+    **dict.fromkeys(("tv_factor", "tv_corner", "growth"), {"above": 0.0}),
+    **dict.fromkeys(
+        ("views_per_step", "max_gaussians", "pixel_rays", "tv_every", "patience", "spectral_nodes"),
+        {"at_least": 1},
+    ),
     "blur": {"at_least": 0.0, "at_most": 0.6},
     "held_out": {"at_least": 0.0, "at_most": 0.5},
     "finer_seeds": {"at_least": 0.0, "at_most": 0.9},
     "metal_tail": {"at_least": 0.0, "at_most": 0.8},
+}
+_CHOICES = {
+    "loss": ("huber", "weighted-l1", "l1"),
+    "edges": ("sharp", "blurred"),
+    "light": ("soft", "fat"),
+    "kernel": ("auto", "triton", "numba", "reference"),
 }
 
 
@@ -27,79 +40,113 @@ _RANGES: dict[str, dict[str, Any]] = {
 class Settings:
     """Tunables of the solver.
 
-    Lengths are in units of the mean spacing of the seeds or of the voxel, as said; attenuation and density in
-    units of the scan's soft reference (water, for most objects).
+    None leaves a setting to the plan, which decides it from the data (docs/plan.md). Lengths are in voxels, or in units
+    of the seeds' mean distance, as said; attenuation and density are in units of the scan's soft reference (water, for
+    most objects).
     """
 
-    passes: float = 0.0
-    """Times every view is used, unless held-out rays or a time budget end the run before; 0 leaves it to the plan."""
-    views_per_step: int = 0
-    """Views whose gradients make one step of the optimiser; 0 leaves it to the plan."""
-    max_gaussians: int = 0
-    """About how many Gaussians at most, not counting that metal is seeded more finely; 0 leaves it to the plan."""
-    seed_spacing: float = 0.0
-    """Distance of the seeds in voxels; 0 leaves it to the plan."""
+    # The run.
+    passes: float | None = None
+    """How often every view is used. Held-out rays or a time budget may end the run before."""
+    views_per_step: int | None = None
+    """Views whose gradients make one step of the optimiser."""
+    held_out: float = 0.01
+    """Share of the rays that are not fitted. They tell when the fit stops improving."""
+    patience: int | None = None
+    """The run ends after so many passes without improvement of the held-out rays; None: four tenths of the passes, and
+    at least 4."""
+    kernel: str = "auto"
+    """"auto", "triton", "numba" or "reference"."""
+
+    # Seeds.
+    max_gaussians: int | None = None
+    """About how many Gaussians at most. Metal, which is seeded more closely, is not counted."""
+    seed_spacing: float | None = None
+    """Distance of the seeds in voxels."""
+    closer_seeds: float | None = None
+    """Distance in voxels of seeds that are thin across sharp edges; 0: no closer than the others."""
+    growth: float | None = None
+    """The cloud may grow to so many times its number of seeds, by splitting; 1: it does not grow."""
+    edges: str | None = None
+    """"sharp": all seeds are thin across edges. "blurred": none is thinner than the detector could tell apart."""
+    support_level: float = 0.1
+    """Where the start is below this share of the soft reference, there are no seeds. For foam and down, whose main
+    matter is lighter than 0.15 of the reference, it is lowered in proportion."""
     finer_seeds: float = 0.5
-    """Where Gaussians are fewer than the detector could tell apart, the share of them that lies twice as close."""
+    """Where Gaussians are fewer than the detector could tell apart, this share of them lies twice as close."""
     seed_width: float = 0.6
     """Standard deviation of a seed in units of the spacing."""
     seed_edge: float = 0.2
     """Variation of the start over a spacing, in soft references, that makes a seed half as thick across the edge, and
     wider along it, where Gaussians are fewer than the detector could tell apart; 0: all seeds are round."""
-    edges: str = "auto"
-    """"sharp" makes all seeds thin across edges, "blurred" none thinner than the detector could tell apart; "auto"
-    finds out by two short fits which of the two an object has."""
-    support_level: float = 0.1
-    """Where the start is below this share of the soft reference in a seed's cell and those around it, there is none;
-    foam and down, whose main matter is lighter than 0.15 of the reference, have it lowered alike."""
-    smallest_scale: float = 0.0
-    """Smallest standard deviation in voxels, or in seed spacings where seeds are closer; 0 leaves it to the plan."""
+    smallest_scale: float | None = None
+    """Smallest standard deviation in voxels, or in seed spacings where seeds are closer than voxels."""
     largest_scale: float = 8.0
     """Largest standard deviation in seed spacings."""
+    relocated: float = 0.03
+    """Largest share of the Gaussians that, once a pass, moves from where it holds nothing to where it is wanted."""
+    relocate_until: float = 0.5
+    """Share of the run after which no Gaussian is moved: the new ones need time to settle."""
     surroundings: float = 0.5
-    """Share of its edges that the volume is widened by at most on every side, while it is fitted, where the object
-    reaches beyond both the detector and the volume; 0: never."""
+    """Where the object reaches beyond both the detector and the volume, the volume is widened during the fit, on every
+    side by this share of its edge at most; 0: never."""
+    cutoff: float = 3.0
+    """Standard deviations at which a projected Gaussian ends."""
+
+    # Smoothing.
+    tv_weight: float = 0.04
+    """Weight of the total variation per voxel, in soft references."""
+    tv_factor: float | None = None
+    """That weight is multiplied by this."""
+    tv_corner: float | None = None
+    """Difference of neighbouring voxels, in soft references, up to which it counts in full. Larger ones count by their
+    logarithm, so that edges and texture stay; with 1000 all count in full."""
+    tv_every: int | None = None
+    """The total variation is taken in one step of so many, and counts as many times."""
+    tv_clip: float = 5.0
+    """Attenuation above this many soft references does not count as variation: that would erode metal."""
+
+    # Materials.
+    curves: int | None = None
+    """Material curves under a spectrum: 1 for the soft one alone, or 3."""
     bone_level: float = 2.2
-    """Start attenuation, in soft references, above which matter is bone-like, and material numbers are free near it."""
+    """Matter of more than so many soft references in the start is bone-like. Material numbers are free near it."""
     metal_level: float = 6.0
     """The same for metal, which in an object of one solid is three times as dense as that at least."""
-    metal_rim: float = 0.0
-    """Level down to which what is connected to metal belongs to it; 0: ``metal_level`` itself."""
+    metal_rim: float | None = None
+    """Level down to which what is connected to metal belongs to it; None: ``metal_level`` itself."""
+    metal_tail: float = 0.5
+    """A voxel no point of which reaches about this share of the metal around it holds a tail, which that gets back."""
+    agent: dict[str, float] | None = None
+    """Settings that the seeds start from where a contrast agent or a metal was named; {}: none are changed."""
+    light: str | None = None
+    """What matter of 0.65 to 0.95 soft references is: "soft" matter of less density, or "fat", which hardens the beam
+    less."""
     soft_u: float = 0.0
-    """Material number of soft matter that the fit starts from; near dense matter it is free."""
+    """Material number of soft matter that the fit starts from. Near dense matter it is free."""
     soft_gain: float = 1.0
     """Once a pass the soft matter's number moves by so much times the cupping, where it is one matter; 0 holds it."""
-    light: str = "auto"
-    """What has 0.65 to 0.95 soft references: "soft" matter that is less dense, or "fat", which hardens the beam less;
-    "auto" leaves it to the plan, which asks the rays where there is much of it."""
     light_u: float = -0.056
     """Material number of fat, less that of soft matter; that of adipose tissue by default."""
     bone_u: float = 0.3
-    """Material number that matter of four soft references starts from, that of bone (``model/bone_numbers.py``)."""
+    """Material number that matter of four soft references starts from: that of bone (``model/bone_numbers.py``)."""
     metal_u: float = 0.8
-    """Material number that metal starts from; at this default, under the default curves, its attenuation tells the
+    """Material number that metal starts from. At this default, under the default curves, its attenuation tells the
     number after the first pass (``fit/metal_numbers.py``)."""
     free_radius: float = 6.0
     """Gaussians have a material number of their own within this many voxels of bone-like or denser matter."""
-    learning_rate_position: float = 0.03
-    """Per step, in seed spacings; up to twice as much in a run of fewer than 450 steps, as for the scale."""
-    learning_rate_scale: float = 4e-2
-    """Per step, relative."""
-    learning_rate_rotation: float = 3e-3
-    """Per step, of the quaternion; up to seven times as much in a run of fewer than 900 steps."""
-    learning_rate_attenuation: float = 1e-2
-    learning_rate_material: float = 1e-3
-    """Per step of a run of 300, of material numbers outside metal; less in a longer one, by the root."""
-    learning_rate_shared: float = 5e-3
-    """Of each piece of metal's one number."""
-    blur: float = 0.1
-    """Variance of the detector's blur along rows and along columns, in squared pixels, that a fit of it starts from."""
-    learning_rate_blur: float = 1e-2
-    """The blur is fitted where there is metal; 0 holds it, and with ``blur`` 0 rays are infinitely thin."""
     material_from: float = 0.4
     """Share of the run after which the metals' numbers are fitted: before, they would explain blur."""
-    final_rate: float = 0.1
-    """Learning rates fall exponentially to this share of their start."""
+    spectral_nodes: int | None = None
+    """Nodes of the spectrum; None: as few as keep the error of P small."""
+
+    # The detector.
+    blur: float = 0.1
+    """Variance of the detector's blur along rows and along columns, in squared pixels, that a fit of it starts from."""
+    pixel_rays: int | None = None
+    """Rays a pixel and axis over which the light is averaged; 1: infinitely thin rays."""
+
+    # The misfit.
     loss: str = "huber"
     """"huber" or "weighted-l1", both weighted by photon statistics, or "l1" (the paper's)."""
     model_error: float = 0.015
@@ -108,61 +155,38 @@ class Settings:
     """Deviations beyond which a residual counts absolutely (95 % efficient for Gaussian noise: Huber 1964)."""
     ssim_weight: float = 0.0
     """Weight of 1 - SSIM of the projections (the paper uses 0.25)."""
-    pixel_rays: int = 0
-    """Rays a pixel and axis over which the light is averaged; 1: infinitely thin ones; 0 leaves it to the plan, which
-    asks the rays at metal."""
-    tv_weight: float = 0.04
-    """Weight of the total variation per voxel, in soft references."""
-    tv_factor: float = 0.0
-    """So many times that weight is taken; 0 leaves it to the plan, which asks held-out rays in slices and of thin
-    objects."""
-    tv_clip: float = 5.0
-    """Attenuation above this many soft references does not count as variation, which would erode metal; what is lighter
-    than metal, castings of aluminium too, is smoothed."""
-    tv_corner: float = 0.0
-    """Difference of neighbouring voxels, in soft references, up to which it counts in full; larger ones count by
-    their logarithm, so that edges and texture stay. 0 leaves it to the plan; with 1000 all count in full."""
-    tv_every: int = 0
-    """In every how many steps it is taken, and counts as many times; 0 leaves it to the plan."""
-    growth: float = 0.0
-    """So many times as many Gaussians as seeds may be there in the end, by splitting; 1: no more of them; 0 leaves it
-    to the plan, which asks the rays."""
-    relocated: float = 0.03
-    """Largest share of the Gaussians that, once a pass, moves from where it holds nothing to where it is wanted."""
-    relocate_until: float = 0.5
-    """Share of the run after which no Gaussian is moved: the new ones need time to settle."""
-    held_out: float = 0.01
-    """Share of the rays kept from the fit to tell when it stops improving."""
-    patience: int = 0
-    """Passes over the views without improvement of the held-out rays that end the run; 0: four in ten, at least 4."""
-    metal_tail: float = 0.5
-    """A voxel no point of which reaches about this share of the metal around it holds a tail, which that gets back."""
-    cutoff: float = 3.0
-    """Standard deviations at which a projected Gaussian ends."""
-    curves: int = 0
-    """Material curves under a spectrum: 1 for the soft one alone, or 3; 0 leaves it to the plan."""
-    spectral_nodes: int = 0
-    """Nodes of the spectrum; 0 takes as few as keep the error of P small."""
-    kernel: str = "auto"
-    """"auto", "triton", "numba" or "reference"."""
+
+    # Rates, for each step of the optimiser.
+    learning_rate_position: float = 0.03
+    """In seed spacings; up to twice as much in a run of fewer than 450 steps, as for the scale."""
+    learning_rate_scale: float = 4e-2
+    """Relative."""
+    learning_rate_rotation: float = 3e-3
+    """Of the quaternion; up to seven times as much in a run of fewer than 900 steps."""
+    learning_rate_attenuation: float = 1e-2
+    """In soft references."""
+    learning_rate_material: float = 1e-3
+    """Of material numbers outside metal, in a run of 300 steps; less in a longer one, by the root."""
+    learning_rate_shared: float = 5e-3
+    """Of each piece of metal's one number."""
+    learning_rate_blur: float = 1e-2
+    """The blur is fitted where there is metal; 0 holds it, and with ``blur`` 0 rays are infinitely thin."""
+    final_rate: float = 0.1
+    """All rates fall exponentially to this share of their start."""
 
     def __post_init__(self) -> None:
-        require_choice("settings['loss']", self.loss, ("huber", "weighted-l1", "l1"))
-        require_choice("settings['edges']", self.edges, ("auto", "sharp", "blurred"))
-        require_choice("settings['light']", self.light, ("auto", "soft", "fat"))
-        require_choice("settings['kernel']", self.kernel, ("auto", "triton", "numba", "reference"))
         for field in fields(self):
             name, value = f"settings[{field.name!r}]", getattr(self, field.name)
-            if isinstance(field.default, str):
+            if value is None and field.default is None:
                 continue
-            number = require_number(name, value, **_RANGES.get(field.name, {"at_least": 0.0}))
-            if isinstance(field.default, int):
-                if number != int(number):
-                    raise fail(name, "a whole number", repr(value))
-                number = int(number)
-            object.__setattr__(self, field.name, number)
-        if self.curves not in (0, 1, 3):
-            raise fail("settings['curves']", "1, 3, or 0 for the plan to decide", repr(self.curves))
+            if field.name == "agent":
+                _require_changes(name, value)
+            elif field.name in _CHOICES:
+                require_choice(name, value, _CHOICES[field.name])
+            else:
+                object.__setattr__(self, field.name, _number(name, value, str(field.type)))
+        if self.curves not in (None, 1, 3):
+            raise fail("settings['curves']", "1, 3, or None for the plan to decide", repr(self.curves))
         if self.curves == 1 and self.soft_u:
             raise fail("settings['curves']", "3 with a soft_u other than 0", "1", "name the soft material")
         if self.light == "fat" and self.soft_u + self.light_u < -0.1:
@@ -170,9 +194,31 @@ class Settings:
         if self.curves == 1 and self.light == "fat":
             raise fail("settings['curves']", "3 where light matter is fat", "1", "one curve has one number")
 
+    def __hash__(self) -> int:
+        return hash(tuple(repr(getattr(self, field.name)) for field in fields(self)))
+
     def to_dict(self) -> dict[str, Any]:
         """Plain values by name."""
         return asdict(self)
+
+
+def _number(name: str, value: Any, kind: str) -> float | int:
+    number = require_number(name, value, **_RANGES.get(name[len("settings['") : -2], {"at_least": 0.0}))
+    if not kind.startswith("int"):
+        return number
+    if number != int(number):
+        raise fail(name, "a whole number", repr(value))
+    return int(number)
+
+
+def _require_changes(name: str, value: Any) -> None:
+    """See to it that what an agent changes is numbers by the names of settings."""
+    known = {field.name for field in fields(Settings)}
+    if not isinstance(value, dict) or any(
+        key not in known or type(one) not in (int, float) or not math.isfinite(one)
+        for key, one in value.items()
+    ):
+        raise fail(name, "a dict of numbers by the names of settings", repr(value))
 
 
 PRESETS: dict[str, dict[str, Any]] = {
@@ -204,5 +250,7 @@ def make_settings(
     known = sorted(field.name for field in fields(Settings))
     for name in changes or {}:
         if name not in known:
-            raise fail("settings", f"names among {', '.join(known)}", repr(name), did_you_mean(name, known))
+            near = did_you_mean(name, known)
+            remedy = near or "docs/settings.md lists them all"
+            raise fail("settings", "the name of a setting", repr(name), remedy)
     return replace(Settings(), **{**PRESETS[quality], **(changes or {})})

@@ -19,6 +19,7 @@ from tomo_polysplat.bench.scenes import cache_folder, cached_scan, fewer_views
 from tomo_polysplat.cli import main
 from tomo_polysplat.fit.fork import FEWEST_PASSES
 from tomo_polysplat.fit.optimise import FitState
+from tomo_polysplat.fit.stopping import StopReason
 from tomo_polysplat.result.metrics import compare
 
 QUICK = {"passes": 1.0}
@@ -165,11 +166,13 @@ def test_a_budget_that_was_not_used_up_is_not_enlarged(task, monkeypatch):
 
 def test_a_budget_that_ended_a_run_is_enlarged_however_early_that_was(task, monkeypatch):
     """What a run says counts for more than how long it took."""
-    words = {1: "the time budget was used", 3: "15 passes over the views were made"}
+    reasons = {1: StopReason.BUDGET, 3: StopReason.PASSES}
 
     def run(method, task, options):
         budget = options.time_budget
-        return measure_module.Run(task.scan.truth, 0.8 * budget, 1, {"stop": words[budget]})
+        return measure_module.Run(
+            task.scan.truth, 0.8 * budget, 1, {"stop": {"value": reasons[budget].value}}
+        )
 
     monkeypatch.setattr(runs_module, "measure", run)
     runs = timed_runs({"polysplat": METHODS["polysplat"]}, task, (1, 3, 9), {}, lambda words: None)

@@ -6,9 +6,8 @@ import time
 import pytest
 import torch
 
-from tomo_polysplat.fit.stopping import Clock, FitState, Watch, patience_of
+from tomo_polysplat.fit.stopping import Clock, FitState, StopReason, Watch, usual_patience
 from tomo_polysplat.model.gaussians import Gaussians
-from tomo_polysplat.settings import Settings
 
 
 def cloud(mark):
@@ -39,7 +38,7 @@ def best(watch):
 def test_the_state_with_the_lowest_held_out_error_is_kept():
     """In the mean of four passes, or of those there are: 4, 3, 2, 2, 2.25, 3."""
     watch = Watch(10)
-    assert judge(watch, [4.0, 2.0, 0.0, 2.0, 5.0, 5.0]) == [""] * 6
+    assert judge(watch, [4.0, 2.0, 0.0, 2.0, 5.0, 5.0]) == [None] * 6
     assert best(watch) == 3
 
 
@@ -59,7 +58,7 @@ def test_what_is_kept_is_a_copy():
 def test_a_run_ends_after_as_many_passes_without_improvement():
     watch = Watch(3)
     answers = judge(watch, [2.0, 1.0, 2.0, 2.0, 2.0])
-    assert answers[:4] == [""] * 4 and "3 passes" in answers[4]
+    assert answers[:4] == [None] * 4 and answers[4].reason is StopReason.HELD_OUT
     assert best(watch) == 1
 
 
@@ -71,18 +70,17 @@ def test_a_hair_is_no_improvement_but_still_the_best():
 
 def test_gaussians_that_are_no_numbers_are_never_kept_however_good_the_misfit():
     watch, bad = Watch(4), cloud(1)
-    assert judge(watch, [1.0]) == [""]
+    assert judge(watch, [1.0]) == [None]
     bad.rotation[0, 2] = math.nan
     state = FitState(0.0, 0, 1, 0.5, 0.5, 0.5, lambda: None)
-    assert "finite" in watch.judge(state, bad) and watch.best.finite()
+    assert watch.judge(state, bad).reason is StopReason.NOT_FINITE and watch.best.finite()
     with pytest.raises(FloatingPointError):
         Watch(4).judge(state, bad)
 
 
 @pytest.mark.parametrize(("passes", "patience"), [(1.0, 4), (10.0, 4), (12.4, 5), (20.0, 8)])
-def test_longer_runs_have_more_patience_unless_it_is_set(passes, patience):
-    assert patience_of(Settings(), passes) == patience
-    assert patience_of(Settings(patience=3), passes) == 3
+def test_longer_runs_have_more_patience(passes, patience):
+    assert usual_patience(passes) == patience
 
 
 def test_patience_starts_again_with_every_improvement():
@@ -92,14 +90,14 @@ def test_patience_starts_again_with_every_improvement():
 
 def test_without_held_out_rays_the_loss_is_watched_and_nothing_ends_early():
     watch = Watch(1)
-    assert judge(watch, [(loss, math.nan) for loss in (3.0, 1.0, 1.0, 1.0, 9.0)]) == [""] * 5
+    assert judge(watch, [(loss, math.nan) for loss in (3.0, 1.0, 1.0, 1.0, 9.0)]) == [None] * 5
     assert best(watch) == 3
 
 
 def test_a_pass_that_met_no_held_out_ray_says_nothing():
     """As the last one of a time budget may: the fitted rays' misfit is another quantity, and mostly the smaller."""
     watch = Watch(3)
-    assert judge(watch, [(0.2, 0.3), (0.19, 0.28), (0.18, 0.285), (0.01, math.nan)]) == [""] * 4
+    assert judge(watch, [(0.2, 0.3), (0.19, 0.28), (0.18, 0.285), (0.01, math.nan)]) == [None] * 4
     assert best(watch) == 2 and watch.waited == 0
     watch = Watch(3)
     judge(watch, [(0.1, math.nan), (0.1, 0.3), (0.1, 0.4)])
@@ -117,7 +115,7 @@ def test_a_history_tells_all_but_the_best_state():
 
 def test_a_loss_that_is_no_number_ends_the_run_with_what_was_best():
     watch = Watch(4)
-    assert "finite" in judge(watch, [2.0, 1.0, (math.nan, math.nan)])[-1]
+    assert judge(watch, [2.0, 1.0, (math.nan, math.nan)])[-1].reason is StopReason.NOT_FINITE
     assert best(watch) == 1
 
 

@@ -2,11 +2,9 @@
 
 import os
 import resource
-import struct
 import subprocess
 import sys
 import threading
-import time
 import zipfile
 from pathlib import Path
 
@@ -16,7 +14,6 @@ import pytest
 from hostile_files import ARCHIVE, EXCHANGE, OURS, RESULT, RESULT_ATTRIBUTES, image, npy
 
 from tomo_polysplat.result.result import Result
-from tomo_polysplat.scan.hdf5_heaps import require_sound_heaps
 from tomo_polysplat.scan.io import load_scan
 
 
@@ -43,7 +40,7 @@ def test_the_files_that_are_tampered_with_are_sound_before(tmp_path):
 @pytest.mark.parametrize("path", ["exchange/data", "exchange", "polysplat/truth", "polysplat/geometry"])
 @pytest.mark.parametrize(
     ("trick", "message"),
-    [("external", "another file"), ("circle", "links"), ("type", "a dataset of numbers|a group|no such")],
+    [("external", "beside it"), ("circle", "links"), ("type", "a dataset of numbers|a group|no such")],
 )
 def test_links_that_lead_nowhere(tmp_path, path, trick, message):
     file = exchange(tmp_path / "scan.h5", {path: trick})
@@ -56,9 +53,7 @@ def test_links_that_lead_nowhere(tmp_path, path, trick, message):
 )
 def test_datasets_that_hold_no_numbers(tmp_path, trick):
     file = exchange(tmp_path / "scan.h5", {"exchange/data": trick})
-    with pytest.raises(
-        ValueError, match="expected (data in the file|a dataset of numbers|as much data|at most)"
-    ):
+    with pytest.raises(ValueError, match="expected (data in|a dataset of numbers|as much data|at most)"):
         load_scan(file)
 
 
@@ -96,7 +91,7 @@ def test_another_file_is_not_even_opened(tmp_path):
     answer = []
 
     def read():
-        with pytest.raises(ValueError, match="another file"):
+        with pytest.raises(ValueError, match="put pipe"):
             load_scan(file)
         answer.append(True)
 
@@ -132,33 +127,6 @@ def test_pickles_are_not_loaded(tmp_path):
     with pytest.raises(ValueError, match="never loaded"):
         load_scan(archive(tmp_path / "scan.npz", vectors=content))
     assert not (tmp_path / "sprung").exists()
-
-
-def nested_heaps(units):
-    """Sound heaps, each begun inside the one before and reaching to the same end; the walk of each is the longer."""
-    head = b"\x89HDF\r\n\x1a\n" + bytes([0, 0, 0, 0, 0, 8, 8, 0]) + bytes(16)
-    total = 16 + 48 * units
-    parts = [head, b"GCOL\x01\x00\x00\x00", struct.pack("<Q", total)]
-    for unit in range(units):
-        rest = total - 48 * unit - 32
-        parts += [struct.pack("<HHIQ", 1, 0, 0, 32), b"GCOL\x01\x00\x00\x00", struct.pack("<Q", rest)]
-        parts += [struct.pack("<HHIQ", 1, 0, 0, 0)]
-    return b"".join(parts)
-
-
-def test_heaps_within_heaps_take_no_time(tmp_path):
-    """Some are harmless, as those of an HDF5 file kept in another; the time of many grows with their square."""
-    file = tmp_path / "scan.h5"
-    file.write_bytes(nested_heaps(3))
-    require_sound_heaps(file)
-    file.write_bytes(nested_heaps(3)[:-8] + bytes([8] * 8))
-    with pytest.raises(ValueError, match="damaged heap"):
-        require_sound_heaps(file)
-    file.write_bytes(nested_heaps(4000))
-    begun = time.process_time()
-    with pytest.raises(ValueError, match="heaps within heaps"):
-        require_sound_heaps(file)
-    assert time.process_time() - begun < 1.0
 
 
 HEADER = "{'descr': '<f4', 'fortran_order': False, 'shape': (10, 10000, 10000)}"

@@ -81,6 +81,16 @@ def run_project(scene, views, kernel="reference", device="cpu", cutoff=3.0, cota
     return [image.detach().cpu(), *(leaf.grad.cpu() for leaf in leaves)], int(skipped)
 
 
+def vector_gradient(scene, views, kernel="reference", device="cpu", cutoff=3.0):
+    """(views, 4, 3) gradient of the image's product with random numbers by the vectors of the views."""
+    dtype = torch.float64 if kernel == "reference" else torch.float32
+    vectors = torch.from_numpy(views.vectors).requires_grad_()
+    leaves = [t.detach().to(device, dtype, copy=True).requires_grad_() for t in scene]
+    image, _ = project(*leaves, views, kernel=kernel, cutoff=cutoff, vectors=vectors)
+    (image * random_like(image).to(image)).sum().backward()
+    return vectors.grad
+
+
 def run_voxelise(scene, box, kernel="reference", device="cpu", cutoff=3.0):
     """The volume and the gradients of its product with random numbers."""
     dtype = torch.float64 if kernel == "reference" else torch.float32

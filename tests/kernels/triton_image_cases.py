@@ -10,6 +10,7 @@ from splat_scenes import (
     planar_views,
     run_project,
     run_voxelise,
+    vector_gradient,
     voxel_box,
 )
 from triton_case import case
@@ -217,3 +218,16 @@ def gradients_lie_by_pairs_of_rows_and_zeros_follow(device):
         laid = pairs.transpose(2, 3).reshape(2, -1, columns, wide)
         assert torch.allclose(laid[:, :rows, :, :channels].movedim(-1, 0), grad * factor)
         assert not laid[:, rows:].any() and not laid[..., channels:].any() and not pixels[2 * room :].any()
+
+
+@case
+def gradient_by_the_vectors_of_the_views(device):
+    """Of more Gaussians than a program takes, one of them beside the detector, another behind the source."""
+    for views in (cone_views(2, 7, 9, pixel=(0.3, 0.3)), parallel_views(2, 7, 9, pixel=(0.3, 0.3))):
+        scene = gaussians(70)
+        scene[0][3, 2] += 50.0
+        scene[0][5] = 3 * torch.as_tensor(views.origin[0])
+        scene = as_float32(scene)
+        expected, got = vector_gradient(scene, views), vector_gradient(scene, views, "triton", device)
+        assert torch.isfinite(got).all()
+        assert (got - expected).norm(dim=(0, 2)).div(expected.norm(dim=(0, 2))).max() < 1e-5

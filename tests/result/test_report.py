@@ -6,6 +6,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.report.figures import comparison_figure, history_figure, slices_figure
 from tomo_polysplat.report.slices import display_window, planes_through
 from tomo_polysplat.report.table import as_text, is_best
@@ -108,7 +109,7 @@ def test_the_page_stands_alone(tmp_path, flat):
         (truth + 0.01)[None],
         VolumeGrid(truth.shape, (-1, -1, -1), (1, 1, 1)),
         energy_kev=42.0,
-        plan={"channels": {"value": 1, "reason": "<no spectrum> & none wanted"}},
+        plan={"curves": Answer(1, "<no spectrum> & none wanted", Status.USUAL)},
         settings={"passes": 3.0},
         provenance={"scan": "wrist <left>", "device": "CPU"},
         history=[{"seconds": 1.0, "loss": 0.1, "held_out": 0.2}],

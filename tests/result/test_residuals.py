@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tomo_polysplat.plan.answer import Answer
 from tomo_polysplat.report.residuals import residuals_of
 from tomo_polysplat.report.verdict import verdict
 from tomo_polysplat.result.result import Result
@@ -113,15 +114,9 @@ def test_what_is_missing_is_placed():
     assert verdict(ball(), found)[2].startswith("Distrust what lies around x, y, z = ")
 
 
-@pytest.mark.parametrize("words", [False, True])
-def test_scatter_and_blur_of_the_plan_belong_to_the_model(words):
-    """In words, as plans were, or as answers with a value."""
-    values = -np.log(np.exp(-line_integrals()) + 0.05)
-    told = {"calibration": {"fitted": {"scatter": 0.05}}, "detector_blur": "variance of 0.000 squared pixels"}
-    if not words:
-        evidence = {"fitted": {"scatter": 0.05}}
-        told = {"calibration": type("Answer", (), {"value": 1, "why": "found", "evidence": evidence})()}
-    scan = scan_of(values)
+def test_scatter_of_the_plan_belongs_to_the_model():
+    scan = scan_of(-np.log(np.exp(-line_integrals()) + 0.05))
+    told = {"calibration": Answer.found({"fitted": {"scatter": 0.05}}), "fitted_blur": Answer.found(0.0)}
     assert residuals_of(ball(told), scan).rms == pytest.approx(1.0, abs=0.1)
     assert residuals_of(ball(), scan).rms > 3
 

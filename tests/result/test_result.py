@@ -9,6 +9,7 @@ import pytest
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.scan.io import load_scan
@@ -33,7 +34,7 @@ def polychromatic(u=0.3, density=1.7, **changes):
             "u": np.array([0.1, 0.9]),
         },
         "history": [{"seconds": 0.5, "iteration": 3, "loss": np.float32(0.25), "held_out": None}],
-        "plan": {"channels": {"value": 3, "reason": "a spectrum is given"}},
+        "plan": {"curves": Answer(3, "a spectrum is given", Status.ASKED, {"voxels": 7})},
         "counts": {"masked_rays": np.int64(4)},
         "settings": {"passes": 2.0},
         "provenance": {"geometry": "cone beam, 9 views"},

@@ -52,6 +52,17 @@ def test_backprojection_is_the_adjoint(kind):
 
 
 @pytest.mark.parametrize("kind", ["cone_vec", "parallel3d_vec", "fanflat"])
+def test_backprojection_has_the_same_bits_for_any_number_of_threads(kind, monkeypatch):
+    geometry, grid = scan(kind)
+    y = np.random.default_rng(3).random(geometry.shape, np.float32)
+    found = set()
+    for threads in (1, 2, 3, 5, 200):
+        monkeypatch.setattr("tomo_polysplat.start.joseph.cpu_threads", lambda threads=threads: threads)
+        found.add(JosephProjector(geometry, grid).adjoint(y).tobytes())
+    assert len(found) == 1
+
+
+@pytest.mark.parametrize("kind", ["cone_vec", "parallel3d_vec", "fanflat"])
 def test_projections_are_line_integrals(kind):
     """A wide smooth bump, for which interpolating linearly loses about 1 %."""
     geometry, grid = scan(kind)

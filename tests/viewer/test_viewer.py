@@ -13,6 +13,7 @@ import pytest
 
 from tomo_polysplat.cli.main import build_parser, main
 from tomo_polysplat.cli.view import shown_by
+from tomo_polysplat.plan.answer import Answer
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.viewer.server import Server
@@ -113,12 +114,13 @@ def test_volumes_that_do_not_fit_are_refused():
 
 
 def test_the_command_shows_files(tmp_path, capsys):
-    result(plan={"scatter": "modelled: 0.03 of the open beam"}).save(tmp_path / "a.h5")
+    record = {"fitted": {"scatter": 0.03}}
+    result(plan={"calibration": Answer.found(record)}).save(tmp_path / "a.h5")
     result(2.0).save(tmp_path / "b.h5")
     arguments = build_parser().parse_args(["view", str(tmp_path / "a.h5"), str(tmp_path / "b.h5")])
     shown = shown_by(arguments)
     assert list(shown.volumes) == ["tomo-polysplat", "b"]
-    assert "About the scanner was found: scatter, modelled: 0.03 of the open beam." in shown.html
+    assert "About the scanner was found: scatter of 0.03 of the open beam." in shown.html
     assert main(["view", str(tmp_path / "none.h5"), "--no-browser"]) == 2
     assert "none.h5" in capsys.readouterr().err
 

@@ -72,7 +72,7 @@ class Variant:
         energy = scan.truth_energy_kev
         volume = result.volume if self.one_energy or energy is None else result.attenuation(energy)
         told = ("spectrum", "gaussians", "views_per_step", "stop")
-        return volume, {"plan": {key: result.plan.get(key) for key in told}}
+        return volume, {"plan": {key: result.plan[key].to_dict() for key in told if key in result.plan}}
 
 
 DEFAULT = Variant("default")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tomo_polysplat.fit.stopping import FitState, Watch, patience_of
+from tomo_polysplat.fit.stopping import FitState, Watch, usual_patience
 from tomo_polysplat.settings import make_settings
 
 __all__ = ["stopping"]
@@ -48,7 +48,8 @@ def stopping(history: Sequence[Mapping[str, Any]], settings: Mapping[str, Any]) 
     """
     if len(history) < 2:
         return None
-    watch: Watch[_Pass] = Watch(patience_of(make_settings(changes=settings), len(history)))
+    patience = make_settings(changes=settings).patience or usual_patience(len(history))
+    watch: Watch[_Pass] = Watch(patience)
     stops = len(history)
     for number, point in enumerate(history, start=1):
         held_out = math.nan if point["held_out"] is None else point["held_out"]

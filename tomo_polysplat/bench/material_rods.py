@@ -102,4 +102,4 @@ def rod_errors(
         progress=False,
     )
     errors = accuracy_errors(Regions.of(scan.truth, scan.metal_mask), result.volume, scan)
-    return {**errors, "agent": result.plan.get("agent")}
+    return {**errors, "agent": result.plan["agent"].why}

@@ -163,7 +163,9 @@ def _polysplat(task: Task, options: Options) -> Outcome:
 
 
 def _told(result: Result) -> Outcome:
-    about = {key: result.plan.get(key) for key in ("kernel", "stop", "curves")}
+    about: dict[str, Any] = {
+        key: result.plan[key].to_dict() for key in ("kernel", "stop", "curves") if key in result.plan
+    }
     return result.volume, {"gaussians": result.counts.get("gaussians"), **about}
 
 

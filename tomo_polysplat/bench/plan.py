@@ -187,7 +187,7 @@ def run_plan_bench(
         update(record)
         if planned["seconds"] is None:
             continue
-        together = int(planned["about"]["plan"]["views_per_step"].partition(" ")[0])
+        together = planned["about"]["plan"]["views_per_step"]["value"]
         ahead = []
         for variant in variants(SCANS[name], together):
             run = _run(variant, task, bench.settings, progress)

@@ -63,7 +63,7 @@ def _row(run: Mapping[str, Any], plan: Mapping[str, Any]) -> list[str]:
     label = "the plan" if run is plan else run["method"]
     if run["seconds"] is None or plan["seconds"] is None:
         return [f"{label}: {without_figures(run) if run['seconds'] is None else 'no plan'}", *["–"] * 6]
-    seeds = str(run["about"]["plan"]["gaussians"]).partition(",")[0]
+    seeds = str(run["about"]["plan"]["gaussians"]["value"])
     figures = [f"{run['seconds']:.1f}", f"{run['cpu_seconds']:.1f}"]
     figures.append(f"x {run['cpu_seconds'] / plan['cpu_seconds']:.2f}")
     for key in ("psnr", "psnr_all"):

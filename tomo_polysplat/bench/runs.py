@@ -9,7 +9,7 @@ from tomo_polysplat.bench.measure import Run, error_history, measure
 from tomo_polysplat.bench.methods import Method, Options, Task
 from tomo_polysplat.bench.scenes import fewer_views
 from tomo_polysplat.files import available_memory
-from tomo_polysplat.fit.optimise import BUDGET_USED
+from tomo_polysplat.fit.stopping import BY_TIME
 from tomo_polysplat.parallel import run_tasks
 from tomo_polysplat.result.metrics import compare
 from tomo_polysplat.scan.scan import Scan
@@ -74,7 +74,7 @@ def _cut(run: Run, budget: float) -> bool:
     """Whether the budget ended a run, which one that keeps time for its volume may be well before."""
     assert run.seconds is not None
     if "stop" in run.about:
-        return str(run.about["stop"]).startswith(BUDGET_USED)
+        return run.about["stop"]["value"] in BY_TIME
     return run.seconds >= _USED_UP * budget
 
 

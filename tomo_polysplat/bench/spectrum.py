@@ -13,12 +13,12 @@ from tomo_polysplat.bench.environment import environment
 from tomo_polysplat.bench.scenes import cached_scan, object_of, require_scene
 from tomo_polysplat.checks import require_choice
 from tomo_polysplat.files import replacing
-from tomo_polysplat.fit.short_fit import main_density
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.detector import Detector
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.water import water_linearised
+from tomo_polysplat.plan.short_fit import main_density
 from tomo_polysplat.reconstruction import reconstruct
 from tomo_polysplat.report.style import ACCENT, QUIET
 from tomo_polysplat.result.metrics import compare
@@ -189,7 +189,7 @@ def _run(bench: SpectrumBench, scene: str, scan: Scan, case: Case, calibrated: b
     )
     volume = result.attenuation(scan.truth_energy_kev)
     rest = np.ones(volume.shape, bool) if scan.metal_mask is None else ~scan.metal_mask
-    found = result.plan.get("calibration")
+    found = result.plan["calibration"].value if "calibration" in result.plan else None
     return {
         **compare(volume, scan.truth, scan.metal_mask),
         "soft_bias": float(volume[rest].sum() / scan.truth[rest].sum() - 1.0),

@@ -99,7 +99,7 @@ def _add_settings_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_comparison_arguments(parser: argparse.ArgumentParser) -> None:
-    """What benchmarks that compare methods share."""
+    """Options that all benchmarks that compare methods share."""
     words = "default: pins teeth; NAME-control is a scene without its metal"
     parser.add_argument("--scenes", nargs="+", default=["pins", "teeth"], help=words)
     parser.add_argument("--sizes", nargs="+", type=int, default=[64], help="voxels per edge (default: 64)")
@@ -179,7 +179,7 @@ def _recon(arguments: argparse.Namespace) -> int:
 
 
 def _status(record: dict[str, Any]) -> int:
-    """0 unless a run failed; one that cannot take part here did not."""
+    """0, or 1 if a run failed. A method that cannot run on this machine is not a failure."""
     return 0 if all(run["seconds"] is not None or "skipped" in run["about"] for run in record["runs"]) else 1
 
 

@@ -43,7 +43,7 @@ def _materials_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def spectrum(arguments: argparse.Namespace, write: Callable[..., None], say: Callable[[str], None]) -> int:
-    """``bench spectrum``; ``write`` keeps a record, ``say`` tells what comes next."""
+    """``bench spectrum``; ``write`` saves a record, ``say`` prints what comes next."""
     from tomo_polysplat.bench.spectrum import SpectrumBench, as_markdown, run_spectrum_bench, write_figure
 
     names = ("scenes", "size", "views", "quality", "device", "seed")
@@ -60,7 +60,7 @@ def spectrum(arguments: argparse.Namespace, write: Callable[..., None], say: Cal
 
 
 def materials(arguments: argparse.Namespace, write: Callable[..., None], say: Callable[[str], None]) -> int:
-    """``bench materials``; ``write`` keeps a record, ``say`` tells what comes next."""
+    """``bench materials``; ``write`` saves a record, ``say`` prints what comes next."""
     from tomo_polysplat.bench.materials import MaterialsBench, as_markdown, run_materials_bench, write_figure
 
     names = ("kvp", "aluminium_cm", "largest", "size", "device")
@@ -79,7 +79,7 @@ def materials(arguments: argparse.Namespace, write: Callable[..., None], say: Ca
 def _tell(
     arguments: argparse.Namespace, name: str, record: dict[str, Any], table: str, figure: Callable[..., None]
 ) -> int:
-    """Print a table, and keep it with its figure."""
+    """Print a table, and save it with its figure."""
     print(table)
     if arguments.record:
         folder = Path(arguments.record)

@@ -1,4 +1,4 @@
-"""``tomo-polysplat check``: what a scan file says and what is wrong with it, before time is spent on it."""
+"""``tomo-polysplat check``: what a scan file holds, and what is wrong with it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Read, describe and examine; the exit status is 3 when something should be mended."""
+    """Read, describe and check a file; the exit status is 3 if something should be mended."""
     import numpy as np
 
     from tomo_polysplat.cli.options import scan_from

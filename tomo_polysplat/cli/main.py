@@ -8,13 +8,13 @@ from collections.abc import Sequence
 
 import tomo_polysplat
 from tomo_polysplat.checks import visible
-from tomo_polysplat.cli import bench, check, demo, doctor, recon, simulate, view
+from tomo_polysplat.cli import bench, check, demo, doctor, import_scan, recon, simulate, view
 from tomo_polysplat.cli.options import INTERRUPTED
 from tomo_polysplat.cli.parser import Parser
 
 __all__ = ["main"]
 
-COMMANDS = (demo, recon, view, simulate, check, bench, doctor)
+COMMANDS = (demo, import_scan, recon, view, simulate, check, bench, doctor)
 BAD_INPUT, FAILED = 2, 1
 
 
@@ -39,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _complain(str(error) or type(error).__name__, BAD_INPUT)
     except KeyboardInterrupt as error:
         return _complain(str(error) or "interrupted", INTERRUPTED)
-    except Exception as error:  # the last place that can still say it in one line
+    except Exception as error:  # the last place where it can become one line
         return _complain(f"{type(error).__name__}: {error} (run again with --debug to see where)", FAILED)
 
 
@@ -68,7 +68,7 @@ def build_parser() -> Parser:
 
 
 class _VisibleFormatter(logging.Formatter):
-    """One line a message, whatever stands in the texts of files that it tells of."""
+    """One line a message, even if texts from files have control characters in them."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  # its name in the library
         record.message = visible(record.message)

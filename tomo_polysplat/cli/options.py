@@ -19,7 +19,7 @@ __all__ = [
 ]
 
 
-# Exit status of a command that Ctrl-C has ended, as of a shell's.
+# Exit status after Ctrl-C, as shells use it.
 INTERRUPTED = 130
 
 
@@ -99,7 +99,9 @@ def _detector(text: str) -> Detector:
 
 def add_scan_options(parser: argparse.ArgumentParser) -> None:
     """The scan and what its file leaves open."""
-    parser.add_argument("scan", metavar="SCAN", help="Data Exchange HDF5 file or .npz scan")
+    parser.add_argument(
+        "scan", metavar="SCAN", help="Data Exchange HDF5 file, .npz scan, or a scanner's folder"
+    )
     group = parser.add_argument_group("what the file does not say")
     group.add_argument("--unit", help="unit of its lengths: cm (default), mm, um, m or pixel")
     group.add_argument(
@@ -132,8 +134,8 @@ def add_scan_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def scan_from(arguments: argparse.Namespace, spectrum: Spectrum | None = None) -> Any:
-    """The scan that the options name."""
+def scan_from(arguments: argparse.Namespace, spectrum: Spectrum | None = None, **more: Any) -> Any:
+    """The scan that the options name; `more` are arguments of ``load_scan`` that only some subcommands have."""
     from tomo_polysplat.scan.io import load_scan
 
     return load_scan(
@@ -145,10 +147,11 @@ def scan_from(arguments: argparse.Namespace, spectrum: Spectrum | None = None) -
         input=arguments.input,
         saturation=arguments.saturation,
         water_correction=arguments.water_correction,
+        **more,
     )
 
 
 def add_solver_options(parser: argparse._ActionsContainer) -> None:
-    """Where and from what seed to compute."""
+    """Device and seed."""
     parser.add_argument("--device", default="auto", help="auto (default), cpu, cuda or cuda:N")
     parser.add_argument("--seed", type=int, default=0, help="seed of everything random (default: 0)")

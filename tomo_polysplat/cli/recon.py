@@ -18,6 +18,7 @@ from tomo_polysplat.cli.options import (
     spectrum_from,
 )
 from tomo_polysplat.cli.recon_outputs import require_outputs, require_room_of, write_outputs
+from tomo_polysplat.fit.stopping import StopReason
 from tomo_polysplat.interrupts import postponed_interrupts
 from tomo_polysplat.progress import progress_reports
 
@@ -136,8 +137,9 @@ def run(arguments: argparse.Namespace) -> int:
         result.provenance = {"scan": scan.name} | result.provenance
         print(result)
         write_outputs(result, scan, arguments)
-    interrupted = interruption.asked or "interrupted" in result.plan.get("stop", "")
-    return INTERRUPTED if interrupted else 0
+    stop = result.plan.get("stop")
+    interrupted = stop is not None and stop.value == StopReason.INTERRUPTED
+    return INTERRUPTED if interruption.asked or interrupted else 0
 
 
 def _calibrated(arguments: argparse.Namespace) -> bool | list[str] | None:

@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 
 
 def require_outputs(arguments: argparse.Namespace) -> None:
-    """Find out before the work, not after it, that a result could not be written."""
+    """Refuse outputs that could not be written, before the work begins."""
     from tomo_polysplat.result.formats import format_of
     from tomo_polysplat.result.tiff import require_slices_folder
 
@@ -55,7 +55,7 @@ def require_outputs(arguments: argparse.Namespace) -> None:
 
 
 def _require_apart(arguments: argparse.Namespace, written: dict[str, Path], folders: dict[str, Path]) -> None:
-    """Refuse to write one file twice, over what is read, or into a folder that is replaced as a whole."""
+    """Refuse to write a file twice, over an input, or into a folder that is replaced as a whole."""
     read = {name: Path(path) for name in ("scan", "spectrum") if (path := getattr(arguments, name))}
     seen: dict[Path, str] = {}
     for name, path in (read | written | folders).items():
@@ -72,7 +72,7 @@ def _require_apart(arguments: argparse.Namespace, written: dict[str, Path], fold
 
 
 def _same_file(one: Path, other: Path) -> bool:
-    """Whether two names, perhaps in other letters, are of one file."""
+    """Whether two names, perhaps with other letters or case, mean one file."""
     try:
         return one.samefile(other)
     except OSError:
@@ -80,7 +80,7 @@ def _same_file(one: Path, other: Path) -> bool:
 
 
 def require_room_of(arguments: argparse.Namespace, scan: Scan) -> None:
-    """Find out before the work that the disk is too full for the volume, or that the file cannot hold it."""
+    """Refuse, before the work begins, a volume that the disk has no room for, or that the file cannot hold."""
     from tomo_polysplat.result.formats import format_of
 
     voxels = math.prod(scan.volume_shape)
@@ -89,7 +89,7 @@ def require_room_of(arguments: argparse.Namespace, scan: Scan) -> None:
         kind.require(hu=arguments.hu, bits=arguments.bits, voxels=voxels, argument="--output")
     if arguments.hu:
         _require_hounsfield(arguments, scan)
-    # Of the three curves that there may be.
+    # At most three curves.
     needed = {Path(arguments.output).parent: kind.bytes_needed(voxels, 3, arguments.bits)}
     if arguments.tiff is not None:
         folder = Path(arguments.tiff)
@@ -98,14 +98,14 @@ def require_room_of(arguments: argparse.Namespace, scan: Scan) -> None:
 
 
 def _require_hounsfield(arguments: argparse.Namespace, scan: Scan) -> None:
-    """Hounsfield units compare with water at an energy that only a spectrum tells."""
+    """Refuse Hounsfield units without a spectrum or a real length: they compare with water at an energy."""
     if scan.unit == "pixel" or arguments.mono or scan.spectrum is None:
         remedy = "pass --kvp or --spectrum and the pixel's size, or leave it out"
         raise fail("--hu", "a spectrum and real lengths", "a volume without an energy", remedy)
 
 
 def write_outputs(result: Result, scan: Scan, arguments: argparse.Namespace) -> None:
-    """Everything that was asked for; what cannot be written keeps nothing else from it."""
+    """Write all outputs. If one of them fails, the others are still written."""
     failures: list[OSError] = []
     _attempt(arguments.output, failures, lambda: _save(result, arguments))
     if failures:
@@ -149,7 +149,7 @@ def _save(result: Result, arguments: argparse.Namespace) -> None:
 
 
 def _attempt(path: str, failures: list[OSError], write: Callable[[], None]) -> None:
-    """Write one file; what keeps it from that is added to the failures, and the rest goes on."""
+    """Write one file; add its error, if any, to the failures and go on."""
     try:
         write()
     except OSError as error:
@@ -160,7 +160,7 @@ def _attempt(path: str, failures: list[OSError], write: Callable[[], None]) -> N
 
 
 def _rescue(result: Result, arguments: argparse.Namespace) -> None:
-    """Keep what may have taken hours in a folder for temporary files; its name nobody else can foresee."""
+    """Save the result, which may have taken hours, to a new temporary folder with a random name."""
     folder = Path(tempfile.mkdtemp(prefix="tomo-polysplat-"))
     path = folder / "rescued.h5"
     try:
@@ -173,7 +173,7 @@ def _rescue(result: Result, arguments: argparse.Namespace) -> None:
 
 
 def _errors(result: Result, scan: Scan) -> dict[str, Any] | None:
-    """Figures of merit at the energy of the truth, where the scan carries one that the volume can be compared with."""
+    """Errors at the energy of the truth, if the scan has a truth that the volume can be compared with."""
     if scan.truth is None:
         return None
     from tomo_polysplat.result.metrics import compare

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.checkpoint import Snapshot
 from tomo_polysplat.fit.choose_step import make_step
 from tomo_polysplat.fit.learning_rates import hurried
 from tomo_polysplat.fit.light_matter import tell_light
 from tomo_polysplat.fit.metal_numbers import number_metals
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.snapshot import Snapshot
 from tomo_polysplat.fit.soft_matter import flatten
 from tomo_polysplat.fit.step import step_rates
 from tomo_polysplat.fit.stopping import Clock
@@ -75,7 +75,7 @@ class Fitter:
         self.relocated = 0
         self.relocation_due = False
         light = int(splittable(gaussians, settings.bone_level).sum())
-        self.most = len(gaussians) + math.floor(max(settings.growth - 1.0, 0.0) * light)
+        self.most = len(gaussians) + math.floor(max((settings.growth or 1.0) - 1.0, 0.0) * light)
 
     def passes(self, clock: Clock) -> Iterator[tuple[float, float, int]]:
         """Step until the clock runs out; what each pass over the views gave, the last perhaps a part of one.

@@ -5,31 +5,18 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 from tomo_polysplat.fit.fitter import Fitter
+from tomo_polysplat.fit.optimise import Made
 from tomo_polysplat.fit.stopping import Clock
 from tomo_polysplat.start.initial import FEW_VIEWS
 
-__all__ = ["FEWEST_PASSES", "Fork", "Made", "Question", "fork", "passes_of_a_fork", "why_no_fork"]
+__all__ = ["FEWEST_PASSES", "Fork", "fork", "passes_of_a_fork", "why_no_fork"]
 
 # A run of fewer passes is in a hurry.
 FEWEST_PASSES = 10.0
 # Passes of each way at least.
 _PASSES = 2
-
-# Errors of the fitted and of the held-out rays, and the pairs skipped.
-Made = tuple[float, float, int]
-
-
-class Question(Protocol):
-    """What a run is asked on the way; its plan gets the answer."""
-
-    def due(self, clock: Clock) -> bool:
-        """Whether it is to be asked now."""
-
-    def answered(self, fitter: Fitter, clock: Clock) -> tuple[Fitter, Made | None]:
-        """The fitter to go on with, some passes later, and what the last of them gave, if there were any."""
 
 
 @dataclass(frozen=True)

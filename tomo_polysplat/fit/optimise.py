@@ -11,31 +11,44 @@ from typing import Any
 
 import numpy as np
 
-from tomo_polysplat.fit.checkpoint import Checkpoint
 from tomo_polysplat.fit.fitter import Fitter, views_of_a_pass
-from tomo_polysplat.fit.fork import Question
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.fit.stopping import Clock, FitState, Watch, is_true, patience_of
+from tomo_polysplat.fit.snapshot import Keeps
+from tomo_polysplat.fit.stopping import Clock, FitState, Stop, StopReason, Watch, is_true, usual_patience
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 
-__all__ = ["BUDGET_USED", "FitOutcome", "FitState", "OtherPhysics", "fit"]
+__all__ = ["Between", "FitOutcome", "FitState", "Made", "Run", "fit"]
 
 logger = logging.getLogger(__name__)
 
-BUDGET_USED = "the time budget was used"
+# Mean misfit of the fitted and of the held-out rays, and the pairs skipped.
+Made = tuple[float, float, int]
 
 
 @dataclass
 class FitOutcome:
-    """Fitted Gaussians with the record of the run."""
+    """Fitted Gaussians with the record of the run.
+
+    Attributes
+    ----------
+    gaussians : Gaussians
+    history : list of dict
+        One entry a pass.
+    skipped_pairs, relocated : int
+    stop : Stop or None
+        What ended the run.
+    restart : anything, or None
+        What a question found that the run is to begin anew with.
+    """
 
     gaussians: Gaussians
     history: list[dict[str, Any]] = field(default_factory=list)
     skipped_pairs: int = 0
     relocated: int = 0
-    reason: str = ""
+    stop: Stop | None = None
+    restart: Any = None
 
     def counts(self) -> dict[str, int]:
         """What was skipped or held at a bound."""
@@ -47,36 +60,40 @@ class FitOutcome:
         }
 
 
-class OtherPhysics(Exception):
-    """A fit is to begin anew, under physics that its rays have shown.
+@dataclass
+class Run:
+    """A run that is under way, as what is called between its passes sees it.
 
     Attributes
     ----------
-    found : dict
-        The record of what told so; see `fit.calibration.calibrated`.
-    outcome : FitOutcome
-        What the fit had come to.
+    fitter : Fitter
+        To be replaced where a question is answered by another one.
+    clock : Clock
+    made : (float, float, int) or None
+        To be set by who has made passes: errors of the last one, and the pairs skipped in all of them.
+    restart : anything, or None
+        To be set where the run is to begin anew with it.
     """
 
-    outcome: FitOutcome
+    fitter: Fitter
+    clock: Clock
+    made: Made | None = None
+    restart: Any = None
 
-    def __init__(self, found: dict[str, Any]) -> None:
-        super().__init__(found["why"])
-        self.found = found
+
+# What is called between two passes.
+Between = Callable[[Run], Any]
 
 
-@dataclass
-class _Run:
+@dataclass(kw_only=True)
+class _Keeper(Run):
     """All that changes during a run, and the file that keeps it, if there is one."""
 
-    fitter: Fitter
     outcome: FitOutcome
     watch: Watch[Gaussians]
-    clock: Clock
     started: float
-    checkpoint: Checkpoint | None
-    questions: Sequence[Question]
-    look: Callable[[Fitter, Clock], Any] | None
+    checkpoint: Keeps | None
+    between: Between | None
 
     def keep(self, *, now: bool) -> None:
         """Offer the checkpoint the state between two passes."""
@@ -91,7 +108,7 @@ class _Run:
             "begun": clock.begun - self.started,
             "history": outcome.history,
             "skipped_pairs": outcome.skipped_pairs,
-            "reason": outcome.reason,
+            "stop": None if outcome.stop is None else [outcome.stop.reason.value, outcome.stop.words],
         }
 
     def restore(self) -> None:
@@ -104,43 +121,43 @@ class _Run:
         self.clock.done, self.clock.begun = numbers["steps"], self.started + numbers["begun"]
         best = None if kept.best is None else kept.best.to(gaussians.position.device)
         self.watch.recall(numbers["history"], best)
-        self.outcome.history, self.outcome.reason = numbers["history"], numbers["reason"]
+        self.outcome.history, stop = numbers["history"], numbers["stop"]
+        self.outcome.stop = None if stop is None else Stop(StopReason(stop[0]), stop[1])
         self.outcome.skipped_pairs = numbers["skipped_pairs"]
         self.outcome.relocated = self.fitter.relocated
 
     def follow(
         self, volume: Callable[[Gaussians], np.ndarray], callbacks: Sequence[Callable[[FitState], Any]]
     ) -> None:
-        """Pass by pass until something ends the run, which the outcome's reason then says."""
+        """Pass by pass until something ends the run, which the outcome's ``stop`` then says."""
         outcome = self.outcome
         for loss, held_out, skipped in self._passes():
             outcome.skipped_pairs += skipped
             outcome.relocated = self.fitter.relocated
             state = self._state(loss, held_out, volume)
             outcome.history.append(state.record())
-            outcome.reason = self.watch.judge(state, self.fitter.gaussians)
-            self.keep(now=bool(outcome.reason) or self.clock.share() >= 1)
+            outcome.stop = self.watch.judge(state, self.fitter.gaussians)
+            self.keep(now=outcome.stop is not None or self.clock.share() >= 1)
             if any([is_true(callback(state)) for callback in callbacks]):
                 self.keep(now=True)
-                outcome.reason = "a callback ended it"
-            if outcome.reason:
+                outcome.stop = Stop(StopReason.CALLBACK, "a callback ended it")
+            if outcome.stop is not None:
                 return
 
     def _passes(self) -> Iterator[tuple[float, float, int]]:
         """What each pass gave; where something is asked, several at once, so that no checkpoint lies between them."""
-        passes = self.fitter.passes(self.clock)
         while True:
-            if self.look is not None:
-                self.look(self.fitter, self.clock)
-            if (asked := next((one for one in self.questions if one.due(self.clock)), None)) is not None:
-                self.fitter, made = asked.answered(self.fitter, self.clock)
-                passes = self.fitter.passes(self.clock)
-                if made is not None:
-                    yield made
-            elif (one := next(passes, None)) is not None:
-                yield one
-            else:
+            self.made = None
+            if self.between is not None:
+                self.between(self)
+            if self.restart is not None:
+                self.outcome.restart = self.restart
+                self.outcome.stop = Stop(StopReason.RESTART, "begun anew")
                 return
+            one = self.made or next(self.fitter.passes(self.clock), None)
+            if one is None:
+                return
+            yield one
 
     def _state(self, loss: float, held_out: float, volume: Callable[[Gaussians], np.ndarray]) -> FitState:
         gaussians, clock = self.fitter.gaussians, self.clock
@@ -162,63 +179,55 @@ def fit(
     deadline: float | None = None,
     volume: Callable[[Gaussians], np.ndarray],
     callbacks: Sequence[Callable[[FitState], Any]] = (),
-    checkpoint: Checkpoint | None = None,
-    questions: Sequence[Question] = (),
-    look: Callable[[Fitter, Clock], Any] | None = None,
+    checkpoint: Keeps | None = None,
+    between: Between | None = None,
 ) -> FitOutcome:
     """Fit Gaussians to rays.
 
-    Stops after ``settings.passes`` over the views, at ``deadline`` (``time.perf_counter`` seconds), when the
-    held-out rays have not improved for `patience_of` passes, when a callback returns True, or on
+    Stops after ``settings.passes`` over the views, at ``deadline`` (``time.perf_counter`` seconds), when the held-out
+    rays have not improved for ``settings.patience`` passes (`usual_patience`), when a callback returns True, or on
     KeyboardInterrupt; returns the Gaussians that `Watch` holds for the best. Where ``checkpoint``
-    holds a snapshot, ``gaussians`` are its own and the fit goes on from there. ``questions`` are asked on the
-    way, and ``look`` is called between passes.
-
-    Raises
-    ------
-    OtherPhysics
-        That ``look`` raises, with what the fit had come to.
+    holds a snapshot, ``gaussians`` are its own and the fit goes on from there. ``between`` is called
+    between passes, and asks what the plan left open.
     """
     if not len(gaussians):
         logger.warning("The start volume is empty: no Gaussians, a volume of zeros.")
-        return FitOutcome(gaussians, reason="nothing to fit: the start volume is empty")
+        words = "nothing to fit: the start volume is empty"
+        return FitOutcome(gaussians, stop=Stop(StopReason.EMPTY, words))
     batch = min(views_per_step, len(rays.views))
-    steps = max(1, math.ceil(settings.passes * views_of_a_pass(rays) / batch))
+    steps = max(1, math.ceil((settings.passes or 1.0) * views_of_a_pass(rays) / batch))
     outcome = FitOutcome(gaussians)
-    watch: Watch[Gaussians] = Watch(patience_of(settings, settings.passes))
+    passes = settings.passes or 1.0
+    watch: Watch[Gaussians] = Watch(settings.patience or usual_patience(passes))
     # Nobody else holds the fitter, which makes room for another one where a question is answered by that.
-    run = _Run(
+    run = _Keeper(
         Fitter(gaussians, spacing, rays, scene, settings, batch, steps, rng),
-        outcome,
-        watch,
         # From now on: what compiling or recording the step took is no part of the run that the learning rates follow.
         clock := Clock(steps, deadline),
-        started,
-        checkpoint,
-        questions,
-        look,
+        outcome=outcome,
+        watch=watch,
+        started=started,
+        checkpoint=checkpoint,
+        between=between,
     )
     run.restore()
     try:
-        if not outcome.reason:
+        if outcome.stop is None:
             run.follow(volume, callbacks)
     except KeyboardInterrupt:
         logger.warning("Interrupted after %d steps; the best state so far is returned.", clock.done)
-        outcome.reason = "interrupted"
-    except OtherPhysics as other:
-        outcome.gaussians, outcome.reason = watch.best or gaussians.copy(), "interrupted"
-        other.outcome = outcome
-        raise
-    outcome.reason = outcome.reason or _used_up(clock, settings)
+        outcome.stop = Stop(StopReason.INTERRUPTED, "interrupted")
+    outcome.stop = outcome.stop or _used_up(clock, passes)
     outcome.gaussians = watch.best or gaussians.copy()
     return outcome
 
 
-def _used_up(clock: Clock, settings: Settings) -> str:
+def _used_up(clock: Clock, passes: float) -> Stop:
     """Why a run ended that nothing else had ended before."""
     if not clock.late:
-        return f"{settings.passes:g} passes over the views were made"
+        return Stop(StopReason.PASSES, f"{passes:g} passes over the views were made")
     if clock.done:
-        return BUDGET_USED
+        return Stop(StopReason.BUDGET, "the time budget was used")
     logger.warning("The time budget ended before the first step: the result is no better than its start.")
-    return f"{BUDGET_USED} before the first step"
+    words = "the time budget was used before the first step"
+    return Stop(StopReason.BUDGET_BEFORE_FIRST_STEP, words)

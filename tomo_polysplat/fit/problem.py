@@ -7,7 +7,7 @@ the first reconstruction on happens in them, so that no choice, and not even rou
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,31 +17,25 @@ import torch
 from tomo_polysplat.checks import require_choice
 from tomo_polysplat.fit.inside import matter_is_inside
 from tomo_polysplat.fit.memory import projections_stay
-from tomo_polysplat.fit.plan import Plan
-from tomo_polysplat.fit.rays import Rays
-from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.fit.spectral_model import OPAQUE, spectral_model
 from tomo_polysplat.fit.surroundings import widened_grid
-from tomo_polysplat.kernels import select
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.scatter import Scatter, made_level, without_scatter
-from tomo_polysplat.physics.solids import number_of_solid
 from tomo_polysplat.physics.spectrum import Spectrum
-from tomo_polysplat.render.renderer import detector_views, voxel_box
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.scan.noise import photons_per_ray
 from tomo_polysplat.scan.snapped import snapped_geometry, snapped_grid
 from tomo_polysplat.scan.view_order import view_order
-from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.agreement import halves_agree
 from tomo_polysplat.transfer import to_device
 from tomo_polysplat.units import LENGTH_UNITS, cm_per
 
-__all__ = ["Problem"]
+__all__ = ["OPAQUE", "Problem"]
 
 logger = logging.getLogger(__name__)
 
 _HOST = torch.device("cpu")
+# Beyond this a ray says "opaque", not how opaque: the spectral nodes are fitted up to it at most.
+OPAQUE = 15.0
 
 
 @dataclass
@@ -227,13 +221,13 @@ class Problem:
                 self._known.agreement = [None] * len(bodies)
         return self._known.agreement
 
-    def _photons(self, device: torch.device) -> float:
+    def photons(self, device: torch.device) -> float:
         """Photons of an unattenuated ray, told once a scan; see ``scan.noise``."""
         if self._known.photons is None:
             self._known.photons = photons_per_ray(self._copied(device))
         return self._known.photons
 
-    def _closed(self, device: torch.device) -> tuple[bool, str]:
+    def closed(self, device: torch.device) -> tuple[bool, str]:
         """Whether no matter lies beside the volume, and words that say so."""
         if self._known.closed is None:
             self._known.closed = (
@@ -243,67 +237,7 @@ class Problem:
             )
         return self._known.closed
 
-    def scene(self, plan: Plan, settings: Settings, device: torch.device) -> FitScene:
-        """The forward model."""
-        kernel, why = select.choose(device, settings.kernel)
-        plan.reasons["kernel"] = f"{kernel}: {why}"
-        quadrature, reference_curve, output_curve, least_u = spectral_model(self, plan, settings, device)
-        # One node of one curve: -log(I/I0) is in proportion to the areal density.
-        straight = quadrature is not None and quadrature.attenuation.size == 1
-        slope = float(quadrature.attenuation[0, 0]) if quadrature is not None and straight else 1.0
-        closed, plan.reasons["window"] = self._closed(device)
-        return FitScene(
-            box=voxel_box(self.grid),
-            quadrature=None if straight else quadrature,
-            areal_scale=self.depth * plan.reference * slope,
-            reference_curve=reference_curve,
-            output_curve=output_curve,
-            least_u=least_u,
-            kernel=kernel,
-            cutoff=settings.cutoff,
-            metal_tail=settings.metal_tail,
-            blurring=plan.blurred,
-            tv_corners=plan.tv_corners,
-            closed=closed,
-            tv_every=plan.tv_every,
-            smallest_scale=plan.smallest_scale,
-            pixel_rays=max(plan.pixel_rays, 1),
-            light_u=settings.light_u if plan.fat else 0.0,
-            solid_number=self._solid_number(plan, settings),
-        )
-
     def primary(self, device: torch.device) -> torch.Tensor:
         """The projections as they would be without scatter, on a device."""
         values, level = self._level(device)
         return without_scatter(values, level, OPAQUE) if level else values
-
-    def _solid_number(self, plan: Plan, settings: Settings) -> Callable[[np.ndarray], np.ndarray] | None:
-        """Numbers of solids by attenuation at the volume's energy, for curves that they are known for."""
-        if self.spectrum is None or self.materials != Materials() or settings.metal_u != Settings().metal_u:
-            return None
-        energy = self.spectrum.effective_energy
-        return lambda levels: number_of_solid(plan.reference * levels, energy)
-
-    def all_curves(self, basis: np.ndarray, plan: Plan, dense: float) -> np.ndarray:
-        """(3, nz, ny, nx) densities of the material curves from those of the model, which may lack two.
-
-        Matter denser than so many soft references, which the start did not show, is told in the log and the plan.
-        """
-        if self.materials is None or len(basis) > 1:
-            return basis
-        found = float(basis.max(initial=0.0)) / plan.reference
-        if found > dense:
-            words = f"the fit found {found:.2g} soft references where the start had none above {dense:g}"
-            words += f"; settings={{'bone_level': {0.7 * dense:.2g}}} would free material numbers there"
-            plan.reasons["curves"] += f"; {words}"
-            logger.warning("One curve may be too few: %s.", words)
-        return np.concatenate([basis, np.zeros((2, *basis.shape[1:]), np.float32)])
-
-    def rays(self, plan: Plan, settings: Settings, device: torch.device) -> Rays:
-        """The measured rays on the device."""
-        photons = float("inf") if settings.loss == "l1" else self._photons(device)
-        plan.reasons["photons_per_ray"] = f"{photons:.3g}, from the scatter of neighbouring pixels"
-        views = detector_views(self.geometry, self.planar)
-        values = self.measured(device)
-        target = None if values.device.type == device.type else device
-        return Rays(values, views, photons, settings.model_error, settings.held_out, target)

@@ -6,13 +6,22 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from tomo_polysplat.settings import Settings
-
-__all__ = ["Clock", "FitState", "Fitted", "Watch", "is_true", "patience_of"]
+__all__ = [
+    "BY_TIME",
+    "Clock",
+    "FitState",
+    "Fitted",
+    "Stop",
+    "StopReason",
+    "Watch",
+    "is_true",
+    "usual_patience",
+]
 
 _Fitted = TypeVar("_Fitted", bound="Fitted")
 
@@ -24,6 +33,37 @@ _IMPROVEMENT = 2e-3
 # Share of a run's passes, and passes at least, without improvement that end it. While the learning rates are high the
 # held-out error goes up and down: with 4 passes, runs of 20 ended after 8 and 10 (slices of 64^2: 19.4 for 23.2 dB).
 _PATIENCE, _LEAST_PATIENCE = 0.4, 4
+
+
+class StopReason(str, Enum):
+    """What ended a run."""
+
+    PASSES = "passes"
+    HELD_OUT = "held out"
+    CALLBACK = "callback"
+    BUDGET = "budget"
+    BUDGET_BEFORE_FIRST_STEP = "budget before the first step"
+    NOT_FINITE = "not finite"
+    INTERRUPTED = "interrupted"
+    RESTART = "restart"
+    EMPTY = "empty"
+
+
+# The time budget's.
+BY_TIME = (StopReason.BUDGET, StopReason.BUDGET_BEFORE_FIRST_STEP)
+
+
+@dataclass(frozen=True)
+class Stop:
+    """What ended a run, and words that say so."""
+
+    reason: StopReason
+    words: str
+
+    @property
+    def by_time(self) -> bool:
+        """Whether the time budget did."""
+        return self.reason in BY_TIME
 
 
 @dataclass
@@ -107,9 +147,9 @@ class Clock:
         return now + steps * (now - self.begun) / max(self.done, 1) <= self.deadline
 
 
-def patience_of(settings: Settings, passes: float) -> int:
+def usual_patience(passes: float) -> int:
     """Passes without improvement that end a run of so many."""
-    return settings.patience or max(_LEAST_PATIENCE, math.ceil(_PATIENCE * passes))
+    return max(_LEAST_PATIENCE, math.ceil(_PATIENCE * passes))
 
 
 class Fitted(Protocol):
@@ -138,19 +178,20 @@ class Watch(Generic[_Fitted]):
         self.lowest = math.inf
         self.waited = 0
 
-    def judge(self, state: FitState, fitted: _Fitted) -> str:
-        """The reason to stop, or nothing."""
+    def judge(self, state: FitState, fitted: _Fitted) -> Stop | None:
+        """The reason to stop, if there is one."""
         if not (math.isfinite(state.loss) and fitted.finite()):
             if self.best is None:
                 raise FloatingPointError(
                     "the fit diverged in its first pass: projections that are not -log(I/I0), or rates set too high"
                 )
-            return "the fit stopped being finite"
+            return Stop(StopReason.NOT_FINITE, "the fit stopped being finite")
         if self._note(state.loss, state.held_out):
             self.best = fitted.copy()
         if self.by_held_out and self.waited >= self.patience:
-            return f"the held-out rays had not improved for {self.waited} passes"
-        return ""
+            words = f"the held-out rays had not improved for {self.waited} passes"
+            return Stop(StopReason.HELD_OUT, words)
+        return None
 
     def recall(self, history: Sequence[Mapping[str, Any]], best: _Fitted | None) -> None:
         """Go on after the passes of a ``history``, of whose states ``best`` was kept."""

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-__all__ = ["DetectorViews"]
+__all__ = ["DetectorViews", "length_gradient"]
 
 
 # Views a batch may have for its table to be put together from slices: no copy from the host, which would wait.
@@ -60,6 +60,14 @@ class DetectorViews:
         origin, matrix = self.origin[indices], self.matrix[indices]
         return DetectorViews(self.cone, origin, matrix, self.rows, self.columns, self.planar, (self, indices))
 
+    def moved(self, vectors: np.ndarray) -> DetectorViews:
+        """The same views with other :attr:`vectors`, (views, 4, 3)."""
+        vectors = np.asarray(vectors, dtype=np.float64)
+        # Contiguous, as kernels are compiled for.
+        origin = np.ascontiguousarray(vectors[:, 0])
+        matrix = np.ascontiguousarray(vectors[:, 1:].transpose(0, 2, 1))
+        return DetectorViews(self.cone, origin, matrix, self.rows, self.columns, self.planar)
+
     def finer(self, parts: int) -> DetectorViews:
         """The same views by pixels that are parts of these: so many along columns, and along rows unless planar."""
         down = 1 if self.planar else parts
@@ -97,16 +105,26 @@ class DetectorViews:
         return np.concatenate(parts, axis=1)
 
     @property
+    def vectors(self) -> np.ndarray:
+        """(views, 4, 3) float64: ``origin``, ``U``, ``V``, ``D``; all that a view's image depends on."""
+        return np.concatenate([self.origin[:, None], self.matrix.transpose(0, 2, 1)], axis=1)
+
+    @property
     def inverse(self) -> np.ndarray:
         """(views, 3, 3) float64 inverse of ``matrix``."""
         return np.linalg.inv(self.matrix)
 
-    def ray_lengths(self, device: torch.device | str, dtype: torch.dtype) -> torch.Tensor:
+    def ray_lengths(
+        self, device: torch.device | str, dtype: torch.dtype, vectors: torch.Tensor | None = None
+    ) -> torch.Tensor:
         """(views, rows, columns) length of the unnormalised ray vector of every pixel.
 
         It is the factor of the line integral that depends on the pixel alone (one value a view when parallel).
+        ``vectors`` stand for those of the views, so that it can be differentiated by them.
         """
-        matrix = torch.as_tensor(self.matrix, device=device, dtype=dtype)
+        if vectors is None:
+            vectors = torch.from_numpy(self.vectors)
+        matrix = vectors[:, 1:].transpose(1, 2).to(device=device, dtype=dtype)
         if not self.cone:
             return matrix[:, :, 2].norm(dim=1)[:, None, None].expand(-1, self.rows, self.columns)
         column = torch.arange(self.columns, device=device, dtype=dtype)
@@ -114,3 +132,17 @@ class DetectorViews:
         u, v, d = (matrix[:, :, None, None, k] for k in range(3))
         ray = d + row[:, None] * v + column * u
         return ray.square().sum(dim=1).sqrt()
+
+
+def length_gradient(slope: torch.Tensor, views: DetectorViews) -> torch.Tensor:
+    """What the length of each pixel's ray, a factor of its line integral, adds to dL/d(vectors), (views, 4, 3) float64.
+
+    Parameters
+    ----------
+    slope : (views, rows, columns) tensor
+        dL/dP times P, summed over channels, for line integrals P.
+    """
+    vectors = torch.from_numpy(views.vectors).to(slope.device).requires_grad_()
+    with torch.enable_grad():
+        logarithms = views.ray_lengths(slope.device, torch.float64, vectors).log()
+    return torch.autograd.grad(logarithms, vectors, slope.double())[0]

@@ -10,17 +10,17 @@ __all__ = ["start_numbers"]
 
 # Attenuation of bone in soft references. At 90 kV cortical bone has 4.4, at 160 kV 2.4, at 60 kV 5.7.
 _BONE = 4.0
-# What noise and streaks make of soft matter is not taken for bone.
+# Attenuation, in soft references, up to which matter counts as soft: noise and streaks reach it.
 _LEAST = 1.3
 
 
 def start_numbers(relative: torch.Tensor, settings: Settings) -> torch.Tensor:
     """Material numbers by attenuation, as those of mixtures of soft matter and bone mineral go.
 
-    Bone is such a mixture, and so is a voxel that an edge of bone crosses. The material number whose rays look most
-    like those of water with a share ``f`` of hydroxyapatite by volume (``physics.best_stand_in``, default curves) is
-    close to ``0.5 f / (f + 0.2)``, and its attenuation at 90 kV is ``1 + 9.7 f`` times that of water, so that the
-    number goes as ``(v - 1) / (v + 1)`` with the attenuation ``v``.
+    Bone is such a mixture, and so is a voxel that an edge of bone crosses. Take water with a share ``f`` of
+    hydroxyapatite by volume. The material number whose rays are most like its rays (``physics.best_stand_in``, default
+    curves) is close to ``0.5 f / (f + 0.2)``. Its attenuation at 90 kV is ``v = 1 + 9.7 f`` times that of water. So the
+    number is proportional to ``(v - 1) / (v + 1)``.
 
     Parameters
     ----------

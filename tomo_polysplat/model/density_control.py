@@ -1,4 +1,4 @@
-"""Gaussians are split where the rays ask for more detail, into places of others that hold nothing, or to be more."""
+"""Split Gaussians where the rays ask for more detail. Halves replace empty Gaussians, or the cloud grows."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _DEAD = 1e-3
 
 @torch.no_grad()
 def relocate(gaussians: Gaussians, pull: torch.Tensor, share: float) -> torch.Tensor:
-    """Split the Gaussians that are pulled hardest, into the places of those that hold nothing.
+    """Split the Gaussians that the rays pull hardest; their halves take the places of empty Gaussians.
 
     A Gaussian that is pulled both ways at once covers something finer than itself. It becomes two; see `_halve`.
 
@@ -32,7 +32,7 @@ def relocate(gaussians: Gaussians, pull: torch.Tensor, share: float) -> torch.Te
     Returns
     -------
     (m,) int64 tensor
-        Indices of all that changed, whose optimiser's memory is void.
+        Indices of all that changed. The optimiser must forget its state of these.
     """
     dead = (gaussians.attenuation < _DEAD) & (gaussians.group <= 0)
     alive = gaussians.attenuation >= _DEAD
@@ -53,15 +53,15 @@ def relocate(gaussians: Gaussians, pull: torch.Tensor, share: float) -> torch.Te
 def grow(
     gaussians: Gaussians, pull: torch.Tensor, count: int, dense: float
 ) -> tuple[Gaussians, torch.Tensor]:
-    """Split so many of the light Gaussians that are pulled hardest, or all of those that hold something.
+    """Split the ``count`` light Gaussians that the rays pull hardest, or all of them that are not empty.
 
-    Rays pull hardest at the edges of what is dense, and it would come out worse: pins of 64^3 voxels by 3 dB, and the
-    iron in broccoli of that size by 6.
+    Dense Gaussians are left out. Rays pull hardest at dense edges, but these come out worse with more Gaussians: pins
+    of 64^3 voxels by 3 dB, and the iron in broccoli of that size by 6 dB.
 
     Parameters
     ----------
     gaussians : Gaussians
-        Changed in place; halves of theirs follow them in what is returned.
+        Changed in place; the new halves follow them in what is returned.
     pull : (n,) tensor
         As for `relocate`.
     count : int
@@ -86,24 +86,24 @@ def grow(
 
 
 def splittable(gaussians: Gaussians, dense: float) -> torch.Tensor:
-    """(n,) bool: which Gaussians a cloud grows by.
+    """(n,) bool: which Gaussians may be split to make a cloud grow.
 
-    That is soft matter, and what has a material number of its own, as all near metal has, and is less dense than
-    ``dense``. Without the latter packed grains of 36^3 voxels with iron balls gain 1.4 instead of 3.0 dB by growth.
+    These are soft matter, and Gaussians less dense than ``dense`` that have a material number of their own, as all near
+    metal. Without the second kind packed grains of 36^3 voxels with iron balls gain 1.4 instead of 3.0 dB by growth.
     """
     return (gaussians.group == 0) | ((gaussians.group < 0) & (gaussians.attenuation < dense))
 
 
 def _hardest(pull: torch.Tensor, alive: torch.Tensor, count: int) -> torch.Tensor:
-    """(count,) indices of the Gaussians that hold something and are pulled hardest."""
+    """(count,) indices of the Gaussians that are pulled hardest, without empty ones."""
     return torch.where(alive, pull, -torch.ones_like(pull)).topk(count).indices
 
 
 def _halve(gaussians: Gaussians, source: torch.Tensor) -> torch.Tensor:
-    """(m, 3) how far from the middle the halves of some Gaussians lie, to either side; what each holds is set in place.
+    """(m, 3) offsets of the two halves of some Gaussians from their middle, to either side; sizes are set in place.
 
-    Along the longest axis they lie half a deviation from the middle, and are 0.7 times as long; their mass together is
-    the old one's.
+    Halves lie half a deviation from the middle along the longest axis, and are 0.7 times as long there. Both together
+    have the mass of the old Gaussian.
     """
     axis = gaussians.log_scale[source].argmax(dim=1)
     half = 0.5 * gaussians.log_scale[source, axis].exp()[:, None] * _axis(gaussians.rotation[source], axis)

@@ -1,8 +1,8 @@
 """The unknowns: a cloud of Gaussians with an attenuation and a material number each.
 
-Coordinates are relative to the volume's centre in units of half its longest side. What a Gaussian holds is
-stated as its attenuation at one reference energy, in units of the scan's soft reference, not as its density:
-a change of the material number then leaves what most rays see as it was, which lets both be fitted at once.
+Coordinates are relative to the volume's centre in units of half its longest side. A Gaussian has an attenuation at one
+reference energy, in units of the scan's soft reference, and no density. So a change of the material number hardly
+changes what most rays see, and both can be fitted at once.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ class Gaussians:
     shared_material : (groups,) tensor
         Material number of each group.
     group : (n,) int64 tensor
-        The group whose material number a Gaussian shares, or -1 for its own. What the rays cannot tell apart
-        Gaussian by Gaussian, such as the plastic around a pin, they tell very well for all of it together.
+        The group whose material number a Gaussian shares, or -1 for its own. The rays cannot tell the number of each
+        Gaussian in the plastic around a pin, for example, but they tell one number for all of it very well.
     blur : (1,) tensor
-        Variance of the detector's blur in squared pixels, through which their projections are seen.
+        Variance in squared pixels of the detector's blur, which acts on their projections.
     """
 
     position: torch.Tensor
@@ -59,7 +59,7 @@ class Gaussians:
         return {field.name: getattr(self, field.name) for field in fields(self) if field.name != "group"}
 
     def finite(self) -> bool:
-        """Whether every parameter is a finite number: some that are not show in no ray."""
+        """Whether every parameter is finite. Rays do not show all that are not."""
         return all(bool(torch.isfinite(tensor).all()) for tensor in self.parameters().values())
 
     def copy(self) -> Gaussians:
@@ -72,7 +72,7 @@ class Gaussians:
         return Gaussians(**{name: tensor.detach().to(device, copy=True) for name, tensor in parts.items()})
 
     def select(self, chosen: torch.Tensor) -> Gaussians:
-        """The Gaussians of these (m,) int64 indices, still attached to the graph."""
+        """The Gaussians of these (m,) int64 indices, still attached to the graph of gradients."""
         own = {name: tensor.index_select(0, chosen) for name, tensor in self.each().items()}
         return Gaussians(**own, **{name: getattr(self, name) for name in OF_ALL})
 

@@ -1,8 +1,8 @@
-"""Gaussians to start from: a regular grid over the support of a first reconstruction.
+"""Seed Gaussians on a regular grid over the support of a first reconstruction.
 
-The grid is twice as fine at metal, whose edges are where an error of position costs most. Where there are fewer
-Gaussians than the detector could tell apart, it is coarser, but twice as fine where the start varies and three times
-as fine at metal.
+The grid is twice as fine at metal, because an error of position costs most at its edges. If there are fewer Gaussians
+than the detector could tell apart, the grid is coarser, but twice as fine where the start varies, and three times as
+fine at metal.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tomo_polysplat.settings import Settings
 
 __all__ = ["seed_gaussians"]
 
-# Attenuation, in soft references, that a seed in what looks like air starts from: from zero it would not grow.
+# Attenuation, in soft references, of a seed in what looks like air: from zero it would not grow.
 _LEAST = 0.02
 
 
@@ -46,15 +46,15 @@ def seed_gaussians(
     grid : VolumeGrid
         In the solver's coordinates.
     spacing : float
-        Wanted distance of the seeds in the grid's unit; a whole number of them fills the window.
+        Wanted distance of the seeds in the grid's unit. It is changed so that a whole number fills the window.
     planar : bool
         Endless along z, for a scan of one plane.
     finer : float
-        Share of the Gaussians, below 1, that lie where the start varies most, on a grid twice as fine as the
-        rest; as many as a grid of one ``spacing`` would have in all.
+        Share of the Gaussians, below 1, that lie where the start varies most, on a grid twice as fine as that of the
+        rest. The total stays that of a grid with one ``spacing``.
     finest : float
-        Distance of seeds as close as the detector could tell apart; those that are farther apart are made as thin as
-        that across edges of the start (``seed_edges``). Infinite: all are round.
+        Distance of the closest seeds that the detector could tell apart. Seeds that are farther apart are made as thin
+        as that across edges of the start (``seed_edges``). Infinity makes all of them round.
     """
     dims = 2 if planar else 3
     values = start if isinstance(start, torch.Tensor) else torch.tensor(start)
@@ -62,8 +62,8 @@ def seed_gaussians(
     points, size, cell, value = _lattices(start, grid, spacing, dims, settings, finer)
     reach = settings.free_radius * float(grid.voxel_size[:dims].min())
     own, shared, group = _materials(start, points, value, grid, reach, settings, polychromatic)
-    # Round, whatever the cell: thinner than the rays are apart, a Gaussian would be held by none. At this
-    # height a lattice of them averages to the wanted value: the cell's integral over the Gaussian's.
+    # Round, whatever the shape of the cell: a Gaussian thinner than the distance of rays could lie between them. With
+    # this height, the cell's integral over the Gaussian's, a lattice of them averages to the wanted value.
     width = settings.seed_width * size
     attenuation = value * cell / (math.sqrt(2 * math.pi) * width) ** dims
     rotation, thinner = edge_shapes(start, points, size, grid, settings, finest, dims)
@@ -71,13 +71,13 @@ def seed_gaussians(
     parts = (points, log_scale, rotation, attenuation, own, shared, rotation.new_tensor([settings.blur]))
     position, log_scale, rotation, attenuation, own, shared, blur = (part.float() for part in parts)
     gaussians = Gaussians(position, log_scale, rotation, attenuation, own, shared, group, blur)
-    # Neighbours in space beside each other in memory, which the kernels use.
+    # The kernels need neighbours in space beside each other in memory.
     order = spatial_order(gaussians.position)
     return gaussians.select(order)
 
 
 def _pieces(mask: torch.Tensor) -> tuple[tuple[slice, ...], np.ndarray, int]:
-    """The box round all that is true, its connected pieces numbered from 1 in an array, and their number."""
+    """The box around all True voxels, an array of it with connected pieces numbered from 1, and their number."""
     from scipy import ndimage
 
     box = []
@@ -89,7 +89,7 @@ def _pieces(mask: torch.Tensor) -> tuple[tuple[slice, ...], np.ndarray, int]:
 
 
 def _metal(start: torch.Tensor, settings: Settings) -> torch.Tensor:
-    """Voxels of metal, and those down to the level of its rim that are connected to some."""
+    """Voxels of metal, and voxels connected to them down to the level of its rim."""
     core = start > settings.metal_level
     if not settings.metal_rim:
         return core
@@ -102,9 +102,9 @@ def _metal(start: torch.Tensor, settings: Settings) -> torch.Tensor:
 
 
 def _sharpened(start: torch.Tensor, settings: Settings) -> torch.Tensor:
-    """The start with every piece of metal cut at half its height, its mass kept and its rim made soft matter.
+    """The start with every piece of metal cut at half its height. Its mass is kept, its rim becomes soft matter.
 
-    Filtered backprojection blurs; the blurred rim of metal is many times as bright as what really lies there.
+    Filtered backprojection blurs, and the blurred rim of metal is many times as bright as the matter that lies there.
     """
     from scipy import ndimage
 
@@ -153,12 +153,12 @@ def _varied(
     settings: Settings,
     finer: float,
 ) -> torch.Tensor:
-    """Which seeds' cells the start varies most in: as many as make ``finer`` of all Gaussians, once split."""
+    """Seeds in whose cells the start varies most; once split, they are the share ``finer`` of all Gaussians."""
     dims = len(step)
     supported = _sample(start, points, grid, step)[1] > settings.support_level
     # Splitting one of n cells adds 2^dims - 1 Gaussians; there may be n finer / (1 - finer) more.
     most = int(int(supported.sum()) * finer / (1 - finer) / (2**dims - 1))
-    # Means over cells of half the step, against noise; from one such cell's middle to the next it is half a step.
+    # Means over cells of half a step suppress noise; the middles of such cells are half a step apart.
     half = np.ones(3, int)
     half[3 - dims :] = np.maximum(np.round(0.5 * step / grid.voxel_size[:dims]).astype(int), 1)[::-1]
     mean = box_mean(start.clamp(0.0, settings.tv_clip), half)
@@ -202,7 +202,7 @@ def _sample(
 
 
 def _split(points: torch.Tensor, step: np.ndarray, times: int) -> torch.Tensor:
-    """Every lattice point replaced by those of a lattice so many ``times`` as fine in its cell."""
+    """Replace every lattice point by those of a lattice in its cell that is ``times`` as fine."""
     dims = len(step)
     along = (np.arange(times) + 0.5) / times - 0.5
     corners = np.stack(np.meshgrid(*[along] * dims, indexing="ij"), -1).reshape(-1, dims)
@@ -222,8 +222,8 @@ def _materials(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Material numbers of their own, of the groups, and the group of every seed.
 
-    Group 0 is the soft matter away from anything dense; then comes one for every separate piece of metal. In
-    between, where the start cannot be trusted to tell what is what, every Gaussian has its own.
+    Group 0 is the soft matter away from anything dense. Then comes one group for every separate piece of metal. In
+    between, the start does not tell materials reliably, and every Gaussian has a number of its own.
     """
     group = torch.zeros(len(points), dtype=torch.int64, device=points.device)
     if not polychromatic:

@@ -1,7 +1,7 @@
-"""Seeds made thin across the edges of the start, and wider along them.
+"""Make seeds thin across the edges of the start, and wider along them.
 
-Where Gaussians are fewer than the detector could tell apart, a round one cannot show the edges there are, and a fit has
-few steps to turn and flatten it. The start, however noisy, tells which way its edges run.
+If there are fewer Gaussians than the detector could tell apart, round ones cannot show the edges, and a fit has few
+steps to turn and flatten them. Even a noisy start tells the direction of its edges.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from tomo_polysplat.settings import Settings
 
 __all__ = ["edge_shapes"]
 
-# Voxels along an axis over which the start is averaged, twice, before its slope is taken: against noise.
+# Against noise the start is averaged twice over this many voxels along each axis, before its slope is taken.
 _AVERAGED = 3
 # No seed is thinner than this share of a round one: neighbours would no longer overlap (teeth, 96^3 voxels: 54.2 dB
 # everywhere with 0.4, 53.5 with 0.3).
@@ -36,18 +36,19 @@ def edge_shapes(
     Parameters
     ----------
     start : (nz, ny, nx) tensor
-        In soft references; what is above ``tv_clip`` counts as that.
+        In soft references; values above ``tv_clip`` count as ``tv_clip``.
     points : (n, 3) tensor
         The seeds, in the grid's unit.
     size : (n,) tensor
         Distance of a seed from its neighbours, in the grid's unit.
     grid : VolumeGrid
     settings : Settings
-        ``seed_edge`` is the variation of the start over a seed's size that makes it half as thick; 0: all are round.
+        ``seed_edge`` is the variation of the start over a seed's size that makes the seed half as thick. With 0 all are
+        round.
     finest : float
-        Distance, in the grid's unit, of seeds as close as the detector could tell apart. No seed gets thinner than
-        those would be: the scan may be no sharper (fan-beam slices whose edges are blurred lose 1.7 dB otherwise). 0
-        where edges are known to be sharp.
+        Distance, in the grid's unit, of the closest seeds that the detector could tell apart. No seed gets thinner than
+        these would be, because the scan may be no sharper: without this bound fan-beam slices with blurred edges lose
+        1.7 dB. 0 where edges are known to be sharp.
     dims : int
         2 or 3.
 
@@ -56,20 +57,20 @@ def edge_shapes(
     rotation : (n, 4) tensor
         Quaternions (w, x, y, z) that turn the first axis to the slope.
     log_scale : (n, dims) tensor
-        To be added to the logarithms of the deviations; they sum to 0, so that the mass stays.
+        To be added to the logarithms of the deviations. They sum to 0, so the mass does not change.
     """
     rotation, change = points.new_zeros((len(points), 4)), points.new_zeros((len(points), dims))
     rotation[:, 0] = 1.0
     half = settings.seed_edge
     if not (half and bool((size > finest).any())):
         return rotation, change
-    # Metal has seeds fine enough; what is beside it is too uncertain to follow its edge.
+    # Seeds at metal are fine enough, and beside metal the start is too uncertain to follow its edges.
     beside = reaches(start, points, grid, settings.metal_level, float(grid.voxel_size[:dims].min()))
     size = size.masked_fill(beside, 0.0)
     slope = _slope(start.clamp(0.0, settings.tv_clip), points, grid, dims)
     steepness = slope.norm(dim=1)
     direction = slope / steepness.clamp(min=torch.finfo(slope.dtype).tiny)[:, None]
-    # An axis has no sign; with this one the rotation is never a half turn, which would have no axis of its own.
+    # The sign of an axis is free. This one avoids rotations by half a turn, whose own axis is not defined.
     direction = torch.where(direction[:, :1] < 0, -direction, direction)
     rotation[:, 0] = 1 + direction[:, 0]
     rotation[:, 2], rotation[:, 3] = -direction[:, 2], direction[:, 1]

@@ -1,4 +1,4 @@
-"""A start volume as seeds see it."""
+"""Values of a start volume at seeds."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["box_mean", "reaches", "voxel_of", "widened"]
 
 
 def box_mean(volume: torch.Tensor, cells: np.ndarray) -> torch.Tensor:
-    """Mean over (z, y, x) voxels about each one; the volume's faces go on beyond it."""
+    """Mean over (z, y, x) voxels around each one; beyond the volume its outermost values go on."""
     if cells.max() == 1:
         return volume
     margins = [side for n in cells[::-1].tolist() for side in (n // 2, n - 1 - n // 2)]
@@ -29,7 +29,7 @@ def voxel_of(points: torch.Tensor, grid: VolumeGrid) -> tuple[torch.Tensor, ...]
 def reaches(
     start: torch.Tensor, points: torch.Tensor, grid: VolumeGrid, level: float, reach: float
 ) -> torch.Tensor:
-    """Points within a distance, along every axis, of a voxel above a level."""
+    """Which points have a voxel above a level within a distance along every axis."""
     near = start > level
     if not bool(near.any()):
         return torch.zeros(len(points), dtype=torch.bool, device=points.device)
@@ -40,7 +40,7 @@ def reaches(
 
 
 def _grown(mask: torch.Tensor, axis: int, voxels: int) -> torch.Tensor:
-    """What is true, and as many voxels before and behind it; every step nearly trebles the width."""
+    """A mask widened by ``voxels`` both ways along an axis; every step nearly trebles the width."""
     length, half = mask.shape[axis], 0
     while half < min(voxels, length - 1):
         step = min(2 * half + 1, voxels - half, length - 1)

@@ -40,7 +40,8 @@ def _sum_exponentials(
     areal: np.ndarray, log_weights: np.ndarray, attenuation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     areal = np.asarray(areal, dtype=np.float64)
-    exponents = -np.tensordot(np.asarray(attenuation, np.float64), areal, axes=(0, 0))
+    # Not by a library of linear algebra, whose last bits depend on the number of its threads.
+    exponents = -np.einsum("kn,k...->n...", np.asarray(attenuation, np.float64), areal)
     exponents += np.asarray(log_weights, np.float64).reshape(-1, *[1] * (areal.ndim - 1))
     largest = exponents.max(axis=0)
     terms = np.exp(exponents - largest)

@@ -54,7 +54,7 @@ def estimate_scatter(
     lit = spectrum.weights > 0
     curves = materials.mass_attenuation(spectrum.energies[lit])[: len(areal)]
     value, share = shares(areal, np.log(spectrum.weights[lit]), curves)
-    primary, slopes = np.exp(-value), (curves @ share) * areal
+    primary, slopes = np.exp(-value), np.einsum("kn,nr->kr", curves, share) * areal
     rays = (primary, slopes, measured, weight)
     mean = float(light.mean())
     kinds = np.stack([np.ones_like(light), light - mean])

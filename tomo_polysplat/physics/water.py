@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.checks import require_array
-from tomo_polysplat.parallel import cpu_threads, run_tasks, split_range
+from tomo_polysplat.parallel import run_tasks, split_range
 from tomo_polysplat.physics.beer_lambert import shares
 from tomo_polysplat.physics.materials import MaterialLike, mass_attenuation
 from tomo_polysplat.physics.spectrum import Spectrum
@@ -20,6 +20,8 @@ __all__ = ["areal_density", "transmitted_energy", "water_linearised"]
 _NODES, _STEPS = 16384, 2048
 # Values looked up at once: the intermediate results are several times as large.
 _CHUNK = 1 << 22
+# On a CPU, so few that torch shares them out over no threads: vectors, and with them bits, would begin elsewhere.
+_PART = 1 << 15
 
 
 def areal_density(projections: Any, spectrum: Spectrum, material: MaterialLike = "water") -> Any:
@@ -69,7 +71,7 @@ def _inverted(values: torch.Tensor, spectrum: Spectrum, material: MaterialLike) 
         for a, b in _chunks(values):
             look_up(a, b)
     else:
-        run_tasks(look_up, split_range(values.numel(), 4 * cpu_threads()))
+        run_tasks(look_up, [(a, min(a + _PART, len(values))) for a in range(0, len(values), _PART)])
     return density
 
 

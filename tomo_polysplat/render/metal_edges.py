@@ -1,4 +1,4 @@
-"""Metal has a surface: the tails that its Gaussians cast over the neighbouring voxels are put back inside it."""
+"""Move the tails of metal Gaussians from neighbouring voxels back into the metal, which has a sharp surface."""
 
 from __future__ import annotations
 
@@ -12,13 +12,12 @@ from tomo_polysplat.render.renderer import voxelise_peaks
 
 __all__ = ["tail_factors", "tails"]
 
-# Voxels about one whose largest metal is the level of the metal there: the next ones may all be at its surface.
+# The level of metal near a voxel is the largest metal within this many voxels: the next ones may all be at a surface.
 _AROUND = 2
-# Shares of the level below which a voxel's metal is all tail, and from which on it is none. Voxels at a surface are
-# seldom far from the level: where all or nothing hung on it, single ones changed sides from one pass to the next, and a
-# slice of 64^2 with them by 2.8 dB.
+# Below the first share of the level a voxel's metal is all tail, from the second on none. Voxels at a surface are near
+# the level, so with one share single voxels change sides from pass to pass (docs/decisions/tails-of-metal.md).
 _ALL, _NONE = 0.9, 1.2
-# Metal below this share of what else a voxel holds leaves it clean enough to tell what lies beside the metal.
+# A voxel with less metal than this share of its other matter is clean: it shows what lies beside the metal.
 _CLEAN = 0.02
 
 
@@ -30,10 +29,10 @@ def tails(
     kernel: str,
     level: float,
 ) -> torch.Tensor:
-    """How much of the metal of every voxel is the tails of Gaussians that lie in others.
+    """The share of the metal in every voxel that is tails of Gaussians in other voxels.
 
-    The surface of a solid that is seen a little blurred lies where half of what it holds is reached; a voxel no
-    point of which comes near to ``level`` times the metal around it lies outside.
+    In a slightly blurred image the surface of a solid is where half of its attenuation is reached. So a voxel is
+    outside if none of its points comes near to ``level`` times the metal around it.
 
     Parameters
     ----------
@@ -42,7 +41,7 @@ def tails(
     gaussians, weights, kernel
         The metal's Gaussians and their (1, n) attenuation; see ``render.renderer``.
     level : float
-        0: none.
+        Share of the metal around a voxel that its points must reach; 0 for no tails.
 
     Returns
     -------
@@ -66,30 +65,30 @@ def tails(
 
 
 def tail_factors(metal: torch.Tensor, rest: torch.Tensor, tail: torch.Tensor) -> torch.Tensor:
-    """What to multiply each voxel's metal by, so that faint rims move into the voxels they belong to.
+    """Factors of the metal of each voxel, by which tails move into the metal they belong to.
 
-    What is tail goes to the metal that is none in the voxel itself and beside it, in proportion to that. One percent of
-    iron is as bright as water, so such tails would dominate the error of what surrounds metal. Where the fit has
-    lowered the rest of a voxel to make room for a tail, as much of the tail stays as brings the voxel to the level
-    of clean voxels nearby: the rays see only the sum.
+    A tail goes to the metal that is no tail, in the voxel itself and beside it, in proportion to that metal. One per
+    cent of iron is as bright as water, so tails would dominate the error around metal. The fit may have lowered the
+    rest of a voxel to make room for a tail, because rays see only the sum. Then so much of the tail stays that the
+    voxel comes to the level of clean voxels nearby.
 
     Parameters
     ----------
     metal, rest : (nz, ny, nx) tensor
         Attenuation of the metal alone, and of all else.
     tail : (nz, ny, nx) tensor
-        How much of the metal is tails; see `tails`.
+        Share of the metal that is tails; see `tails`.
 
     Returns
     -------
     (nz, ny, nx) tensor
-        The attenuation of the metal, summed over all voxels, is kept.
+        They keep the sum of the metal over all voxels.
     """
     if not bool(tail.any()):
         return torch.ones_like(metal)
     owned = 1 - tail
     owner = _around(metal * owned, 1)
-    # A tail without metal beside it that could own it has nowhere to go and stays.
+    # A tail without metal beside it stays.
     tail = torch.where(owner >= metal * tail, tail, 0.0)
     clean = (metal <= _CLEAN * rest).to(metal.dtype)
     known = _around(clean, 2)
@@ -107,7 +106,7 @@ def _around(volume: torch.Tensor, reach: int) -> torch.Tensor:
 
 
 def _pooled(volume: torch.Tensor, reach: int, pool: Callable[..., torch.Tensor]) -> torch.Tensor:
-    """A pool over ``reach`` voxels each way; beyond the border lies nothing."""
+    """A pool over ``reach`` voxels each way; beyond the border everything is 0."""
     window = tuple(2 * reach + 1 if n > 1 else 1 for n in volume.shape)
     # Padded beforehand: the pools themselves refuse an axis of fewer voxels than the window.
     margin = [n // 2 for n in reversed(window) for _ in range(2)]

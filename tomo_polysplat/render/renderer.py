@@ -24,23 +24,23 @@ __all__ = [
     "voxelise_peaks",
 ]
 
-# Where a volume's Gaussians end so that they hold the same mass as a projected one cut at 3 deviations,
-# 1 - exp(-9/2) of the whole: the solution c of erf(c/sqrt 2) - sqrt(2/pi) c exp(-c^2/2) = 1 - exp(-9/2).
+# Cut-off of Gaussians in a volume, in deviations. It keeps the mass of a projected Gaussian cut at 3, 1 - exp(-9/2):
+# the solution c of erf(c/sqrt 2) - sqrt(2/pi) c exp(-c^2/2) = 1 - exp(-9/2).
 VOXEL_CUTOFF = 3.33424
-# Samples a voxel and axis for thin Gaussians: those that do with as many are sampled together, for where half of them
-# need 3, one may need 6, eight times as many points. And how many samples are held at once at most.
+# Samples per voxel and axis for thin Gaussians, which are sampled in groups that need as many: twice as many samples an
+# axis are eight times as many points. The last number is the most samples held at once.
 _SAMPLES, _SLAB = (3, 6, 12, 24), 1 << 25
-# Samples a voxel and axis that tell how high the Gaussians are somewhere in it.
+# Samples per voxel and axis for the largest value in a voxel.
 _PEAK_SAMPLES = 5
-# Deviations from sample to sample. The mean of a Gaussian over such samples is right within
+# Distance of samples in deviations. The mean of a Gaussian over such samples is right within
 # 2 exp(-2 pi^2 / 1.67^2) = 0.2 % wherever they fall (Poisson's summation formula).
 _SAMPLE_STEP = 5 / 3
-# Of a sample: the least deviation that a fit allows needs a whole number of them.
+# Rounding, as a share of a sample: the least deviation that a fit allows needs a whole number of samples.
 _ROUNDING = 1e-3
 
 
 def detector_views(geometry: Geometry, planar: bool) -> DetectorViews:
-    """The arrays the kernels need of a geometry."""
+    """The arrays of a geometry that the kernels need."""
     cone = geometry.beam == "cone"
     direction = geometry.corner - geometry.origin if cone else geometry.origin
     matrix = np.stack([geometry.u, geometry.v, direction], axis=2)
@@ -86,8 +86,8 @@ def voxelise_gaussians(
 def voxelise_means(gaussians: Gaussians, weights: torch.Tensor, box: VoxelBox, kernel: str) -> torch.Tensor:
     """(channels, nz, ny, nx) means of the Gaussians over the voxels; not differentiable.
 
-    Gaussians thinner than half a voxel would show or not show by where they lie between the voxel centres, so
-    these are sampled at several points a voxel, along the long edges of an oblong voxel at more.
+    Whether a Gaussian thinner than half a voxel shows at voxel centres depends on where it lies between them. So thin
+    Gaussians are sampled at several points per voxel, and at more along the long edges of an oblong voxel.
     """
     dims = gaussians.log_scale.shape[1]
     edge = float(box.spacing[:dims].max())
@@ -111,7 +111,7 @@ def voxelise_means(gaussians: Gaussians, weights: torch.Tensor, box: VoxelBox, k
 
 
 def _reached(gaussians: Gaussians, box: VoxelBox) -> tuple[tuple[int, int, int], tuple[int, int, int]]:
-    """First voxel (z, y, x) and shape of the part of a box that holds what Gaussians reach of it."""
+    """First voxel (z, y, x) and shape of the part of a box that Gaussians reach."""
     if not len(gaussians):
         return (0, 0, 0), (0, 0, 0)
     dims = gaussians.log_scale.shape[1]
@@ -128,7 +128,7 @@ def _reached(gaussians: Gaussians, box: VoxelBox) -> tuple[tuple[int, int, int],
 
 
 def voxelise_peaks(gaussians: Gaussians, weights: torch.Tensor, box: VoxelBox, kernel: str) -> torch.Tensor:
-    """(channels, nz, ny, nx) largest sums of the Gaussians among points in each voxel; not differentiable."""
+    """(channels, nz, ny, nx) largest sum of the Gaussians at points in each voxel; not differentiable."""
     fine = np.full(3, _PEAK_SAMPLES)
     if gaussians.planar:
         fine[0] = 1
@@ -146,7 +146,7 @@ def _of_samples(
     fine: np.ndarray,
     what: Callable[..., torch.Tensor],
 ) -> Iterator[tuple[tuple[slice, ...], torch.Tensor]]:
-    """Part by part of the volume, where it lies and what is made of the ``fine`` (z, y, x) points of each voxel."""
+    """Yield part by part of the volume: its place, and values made from ``fine`` (z, y, x) points of each voxel."""
     nz, ny, nx = box.shape
     line = int(np.prod(fine)) * nx
     rows = min(ny, max(1, _SLAB // line))
@@ -161,7 +161,7 @@ def _of_samples(
 
 
 def _samples(box: VoxelBox, thinnest: float, *, planar: bool) -> np.ndarray:
-    """(z, y, x) samples a voxel for Gaussians of this least deviation."""
+    """(z, y, x) samples per voxel for Gaussians whose least deviation is ``thinnest``."""
     needed = np.ceil(box.spacing[::-1] / (_SAMPLE_STEP * thinnest) - _ROUNDING)
     counts = np.clip(needed, _SAMPLES[0], _SAMPLES[-1]).astype(int)
     if planar:

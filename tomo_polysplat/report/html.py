@@ -13,7 +13,7 @@ from tomo_polysplat.files import write_text
 from tomo_polysplat.report import table as tables
 from tomo_polysplat.report.browse import browser
 from tomo_polysplat.report.classical import standard_volume
-from tomo_polysplat.report.decided import decisions, rest_of_plan
+from tomo_polysplat.report.decided import decisions, in_words, rest_of_plan
 from tomo_polysplat.report.evidence import by_pixel_figure, by_view_figure
 from tomo_polysplat.report.figures import history_figure, png_bytes, slices_figure
 from tomo_polysplat.report.materials import histogram_figure
@@ -178,8 +178,8 @@ def _decided(result: Result) -> list[str]:
     """The decisions that mattered, each with its evidence."""
     told = []
     for subject, one in decisions(result.plan):
-        status = f'<span class="status">{text(one.status)}</span>' if one.status else ""
-        words = f"{one.value}: {one.why}" if one.value and one.why else one.value or one.why
+        status = f'<span class="status">{text(one.status.value)}</span>'
+        words = in_words(one)
         told.append(f"<dt>{text(subject)}{status}</dt><dd>{text(words[:1].upper() + words[1:])}.</dd>")
     return ["<h2>What was decided, and why</h2>", f"<dl>{''.join(told)}</dl>"] if told else []
 

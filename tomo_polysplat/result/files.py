@@ -21,10 +21,12 @@ from tomo_polysplat.checks import fail, require_choice, require_number
 from tomo_polysplat.files import replacing, write_text
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.plain_file import PlainFile
+from tomo_polysplat.plan.answer import Answer
 from tomo_polysplat.result.image import Image
 from tomo_polysplat.result.result import GAUSSIAN_PARTS, Result
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.scan.hdf5 import (
+    find_array,
     find_group,
     number_attribute,
     opened,
@@ -52,6 +54,8 @@ _RANGES = {
     "density": (-_LARGEST, _LARGEST),
     "u": (-0.2, 1.1),
 }
+# Numbers in a part of a Gaussian: its rotation has them.
+_MOST_PARTS = 4
 JSON_PARTS = ("history", "plan", "counts", "settings", "provenance")
 
 
@@ -111,7 +115,10 @@ def _write_model(group: Any, result: Result) -> None:
     if result.materials is not None:
         group["materials"] = json.dumps(plain(list(result.materials)))
     for name in JSON_PARTS:
-        group[name] = json.dumps(plain(getattr(result, name)))
+        part = getattr(result, name)
+        if name == "plan":
+            part = {key: answer.to_dict() for key, answer in part.items()}
+        group[name] = json.dumps(plain(part))
 
 
 def load_hdf5(path: str | os.PathLike) -> Result:
@@ -149,7 +156,9 @@ def load_hdf5(path: str | os.PathLike) -> Result:
 def _read_gaussians(group: Any, planar: bool) -> dict[str, np.ndarray]:
     if find_group(group, "gaussians") is None:
         return {}
-    parts = {name: read_numbers(group, f"gaussians/{name}") for name in GAUSSIAN_PARTS}
+    density = find_array(group, "gaussians/density")
+    most = _MOST_PARTS * (0 if density is None else density.size)
+    parts = {name: read_numbers(group, f"gaussians/{name}", most=most) for name in GAUSSIAN_PARTS}
     for name, values in parts.items():
         # Those of a slice have no end along z.
         bounded = values[..., :2] if planar and name == "scale" else values
@@ -187,7 +196,15 @@ def _read_parts(group: Any) -> dict[str, Any]:
             good = all(isinstance(record, dict) and _numeric(record) for record in content)
         if not good:
             raise fail(f"/polysplat/{name}", "what Result.save writes", f"{content!r}"[:100])
+    parts["plan"] = _answers(parts["plan"])
     return parts
+
+
+def _answers(plan: dict[str, Any]) -> dict[str, Answer]:
+    try:
+        return {name: Answer.from_dict(answer) for name, answer in plan.items()}
+    except TypeError as error:
+        raise fail("/polysplat/plan", "what Result.save writes", f"{error}"[:100]) from error
 
 
 def _numeric(record: dict[str, Any]) -> bool:

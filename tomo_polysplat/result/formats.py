@@ -1,4 +1,4 @@
-"""Which file a name's ending stands for."""
+"""Kinds of files, by the ending of a name."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ class Format:
     Attributes
     ----------
     endings : tuple of str
-        Of its names, in lower case.
+        Endings of its names, in lower case.
     write : str
         Module and function that write it.
     sixteen_bits : bool
-        Whether it says how whole numbers become the quantity.
+        Whether its header can hold slope and offset of whole numbers.
     everything : bool
         Whether it is the package's own, from which a result can be loaded.
     single_tiff : bool
-        Whether it ends at 4 GiB.
+        Whether it cannot be larger than 4 GiB.
     """
 
     endings: tuple[str, ...]
@@ -47,7 +47,7 @@ class Format:
         return self.endings == ("/",)
 
     def bytes_needed(self, voxels: int, channels: int, bits: int = 32) -> int:
-        """Bytes of a file of so many voxels and base curves."""
+        """Bytes of a file with this many voxels and base curves."""
         return image_bytes(voxels * (channels + 1 if self.everything else 1), bits)
 
     def require(self, *, hu: bool, bits: int, voxels: int = 0, argument: str = "path") -> None:

@@ -1,4 +1,4 @@
-"""A volume as other programs are given it: numbers, where the voxels are, and what the numbers mean."""
+"""A volume for other programs: its numbers, where the voxels are, and what the numbers mean."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ class Image:
     slope, offset : float
         The quantity is ``slope * values + offset``.
     window : (low, high)
-        Quantities to be shown black and white.
+        Quantities that a viewer shows black and white.
     top_row : str
-        ``"smallest y"``, or ``"largest y"`` after a 2D scan: the row that a picture shows at its top.
+        Row at the top of a picture: ``"smallest y"``, or ``"largest y"`` after a 2D scan.
     """
 
     values: np.ndarray
@@ -57,7 +57,7 @@ class Image:
 
     @property
     def stored_window(self) -> tuple[float, float]:
-        """The window in stored numbers, those that there are."""
+        """The window in stored numbers, cut to those that exist."""
         low, high = ((value - self.offset) / self.slope for value in self.window)
         return (low, high) if self.values.dtype.kind == "f" else (max(low, 0.0), min(high, float(_LEVELS)))
 
@@ -67,12 +67,12 @@ class Image:
             yield plane[::-1] if self.top_row == "largest y" else plane
 
     def in_millimetres(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """`voxel_size` and `first` in mm, which medical programs expect; voxels as they are for ``"pixel"``."""
+        """`voxel_size` and `first` in mm, which medical programs expect; unchanged for the unit ``"pixel"``."""
         mm = 10 * CM_PER_UNIT.get(self.unit, 0.1)
         return tuple(mm * size for size in self.voxel_size), tuple(mm * at for at in self.first)
 
     def about(self) -> dict[str, Any]:
-        """What there is to say beside the numbers, in what JSON knows."""
+        """What a file says beside the numbers, in types that JSON knows."""
         return {
             "program": "tomo-polysplat",
             "unit": self.quantity,
@@ -97,11 +97,11 @@ def image_of(result: Result, *, hu: bool = False, bits: int = 32) -> Image:
     ----------
     result : Result
     hu : bool
-        Hounsfield units ``1000 (mu / mu_water - 1)`` at the energy of the volume instead of attenuation; water of
-        1 g/cm3, so that nothing is -1000 (doi:10.1259/0007-1285-46-552-1016).
+        Hounsfield units ``1000 (mu / mu_water - 1)`` at the energy of the volume instead of attenuation, with water
+        of 1 g/cm3; vacuum is -1000 (doi:10.1259/0007-1285-46-552-1016).
     bits : {32, 16}
-        32 for floating point; 16 for whole numbers from 0 to 65535 that span the volume's range, from which
-        ``slope * number + offset`` is wrong by half a `slope` at most.
+        32 for floating point; 16 for whole numbers from 0 to 65535 that span the volume's range. The error of
+        ``slope * number + offset`` is then at most half a `slope`.
 
     Raises
     ------
@@ -138,13 +138,13 @@ def image_of(result: Result, *, hu: bool = False, bits: int = 32) -> Image:
 
 
 def _rounded(lengths: np.ndarray) -> tuple[float, float, float]:
-    """Without the last digits, which only the arithmetic has put there."""
+    """Lengths without the last digits, which are rounding errors."""
     x, y, z = (float(f"{length:.12g}") for length in lengths)
     return x, y, z
 
 
 def image_bytes(voxels: int, bits: int = 32) -> int:
-    """Bytes of so many voxels, before any compression."""
+    """Bytes of this many voxels, without compression."""
     return voxels * bits // 8
 
 

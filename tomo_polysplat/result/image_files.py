@@ -1,6 +1,6 @@
-"""Volumes for ITK's family (3D Slicer, ITK-SNAP), NIfTI's, and ParaView: a header, and the numbers as they are.
+"""Volumes for programs of ITK (3D Slicer, ITK-SNAP), for NIfTI and for ParaView: a header, and the numbers.
 
-They are written as plain bytes, slab by slab: a full disk is noticed at once, and a volume needs no second copy.
+The numbers are written as plain bytes, slab by slab. So a full disk shows at once, and no second copy is needed.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def write_nifti(image: Image, path: str | os.PathLike, *, overwrite: bool = Fals
     header = _nifti_header(image)
     with _new(path, image, overwrite) as file:
         if os.fsdecode(path).lower().endswith(".gz"):
-            # Stronger compression of noise takes long and saves next to nothing; no name and time go in.
+            # Stronger compression of noise is slow and saves hardly anything; the same volume gives the same bytes.
             with gzip.GzipFile("", "wb", 1, file, mtime=0) as packed:
                 packed.write(header)
                 _write_values(packed, image.values)
@@ -165,7 +165,7 @@ def write_vti(image: Image, path: str | os.PathLike, *, overwrite: bool = False)
 
 
 def _vtk_field(name: str, value: Any) -> str:
-    """One entry of the field data: numbers, or a text as the codes of its characters."""
+    """One entry of the field data: numbers, or the character codes of a text."""
     if value is None:
         return ""
     if isinstance(value, str):

@@ -11,9 +11,12 @@ import math
 import numpy as np
 
 from tomo_polysplat.checks import fail, require_array, require_shape
-from tomo_polysplat.parallel import cpu_threads, run_tasks, split_range
+from tomo_polysplat.parallel import run_tasks, split_range
 
 __all__ = ["compare", "psnr", "ssim"]
+
+# Parts of a volume whose similarity is looked at side by side; their number is part of the result.
+_SLABS = 8
 
 
 def compare(volume: np.ndarray, truth: np.ndarray, metal_mask: np.ndarray | None = None) -> dict[str, float]:
@@ -76,8 +79,8 @@ def ssim(volume: np.ndarray, truth: np.ndarray, span: float) -> float:
     if window < 3:
         raise fail("truth", "at least 3 voxels along each axis longer than one", f"shape {truth.shape}")
     margin = window // 2
-    bounds = split_range(len(truth) - 2 * margin, 4 * cpu_threads())
     # By several threads: a volume of 256^3 takes one of them seconds.
+    bounds = split_range(len(truth) - 2 * margin, _SLABS)
     slabs = [(volume[a : b + 2 * margin], truth[a : b + 2 * margin], span, window) for a, b in bounds]
     total = sum(run_tasks(_ssim_sum, slabs))
     return total / math.prod(n - 2 * margin for n in truth.shape)

@@ -1,4 +1,4 @@
-"""What a result was made from and with, in words for its report and its file."""
+"""Texts on what a result was made from and with, for its report and its file."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from tomo_polysplat.versions import installed_version
 
 __all__ = ["provenance"]
 
-# Those whose version may change a volume.
+# Packages whose version may change a volume.
 _PACKAGES = ("torch", "numba", "triton", "astra-toolbox")
 
 
 def provenance(
     geometry: Geometry, grid: VolumeGrid, unit: str, spectrum: Spectrum | None, device: torch.device
 ) -> dict[str, str]:
-    """Words by name: ``geometry``, ``volume``, ``spectrum``, ``device`` and ``software``.
+    """Texts by name: ``geometry``, ``volume``, ``spectrum``, ``device`` and ``software``.
 
     Parameters
     ----------
     geometry : Geometry
     grid : VolumeGrid
     unit : str
-        Of their lengths.
+        Unit of their lengths.
     spectrum : Spectrum or None
     device : torch.device
     """

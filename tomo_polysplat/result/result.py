@@ -14,6 +14,7 @@ from tomo_polysplat.checks import fail, require_array, require_number, require_s
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.materials import require_energies
 from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.plan.answer import Answer
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.units import cm_per
 
@@ -50,8 +51,10 @@ class Result:
         ``density`` (n,) in g/cm3 (1/`unit` when monochromatic), ``u`` (n,) material, -0.1 to 1.
     history : list of dict
         ``seconds``, ``iteration``, ``loss``, ``held_out``, ``gaussians``, ``stage``: speed against error.
-    plan, counts, settings : dict
-        What was modelled and why; how many rays or Gaussians were masked, skipped or clamped; every tunable.
+    plan : dict of str to Answer
+        What was decided and found, by name, with the value, why, where it comes from, and its evidence.
+    counts, settings : dict
+        How many rays or Gaussians were masked, skipped or clamped; every tunable.
     provenance : dict
         Words on what it was made from and with: scanner, volume, spectrum, device and software.
     seconds : float
@@ -68,7 +71,7 @@ class Result:
     spectrum: Spectrum | None = None
     gaussians: Mapping[str, np.ndarray] = field(default_factory=dict)
     history: list[dict[str, Any]] = field(default_factory=list)
-    plan: dict[str, Any] = field(default_factory=dict)
+    plan: dict[str, Answer] = field(default_factory=dict)
     counts: dict[str, Any] = field(default_factory=dict)
     settings: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)

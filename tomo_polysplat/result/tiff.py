@@ -1,9 +1,9 @@
 """Volumes as TIFF with the calibration of ImageJ or of OME: one file, or a folder of slices.
 
-ImageJ reads voxel size, unit, window and the line from whole numbers to the quantity from the description
-(``ij.io.FileInfo``, ``ij.io.FileOpener.decodeDescriptionString``). It counts y downwards and slices away from the
-viewer, which is as right-handed as x, y and z are here: row 0 is the smallest y. After a 2D scan it is the largest,
-as in ASTRA's images, and y is upwards.
+ImageJ reads voxel size, unit, window, slope and offset from the description (``ij.io.FileInfo``,
+``ij.io.FileOpener.decodeDescriptionString``). It counts y downwards and slices away from the viewer. This is
+right-handed, like x, y and z here, so row 0 is the smallest y. After a 2D scan row 0 is the largest y, as in ASTRA's
+images, and y points upwards.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = ["require_slices_folder", "require_tiff_size", "write_ome_tiff", "writ
 
 _NAME = re.compile(r"slice_\d{4,}\.tif")
 _PROGRAM = "tomo-polysplat"
-# Offsets in a TIFF have 32 bits; tifffile keeps a part for what stands beside the numbers.
+# Offsets in a TIFF have 32 bits; tifffile needs a part of that for what it writes beside the numbers.
 _LARGEST_TIFF = 2**32 - 2**25
 # Bytes of a slice's own tags, for the room that a folder needs.
 _TAGS = 4096
@@ -46,7 +46,7 @@ def write_tiff(image: Image, path: str | os.PathLike, *, overwrite: bool = False
 
 
 def require_tiff_size(size: int, argument: str = "path") -> None:
-    """Refuse a single TIFF of so many bytes: what most programs would read of it is the first slice."""
+    """Refuse a single TIFF that is too large: most programs would read only its first slice."""
     if size > _LARGEST_TIFF:
         remedy = "name a folder for slices (a name ending in /), an .ome.tif, an .nrrd, or pass bits=16"
         raise fail(argument, "at most 4 GiB for one TIFF", f"{size / 2**30:.1f} GiB", remedy)
@@ -64,7 +64,7 @@ def write_ome_tiff(image: Image, path: str | os.PathLike, *, overwrite: bool = F
 
 
 def write_tiff_slices(image: Image, folder: str | os.PathLike, *, overwrite: bool = False) -> None:
-    """A folder of ``slice_0000.tif``, ``slice_0001.tif``, ... that is there whole or not at all."""
+    """A folder of ``slice_0000.tif``, ``slice_0001.tif``, ...; it is written whole or not at all."""
     needed = image.values.nbytes + _TAGS * len(image.values)
     with replacing_folder(folder, _is_ours, overwrite=overwrite, needed_bytes=needed) as temporary:
         for index, picture in enumerate(image.pictures()):
@@ -76,7 +76,7 @@ def _write(path: Path, values: np.ndarray, tags: dict[str, Any], **options: Any)
     import tifffile
 
     with PlainFile(path) as plain:
-        # Which is all of one that tifffile uses.
+        # tifffile uses nothing else of a file object.
         file = cast(IO[bytes], plain)
         tifffile.imwrite(file, np.ascontiguousarray(values), photometric="minisblack", **tags, **options)
 
@@ -93,12 +93,12 @@ def require_slices_folder(
     remedy: str = "pass overwrite=True",
     argument: str = "folder",
 ) -> Path:
-    """The folder of slices that would be written; refused is one that is, or holds, what must stay."""
+    """The folder of slices to write; refuse one that is, or holds, anything but our slices."""
     return require_replaceable_folder(folder, _is_ours, overwrite=overwrite, remedy=remedy, argument=argument)
 
 
 def _is_ours(path: Path) -> bool:
-    """Whether a file is a slice that was written here, which its tag of the software says."""
+    """Whether a file is a slice of ours, by its software tag."""
     import tifffile
 
     if not _NAME.fullmatch(path.name) or path.is_symlink() or not path.is_file():
@@ -106,13 +106,13 @@ def _is_ours(path: Path) -> bool:
     try:
         with tifffile.TiffFile(path) as file:
             return str(file.pages[0].tags.valueof("Software", "")).startswith(_PROGRAM)
-    except Exception:  # of another program, or none that anybody could read
+    except Exception:  # a file of another program, or not a TIFF at all
         return False
 
 
 def _tags(image: Image) -> dict[str, Any]:
     x, y, _ = image.voxel_size
-    # Without a unit of TIFF's own, which knows inches and centimetres only: the description has it.
+    # TIFF's own unit knows inches and centimetres only, so the description holds the unit.
     return {"resolution": (1 / x, 1 / y), "resolutionunit": "NONE", "software": _PROGRAM}
 
 
@@ -127,7 +127,7 @@ def _calibration(image: Image) -> dict[str, Any]:
         "Info": image.about_text(),
     }
     if image.values.dtype.kind == "u":
-        # cf=0 is the straight line c0 + c1 * number.
+        # cf=0 is a straight line, c0 + c1 * number.
         known |= {"cf": 0, "c0": image.offset, "c1": image.slope, "vunit": image.quantity}
     if image.top_row == "smallest y":
         origin = [0.5 - at / size for at, size in zip(image.first, image.voxel_size)]

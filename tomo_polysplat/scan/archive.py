@@ -1,4 +1,4 @@
-"""Reading NumPy archives that may be damaged, truncated or something else altogether."""
+"""Read NumPy archives that may be damaged, truncated or other files."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tomo_polysplat.files import existing_file, require_plausible_size
 __all__ = ["archived_number", "archived_text", "read_archive"]
 
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-# NumPy writes no others, and some of them may ask for gigabytes before they give the first byte.
+# NumPy writes no other kinds; some of them may need gigabytes before they give the first byte.
 _COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 # What zipfile and zlib raise for archives that are broken, encrypted or of a later version.
 _BROKEN = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, RuntimeError, UnicodeDecodeError)
@@ -31,9 +31,9 @@ _LONGEST_HEADER = 10_000
 def read_archive(
     path: str | Path, names: Iterable[str], most: Mapping[str, int] | None = None
 ) -> dict[str, np.ndarray]:
-    """Arrays called `names` of a NumPy archive, those that it has.
+    """Read the arrays called `names` that a NumPy archive has.
 
-    `most` says how many numbers some of them may have; more are refused by the header alone.
+    `most` limits how many numbers some of them may have; the header alone is enough to refuse more.
 
     Nothing is unpickled, and each header is compared with what is stored before memory is taken.
 

@@ -18,6 +18,7 @@ from tomo_polysplat.scan.volume_grid import VolumeGrid, require_count
 
 __all__ = [
     "from_astra",
+    "geometry_from_astra",
     "is_planar_geometry",
     "projections_from_astra",
     "to_astra",
@@ -61,8 +62,6 @@ def from_astra(proj_geom: Mapping[str, Any], vol_geom: Mapping[str, Any]) -> tup
     ValueError, TypeError
         If something is missing, not finite, in degrees, or does not fit together.
     """
-    from astra import geom_2vec
-
     if _is_volume(proj_geom) and not _is_volume(vol_geom):
         remedy = "the projection geometry comes first"
         raise fail("proj_geom, vol_geom", "geometries in this order", "them exchanged", remedy)
@@ -74,6 +73,17 @@ def from_astra(proj_geom: Mapping[str, Any], vol_geom: Mapping[str, Any]) -> tup
         remedy = "give create_vol_geom (rows, columns) in 2D or (rows, columns, slices) in 3D"
         raise fail("vol_geom", f"{kinds[0]} to go with proj_geom {kind!r}", kinds[1], remedy)
     grid = _volume_grid(vol_geom)
+    geometry = geometry_from_astra(proj_geom)
+    _check_source(geometry, grid)
+    _log.debug("%s", geometry.describe())
+    return geometry, grid
+
+
+def geometry_from_astra(proj_geom: Mapping[str, Any]) -> Geometry:
+    """Translate ASTRA's projection geometry alone; see `from_astra`."""
+    from astra import geom_2vec
+
+    kind = _type_of(proj_geom)
     proj_geom = dict(proj_geom)
     if "Vectors" in proj_geom or kind.endswith("_vec"):
         proj_geom["Vectors"] = _checked_vectors(proj_geom, kind)
@@ -84,13 +94,9 @@ def from_astra(proj_geom: Mapping[str, Any], vol_geom: Mapping[str, Any]) -> tup
         _check_distances(proj_geom)
     vectors = geom_2vec(proj_geom)["Vectors"]
     if kind in _PLANAR_TYPES:
-        geometry = _planar_geometry(kind, vectors, _entry(proj_geom, "DetectorCount"))
-    else:
-        rows, columns = _entry(proj_geom, "DetectorRowCount"), _entry(proj_geom, "DetectorColCount")
-        geometry = _spatial_geometry(kind, vectors, rows, columns)
-    _check_source(geometry, grid)
-    _log.debug("%s", geometry.describe())
-    return geometry, grid
+        return _planar_geometry(kind, vectors, _entry(proj_geom, "DetectorCount"))
+    rows, columns = _entry(proj_geom, "DetectorRowCount"), _entry(proj_geom, "DetectorColCount")
+    return _spatial_geometry(kind, vectors, rows, columns)
 
 
 def _is_volume(geometry: Any) -> bool:

@@ -8,22 +8,35 @@ from typing import NamedTuple
 import numpy as np
 
 from tomo_polysplat.checks import fail, require_array, require_shape
-from tomo_polysplat.parallel import run_tasks, split_range
+from tomo_polysplat.parallel import run_tasks
+from tomo_polysplat.scan.evidence import Located, compare, locate
 
-__all__ = ["estimate_centre"]
+__all__ = ["estimate_centre", "find_centre"]
 
 logger = logging.getLogger(__name__)
 
-# A mirrored pair must share this part of the detector's width, or noise alone could look alike.
-SMALLEST_OVERLAP = 0.3
+# A mirrored pair must share this part of the detector's width: the axis may be 4 % of it from either edge.
+SMALLEST_OVERLAP = 0.08
+# Detector rows that are looked at, and lines (rows times pairs of views); parts that tell the noise.
+_MOST_ROWS, _MOST_LINES, _PARTS = 128, 2048, 16
 # Rows transformed together: few enough to stay in cache.
 _ROWS_AT_ONCE = 8
-# Of the largest sum of squares.
-_ROUNDING = 1e-10
 
 
 def estimate_centre(projections: np.ndarray, angles: np.ndarray, valid: np.ndarray | None = None) -> float:
-    """Column of the rotation axis, from views half a turn apart being mirror images of each other.
+    """Column of the rotation axis: that of :func:`find_centre`, with a warning in the log where it is uncertain."""
+    found = find_centre(projections, angles, valid)
+    columns = np.shape(projections)[2]
+    logger.info(
+        "rotation axis estimated at column %.2f of %d (mismatch %.3g)", found.place, columns, found.mismatch
+    )
+    if found.doubt:
+        logger.warning("the rotation axis is uncertain: %s; give centre= in columns", found.doubt)
+    return found.place
+
+
+def find_centre(projections: np.ndarray, angles: np.ndarray, valid: np.ndarray | None = None) -> Located:
+    """The rotation axis, from views half a turn apart being mirror images of each other.
 
     Parameters
     ----------
@@ -36,8 +49,8 @@ def estimate_centre(projections: np.ndarray, angles: np.ndarray, valid: np.ndarr
 
     Returns
     -------
-    float
-        Position in columns counted from the detector's edge, as in TomoPy: ``columns / 2`` is the middle.
+    Located
+        In columns counted from the detector's edge, as in TomoPy: ``columns / 2`` is the middle.
 
     Raises
     ------
@@ -48,27 +61,27 @@ def estimate_centre(projections: np.ndarray, angles: np.ndarray, valid: np.ndarr
     -----
     The axis at column index c (of pixel centres) maps column j of a view onto ``2 c - j`` of its opposite.
     For every whole 2 c the two are compared where they overlap and both rays are to be used,
-    ``sum (a - b)^2 / sum (a^2 + b^2)``, and the smallest value is refined by a parabola. Written out, the sums
-    are convolutions of a view with its opposite, which Fourier transforms give for all 2 c at once.
+    ``sum (a - b)^2 / sum ((a - mean a)^2 + (b - mean b)^2)``, and the smallest value is refined by a parabola. Noise
+    alone gives 1, however narrow the overlap. Written out, the sums are convolutions of a view with its opposite,
+    which Fourier transforms give for all 2 c at once.
     """
     projections = require_array("projections", projections, 3)
     angles = require_array("angles", angles, 1).astype(np.float64)
     require_shape("angles", angles, (projections.shape[1],), "(views,)")
     if valid is not None:
         require_shape("valid", valid, projections.shape, "(rows, views, columns)")
-    pairs = _opposite_views(angles)
-    columns = projections.shape[2]
+    rows, _, columns = projections.shape
+    chosen = np.unique(np.linspace(0, rows - 1, min(rows, _MOST_ROWS)).round().astype(int))
+    pairs = _opposite_views(angles, max(_PARTS, _MOST_LINES // len(chosen) // 16))
     smallest = max(3, int(SMALLEST_OVERLAP * columns))
     sums = np.arange(smallest - 1, 2 * columns - 1 - smallest)
-    scores = _mismatches(projections, valid, pairs)[sums]
-    if not np.isfinite(scores).any():
+    differences, variances, samples = _mismatches(projections, valid, chosen, pairs)
+    found = compare(differences[:, sums], variances[:, sums], samples[sums])
+    if found is None:
         raise fail(
             "projections", "an object in the beam", "views without contrast", "give centre= in columns"
         )
-    best = int(np.nanargmin(scores))
-    centre = (sums[best] + _parabola_offset(scores, best)) / 2 + 0.5
-    logger.info("rotation axis estimated at column %.2f of %d (mismatch %.3g)", centre, columns, scores[best])
-    return float(centre)
+    return locate(found, (sums + 1) / 2)
 
 
 class _Pairs(NamedTuple):
@@ -79,8 +92,11 @@ class _Pairs(NamedTuple):
     second: np.ndarray
     share: np.ndarray
 
+    def part(self, begin: int, end: int) -> _Pairs:
+        return _Pairs(*(values[begin:end] for values in self))
 
-def _opposite_views(angles: np.ndarray, most: int = 16) -> _Pairs:
+
+def _opposite_views(angles: np.ndarray, most: int) -> _Pairs:
     """Up to `most` views and, for each, the view half a turn later, interpolated between measured ones.
 
     A scan over 0 to 180 degrees that leaves the last angle out has no exact pair: the missing view is then
@@ -107,30 +123,40 @@ def _opposite_views(angles: np.ndarray, most: int = 16) -> _Pairs:
     return _Pairs(*map(np.array, zip(*(found[k] for k in keep))))
 
 
-def _mismatches(projections: np.ndarray, valid: np.ndarray | None, pairs: _Pairs) -> np.ndarray:
-    """Relative squared differences where ``column + mirrored column`` is 0, 1, ..., NaN where there is nothing."""
-    from scipy.fft import irfft, next_fast_len
+def _mismatches(
+    projections: np.ndarray, valid: np.ndarray | None, rows: np.ndarray, pairs: _Pairs
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Squared differences and variances (parts, sums), and samples (sums,), for every ``column + mirrored column``."""
+    from scipy.fft import next_fast_len
 
     columns = projections.shape[2]
     length = next_fast_len(2 * columns - 1, real=True)
-    blocks = split_range(len(projections), -(-len(projections) // _ROWS_AT_ONCE))
+    at_once = -(-len(pairs.view) // _PARTS)
+    tasks = [
+        (rows[a : a + _ROWS_AT_ONCE], pairs.part(b, b + at_once))
+        for b in range(0, len(pairs.view), at_once)
+        for a in range(0, len(rows), _ROWS_AT_ONCE)
+    ]
 
-    def part(a: int, b: int) -> np.ndarray:
-        return _spectra(projections[a:b], None if valid is None else valid[a:b], pairs, length)
+    def part(some: np.ndarray, opposite: _Pairs) -> np.ndarray:
+        return _sums(projections, valid, some, opposite, length)[:, : 2 * columns - 1]
 
-    energy, product = irfft(np.sum(run_tasks(part, blocks), axis=0), length)[:, : 2 * columns - 1]
-    # Of nothing at all the transforms leave rounding errors.
-    something = energy > _ROUNDING * energy.max()
-    return np.where(something, 1 - 2 * product / np.where(something, energy, 1), np.nan)
+    parts = np.zeros((min(_PARTS, len(tasks)), 3, 2 * columns - 1))
+    for begin in range(0, len(tasks), _PARTS):
+        for number, found in enumerate(run_tasks(part, tasks[begin : begin + _PARTS])):
+            parts[number] += found
+    return parts[:, 0], parts[:, 1], parts[:, 2].sum(axis=0)
 
 
-def _spectra(projections: np.ndarray, valid: np.ndarray | None, pairs: _Pairs, length: int) -> np.ndarray:
-    """Transforms of ``sum (a^2 + b^2)`` and ``sum a b`` over some rows, (2, frequencies)."""
-    from scipy.fft import rfft
+def _sums(
+    projections: np.ndarray, valid: np.ndarray | None, rows: np.ndarray, pairs: _Pairs, length: int
+) -> np.ndarray:
+    """Squared differences, variances and samples of some rows and pairs, (3, sums)."""
+    from scipy.fft import irfft, rfft
 
     def taken(views: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        values = projections[:, views].astype(np.float64)
-        usable = np.isfinite(values) if valid is None else np.isfinite(values) & (valid[:, views] > 0)
+        values = projections[rows[:, None], views].astype(np.float64)
+        usable = np.isfinite(values) if valid is None else np.isfinite(values) & valid[rows[:, None], views]
         return np.where(usable, values, 0), usable
 
     a, use_a = taken(pairs.view)
@@ -138,16 +164,20 @@ def _spectra(projections: np.ndarray, valid: np.ndarray | None, pairs: _Pairs, l
     use_b = use_first & use_second
     share = pairs.share[None, :, None]
     b = np.where(use_b, (1 - share) * first + share * second, 0)
-    weight_a, weight_b = (rfft(use.astype(np.float64), length) for use in (use_a, use_b))
-    energy = rfft(a * a, length) * weight_b + weight_a * rfft(b * b, length)
-    product = rfft(a, length) * rfft(b, length)
-    return np.stack([energy.sum(axis=(0, 1)), product.sum(axis=(0, 1))])
+    # About the middle of the two, for the sake of rounding.
+    level = 0.5 * (_mean(a, use_a) + _mean(b, use_b))
+    a, b = np.where(use_a, a - level, 0), np.where(use_b, b - level, 0)
+    weight_a, weight_b = rfft(use_a.astype(np.float64), length), rfft(use_b.astype(np.float64), length)
+    ones = np.round(irfft(weight_a * weight_b, length))
+    count = np.maximum(ones, 1)
+    fa, fb = rfft(a, length), rfft(b, length)
+    squares = irfft(rfft(a * a, length) * weight_b + weight_a * rfft(b * b, length), length)
+    mean_a, mean_b = irfft(fa * weight_b, length) / count, irfft(weight_a * fb, length) / count
+    differences = squares - 2 * irfft(fa * fb, length)
+    variances = squares - count * (mean_a**2 + mean_b**2)
+    summed = np.stack([differences, variances, ones])
+    return np.where(ones > 1, summed, 0).sum(axis=(1, 2))
 
 
-def _parabola_offset(scores: np.ndarray, best: int) -> float:
-    """Position of the minimum of the parabola through three scores, relative to the middle one."""
-    if not 0 < best < len(scores) - 1:
-        return 0.0
-    left, middle, right = scores[best - 1 : best + 2]
-    curvature = left - 2 * middle + right
-    return float(0.5 * (left - right) / curvature) if curvature > 0 else 0.0
+def _mean(line: np.ndarray, use: np.ndarray) -> np.ndarray:
+    return line.sum(axis=2, keepdims=True) / np.maximum(use.sum(axis=2, keepdims=True), 1)

@@ -1,29 +1,36 @@
-"""What is wrong with a scan, found in seconds, before minutes are spent on it."""
+"""Find what is wrong with a scan, in seconds, before a reconstruction takes minutes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
-from tomo_polysplat.scan.probes.axes import probe_axes
-from tomo_polysplat.scan.probes.logarithm import probe_logarithm
-from tomo_polysplat.scan.probes.measured import Finding, Measured
+from tomo_polysplat.scan.probes.axes import AXES, probe_axes
+from tomo_polysplat.scan.probes.finding import DEFECT, OK, UNKNOWN, Finding, Verdict
+from tomo_polysplat.scan.probes.logarithm import LOGARITHM, probe_logarithm
+from tomo_polysplat.scan.probes.measured import Measured
 from tomo_polysplat.scan.probes.opposite import CENTRE, DIRECTION, probe_centre_and_direction
-from tomo_polysplat.scan.probes.order import probe_order
+from tomo_polysplat.scan.probes.order import ORDER, probe_order
 from tomo_polysplat.scan.probes.rays import DEAD, bad_rays, probe_rays
-from tomo_polysplat.scan.probes.truncation import probe_truncation
+from tomo_polysplat.scan.probes.truncation import TRUNCATION, probe_truncation
 from tomo_polysplat.scan.scan import Scan
 
-__all__ = ["Finding", "check_scan"]
+__all__ = ["DEFECT", "OK", "UNKNOWN", "Finding", "Verdict", "check_scan"]
 
-LATER: tuple[tuple[tuple[str, ...], Callable[[Measured], list[Finding]]], ...] = (
-    (("order of views",), lambda measured: [probe_order(measured)]),
-    (("truncation",), lambda measured: [probe_truncation(measured)]),
+Probe = Callable[[Measured], "Finding | list[Finding]"]
+# What each probe answers, in the order in which they are asked; a defect of one of the first group would mislead the
+# second.
+FIRST: tuple[tuple[tuple[str, ...], Probe], ...] = (
+    ((LOGARITHM,), probe_logarithm),
+    ((AXES,), probe_axes),
+)
+LATER: tuple[tuple[tuple[str, ...], Probe], ...] = (
+    ((ORDER,), probe_order),
+    ((TRUNCATION,), probe_truncation),
     ((CENTRE, DIRECTION), probe_centre_and_direction),
 )
-
-
 # An object and air on both sides of it.
 _FEWEST_COLUMNS = 3
 
@@ -34,36 +41,43 @@ def check_scan(scan: Scan) -> list[Finding]:
     Parameters
     ----------
     scan : Scan
-        Nothing of its truth, spectrum or volume is used.
+        Nothing of its truth is used.
 
     Returns
     -------
     list of Finding
-        On the logarithm, the order of the axes and of the views, bad rays, truncation, the centre and the
-        direction of the angles. A defect that would mislead a later probe makes that one "unknown".
+        On bad rays, the logarithm, the order of the axes and of the views, truncation, the centre and the direction of
+        the angles. A probe without evidence says "unknown" and what it would take, and the others answer all the same.
     """
     measured = Measured(scan)
     kinds = bad_rays(measured)
-    rays = probe_rays(measured, kinds)
+    findings = [probe_rays(measured, kinds)]
     # The other probes look at what is left.
-    measured = Measured(scan, dead_pixels=np.asarray(kinds[DEAD].any(axis=1)))
+    measured = replace(measured, dead_pixels=np.asarray(kinds[DEAD].any(axis=1)))
     nothing = _nothing_to_see(measured)
-    if nothing:
-        names = ("logarithm", "order of axes", *(name for names, _ in LATER for name in names))
-        return [rays, *(Finding(name, "unknown", nothing) for name in names)]
-    findings = [rays, probe_logarithm(measured), probe_axes(measured)]
-    for names, probe in LATER:
+    for names, probe in FIRST + LATER:
         misleading = [finding.probe for finding in findings[1:] if finding.misleading]
-        if misleading:
+        if nothing:
+            findings += [Finding(name, UNKNOWN, nothing, "a scan of an object") for name in names]
+        elif misleading and (names, probe) in LATER:
             text = f"looked for once this is mended: {', '.join(misleading)}"
-            findings += [Finding(name, "unknown", text) for name in names]
+            findings += [Finding(name, UNKNOWN, text, "the scan mended") for name in names]
         else:
-            findings += probe(measured)
+            findings += _asked(probe, names, measured)
     return findings
 
 
+def _asked(probe: Probe, names: tuple[str, ...], measured: Measured) -> list[Finding]:
+    """What a probe answers; where it cannot look at a scan such as this one, that it does not know."""
+    try:
+        answer = probe(measured)
+    except ValueError as error:
+        return [Finding(name, UNKNOWN, str(error)) for name in names]
+    return answer if isinstance(answer, list) else [answer]
+
+
 def _nothing_to_see(measured: Measured) -> str:
-    """Why the scan as a whole tells nothing, or an empty text."""
+    """Why the whole scan shows nothing, or an empty text."""
     if measured.scan.columns < _FEWEST_COLUMNS:
         return f"fewer than {_FEWEST_COLUMNS} columns do not tell"
     if not measured.valid.any():

@@ -8,7 +8,8 @@ in a group of our own, ``/polysplat``:
   ymin, ymax, zmin, zmax);
 - ``spectrum``: datasets ``energies`` (keV) and ``weights``;
 - ``truth`` (z, y, x) in 1/unit with attribute ``energy_kev``; ``metal_mask`` (z, y, x);
-  ``valid`` (like data); ``water_correction``, the coefficients of ``Scan``.
+  ``valid`` (like data); ``water_correction``, the coefficients of ``Scan``;
+- ``scanner``: JSON text of what a scanner's folder told (``Scan.notes["scanner"]``).
 
 The attribute ``input`` of ``/exchange/data`` tells counts, transmission and attenuation apart.
 """
@@ -21,22 +22,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tomo_polysplat.checks import fail, require_array, require_choice, require_shape
+from tomo_polysplat.checks import fail, require_array, require_choice, require_number, require_shape
 from tomo_polysplat.scan.centre import estimate_centre
-from tomo_polysplat.scan.defects import attenuation, flat_and_dark
+from tomo_polysplat.scan.circular import parallel_geometry
+from tomo_polysplat.scan.defects import flat_and_dark
 from tomo_polysplat.scan.dxchange_host import read_block
 from tomo_polysplat.scan.hdf5 import (
     find_array,
     find_group,
     number_attribute,
     opened,
+    read_json,
     read_numbers,
     read_spectrum,
     read_text,
     text_attribute,
 )
+from tomo_polysplat.scan.in_blocks import line_integrals
 from tomo_polysplat.scan.layout import (
-    parallel_geometry,
     spatial_geometry,
     vector_geometry,
     volume_geometry,
@@ -47,11 +50,16 @@ from tomo_polysplat.scan.scan import Scan
 if TYPE_CHECKING:
     import h5py
 
+    from tomo_polysplat.scan.hdf5_array import StoredArray
+
 __all__ = ["scan_from_hdf5"]
 
 logger = logging.getLogger(__name__)
 
-BLOCK_BYTES = 2**27
+# Of the longest kind of vectors, and of a polynomial.
+_PER_VECTOR, _MOST_COEFFICIENTS = 13, 100
+# Open-beam or dark images beside fewer views than that.
+_MOST_FRAMES = 1000
 # Where APS tomography files keep the size of a pixel in the plane of the object. The size of a camera's own
 # pixel is not used: without the magnification it is off by the objective's factor.
 PIXEL_SIZE_PATHS = ("measurement/instrument/detection_system/objective/resolution",)
@@ -75,21 +83,23 @@ def scan_from_hdf5(path: Path, options: ReadOptions) -> Scan:
             valid &= stored.transpose(1, 0, 2)
         _report_defects(notes["rays"], valid)
         geometry = _geometry(file, projections, valid, options, notes)
+        if (scanner := read_json(file, "polysplat/scanner", None)) is not None:
+            notes["scanner"] = scanner
         return Scan(
             projections=projections,
             valid=None if valid.all() else valid,
             name=read_text(file, "measurement/sample/name") or path.stem,
             notes=notes,
             **geometry,
-            **_knowledge(file, options),
+            **_knowledge(file, geometry["vol_geom"], options),
         )
 
 
 def _line_integrals(
-    exchange: h5py.Group, data: h5py.Dataset, options: ReadOptions
+    exchange: h5py.Group, data: StoredArray, options: ReadOptions
 ) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
     """Projections and validity in the order (rows, views, columns), read a block of views at a time."""
-    views, rows, columns = data.shape
+    rows, columns = data.shape[1:]
     white, dark = find_array(exchange, "data_white"), find_array(exchange, "data_dark")
     kind = _input_kind(data, white is not None, options.input)
     flat = background = None
@@ -101,23 +111,26 @@ def _line_integrals(
                 "none",
                 "or pass input='transmission' or 'attenuation'",
             )
+        for frames in filter(None, (white, dark)):
+            _require_few(frames, data)
         no_light = None if dark is None else read_block(dark)
         flat, background = flat_and_dark(read_block(white), no_light, (rows, columns))
-    projections = np.empty((rows, views, columns), np.float32)
-    valid = np.empty((rows, views, columns), bool)
-    rays: dict[str, int] = {}
-    block = max(1, BLOCK_BYTES // (rows * columns * 8))
-    for first in range(0, views, block):
-        part = slice(first, min(first + block, views))
-        values, usable, counts = attenuation(
-            read_block(data, part), kind, flat, background, options.saturation
-        )
-        projections[:, part], valid[:, part] = values.transpose(1, 0, 2), usable.transpose(1, 0, 2)
-        rays = {name: rays.get(name, 0) + count for name, count in counts.items()}
+    projections, valid, rays = line_integrals(
+        lambda part: read_block(data, part), data.shape, kind, flat, background, options.saturation
+    )
     return projections, valid, {"input": kind, "rays": rays}
 
 
-def _input_kind(data: h5py.Dataset, has_white: bool, stated: str | None) -> str:
+def _require_few(frames: StoredArray, data: StoredArray) -> None:
+    """Refuse open-beam or dark images of another size than the data, or unreasonably many, before they are read."""
+    if frames.ndim not in (2, 3) or frames.shape[-2:] != data.shape[1:]:
+        raise fail(frames.name, f"frames of shape {data.shape[1:]}, as the data", f"{frames.shape}")
+    most = max(_MOST_FRAMES, data.shape[0])
+    if frames.ndim == 3 and len(frames) > most:
+        raise fail(frames.name, f"at most {most} frames", f"{len(frames)}")
+
+
+def _input_kind(data: StoredArray, has_white: bool, stated: str | None) -> str:
     """What the numbers are: as the caller or the file states it, else as they look, with a warning."""
     if stated is not None:
         return stated
@@ -165,9 +178,13 @@ def _geometry(
         }
     if group is not None:
         proj_geom = vector_geometry(
-            _attribute(group, "astra_type"), read_numbers(group, "vectors"), projections.shape
+            _attribute(group, "astra_type"),
+            read_numbers(group, "vectors", most=_PER_VECTOR * projections.shape[1]),
+            projections.shape,
         )
-        vol_geom = volume_geometry(read_numbers(group, "volume_shape"), read_numbers(group, "volume_window"))
+        vol_geom = volume_geometry(
+            read_numbers(group, "volume_shape", (3,)), read_numbers(group, "volume_window", (6,))
+        )
         unit = options.settled_unit(_attribute(group, "unit"), "cm")
         return {"proj_geom": proj_geom, "vol_geom": dict(options.vol_geom or vol_geom), "unit": unit}
     rows, views, columns = projections.shape
@@ -177,7 +194,15 @@ def _geometry(
         centre = estimate_centre(projections, theta, valid)
     notes |= {"centre": float(centre), "centre_estimated": options.centre is None}
     pixel_size, unit = _pixel_size(file, options)
-    proj_geom, vol_geom = parallel_geometry(theta, rows, columns, centre, pixel_size)
+    remedy = "in columns from the edge"
+    centre = require_number("centre", centre, above=0, at_most=columns, remedy=remedy)
+    # In degrees: those may be of many turns, where radians are looked at with suspicion.
+    proj_geom, vol_geom = parallel_geometry(
+        pixel=require_number("pixel_size", pixel_size, above=0),
+        degrees=np.rad2deg(theta),
+        detector=(rows, columns),
+        offset=((columns / 2 - centre) * pixel_size, 0.0),
+    )
     return {"proj_geom": proj_geom, "vol_geom": dict(options.vol_geom or vol_geom), "unit": unit}
 
 
@@ -196,6 +221,8 @@ def _angles(file: h5py.File, views: int, given: Any, centre: float | None) -> np
         if dataset is None:
             raise _missing_theta(views)
         in_radians = (text_attribute(dataset, "units") or "").lower().startswith("rad")
+        if dataset.shape != (views,):
+            raise fail("theta", f"shape {(views,)} (views,)", f"{dataset.shape}")
         given = read_block(dataset)
     theta = require_array("theta", given, 1).astype(np.float64)
     require_shape("theta", theta, (views,), "(views,)")
@@ -239,7 +266,7 @@ def _pixel_size(file: h5py.File, options: ReadOptions) -> tuple[float, str]:
     return 1.0, "pixel"
 
 
-def _knowledge(file: h5py.File, options: ReadOptions) -> dict[str, Any]:
+def _knowledge(file: h5py.File, vol_geom: dict[str, Any], options: ReadOptions) -> dict[str, Any]:
     """Spectrum, water correction, truth and metal mask, where the file has them."""
     known: dict[str, Any] = {"spectrum": options.spectrum, "water_correction": options.water_correction}
     group = find_group(file, "polysplat")
@@ -247,10 +274,12 @@ def _knowledge(file: h5py.File, options: ReadOptions) -> dict[str, Any]:
         return known
     known["spectrum"] = options.spectrum or read_spectrum(group)
     if options.water_correction is None and find_array(group, "water_correction") is not None:
-        known["water_correction"] = read_numbers(group, "water_correction")
+        known["water_correction"] = read_numbers(group, "water_correction", most=_MOST_COEFFICIENTS)
     truth = find_array(group, "truth")
     if options.vol_geom is None and truth is not None:
-        known["truth"], known["truth_energy_kev"] = truth[()], number_attribute(truth, "energy_kev")
+        shape = tuple(int(vol_geom[f"Grid{axis}Count"]) for axis in ("Slice", "Row", "Col"))
+        known["truth"] = read_numbers(group, "truth", shape)
+        known["truth_energy_kev"] = number_attribute(truth, "energy_kev")
         if find_array(group, "metal_mask") is not None:
-            known["metal_mask"] = read_numbers(group, "metal_mask")
+            known["metal_mask"] = read_numbers(group, "metal_mask", shape)
     return known

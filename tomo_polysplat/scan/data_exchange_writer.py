@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,6 +43,8 @@ def _describe(file: h5py.File, scan: Scan) -> None:
     group["vectors"] = geometry["Vectors"]
     group["volume_shape"], group["volume_window"] = np.array(scan.volume_shape), window_of(scan.vol_geom)
     _write_knowledge(file["polysplat"], scan)
+    if "scanner" in scan.notes:
+        file["polysplat/scanner"] = json.dumps(scan.notes["scanner"])
 
 
 def _write_knowledge(group: h5py.Group, scan: Scan) -> None:

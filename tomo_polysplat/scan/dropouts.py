@@ -18,7 +18,7 @@ STEEPEST_RIM = 0.75
 
 
 def dropped_rays(projections: np.ndarray) -> np.ndarray:
-    """Exact zeros that cannot be air, because the object stands on both sides of them.
+    """Find exact zeros that cannot be air, because the object stands on both sides of them.
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    import h5py
+    from tomo_polysplat.scan.hdf5_array import StoredArray
 
 __all__ = ["real_dxchange", "read_block"]
 
@@ -39,10 +39,13 @@ def real_dxchange() -> ModuleType | None:
     return module if all(hasattr(module, name) for name in OFFERS) else None
 
 
-def read_block(dataset: h5py.Dataset, part: slice = slice(None)) -> np.ndarray:
-    """A dataset of an open file, or the block `part` along its first axis."""
+def read_block(dataset: StoredArray, part: slice = slice(None)) -> np.ndarray:
+    """A dataset of an open file, or the block `part` along its first axis.
+
+    What has filters or is virtual does not go through dxchange, which leaves all of it to HDF5.
+    """
     host = real_dxchange()
-    if host is None or dataset.ndim == 0:
+    if host is None or dataset.ndim == 0 or not dataset.plain:
         return dataset[part] if dataset.ndim else dataset[()]
     array = host.read_hdf5(dataset.file.filename, dataset.name, slc=(part.indices(len(dataset)),))
     if array is None:

@@ -10,6 +10,7 @@ edges of the package by the functions named here, and nowhere else.
 
 from tomo_polysplat.scan.astra_geometry import (
     from_astra,
+    geometry_from_astra,
     is_planar_geometry,
     projections_from_astra,
     to_astra,
@@ -23,6 +24,7 @@ __all__ = [
     "Geometry",
     "VolumeGrid",
     "from_astra",
+    "geometry_from_astra",
     "is_planar_geometry",
     "projections_from_astra",
     "to_astra",

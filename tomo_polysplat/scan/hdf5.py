@@ -1,7 +1,8 @@
 """Reading HDF5 files that may be damaged, truncated or something else altogether.
 
-Everything is looked up link by link: nothing outside the file is opened, and no size is believed before it is
-compared with what the file stores.
+Everything is looked up link by link (`hdf5_links`): nothing outside the folder of the file is opened. No size is
+believed before it is compared with what the file stores (`hdf5_array`), and texts are read without HDF5
+(`hdf5_heaps`).
 """
 
 from __future__ import annotations
@@ -15,9 +16,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tomo_polysplat.checks import fail, visible
-from tomo_polysplat.files import existing_file, require_plausible_size
+from tomo_polysplat.files import existing_file
 from tomo_polysplat.json_text import parse_json
-from tomo_polysplat.scan.hdf5_heaps import require_sound_heaps
+from tomo_polysplat.scan.hdf5_array import StoredArray, dtype_of
+from tomo_polysplat.scan.hdf5_child import text_apart
+from tomo_polysplat.scan.hdf5_chunks import chunk_bytes
+from tomo_polysplat.scan.hdf5_headers import attribute_bytes, layout
+from tomo_polysplat.scan.hdf5_heaps import referred_text, require_plain_start
+from tomo_polysplat.scan.hdf5_links import held_files, member
 
 if TYPE_CHECKING:
     import h5py
@@ -29,12 +35,12 @@ __all__ = [
     *("read_numbers", "read_spectrum", "read_text", "text_attribute", "write_spectrum"),
 ]
 
-_MOST_LINKS = 16
 _LARGEST_ATTRIBUTE = 2**16
-_ADDRESS_BYTES = 8
+_MOST_ENERGIES = 1_000_000
+# Of a reference to a text of any length.
+_REFERENCE_BYTES = 16
 # What h5py raises for files that HDF5 cannot make sense of, at any time while they are read.
 _BROKEN = (OSError, RuntimeError, KeyError, UnicodeDecodeError)
-_OUTSIDE = "copy the data into one file: h5repack does, and so does h5py"
 
 
 @contextmanager
@@ -43,15 +49,16 @@ def opened(path: str | Path) -> Iterator[h5py.File]:
     import h5py
 
     file = existing_file(path)
-    require_sound_heaps(file)
+    with open(file, "rb") as stream:
+        require_plain_start(stream, str(file))
     try:
-        with h5py.File(file, "r") as handle:
+        with held_files(), h5py.File(file, "r") as handle:
             yield handle
     except _BROKEN as error:
         if not _of_h5py(error):
             raise
         remedy = (
-            "it is not HDF5, is truncated, or needs a compression plugin (python -m pip install hdf5plugin)"
+            "it is not HDF5, is truncated, or needs a filter (python -m pip install 'tomo-polysplat[hdf5]')"
         )
         raise fail("path", "a readable HDF5 file", f"{file} ({error})", remedy) from error
 
@@ -64,35 +71,6 @@ def _of_h5py(error: BaseException) -> bool:
     return last is not None and str(last.tb_frame.f_globals.get("__name__", "")).startswith("h5py")
 
 
-def _member(group: h5py.Group, path: str, links: int = _MOST_LINKS) -> Any:
-    """The object at a path below a group, or None.
-
-    Raises
-    ------
-    ValueError
-        For a link out of the file, or one that leads round in circles.
-    """
-    import h5py
-
-    here: Any = group.file if path.startswith("/") else group
-    for part in filter(None, path.split("/")):
-        name = part.encode("utf-8", "surrogateescape")
-        # Asked of the link itself: h5py's own look-ups follow it first, to whatever file it names.
-        if not isinstance(here, h5py.Group) or not here.id.links.exists(name):
-            return None
-        kind = here.id.links.get_info(name).type
-        if kind == h5py.h5l.TYPE_SOFT:
-            if not links:
-                raise fail(f"{here.name}/{part}", f"at most {_MOST_LINKS} links to the data", "more")
-            target = here.id.links.get_val(name).decode("utf-8", "surrogateescape")
-            here = _member(here, target, links - 1)
-        elif kind == h5py.h5l.TYPE_HARD:
-            here = here[part]
-        else:
-            raise fail(f"{here.name}/{part}", "data in the file", "a link to another file", _OUTSIDE)
-    return here
-
-
 def find_group(group: h5py.Group, path: str) -> h5py.Group | None:
     """The group at a path, or None.
 
@@ -103,75 +81,61 @@ def find_group(group: h5py.Group, path: str) -> h5py.Group | None:
     """
     import h5py
 
-    found = _member(group, path)
+    found = member(group, path)
     if found is not None and not isinstance(found, h5py.Group):
-        raise fail(f"{group.name}/{path}", "a group", _described(found))
+        raise fail(_where(group, path), "a group", _described(found))
     return found
 
 
-def find_array(group: h5py.Group, name: str) -> h5py.Dataset | None:
+def find_array(group: h5py.Group, name: str) -> StoredArray | None:
     """The dataset called `name`, or None; its type and size are checked before anything is read.
 
     Raises
     ------
     ValueError
-        If it holds no numbers, lies outside the file, or declares more data than the file stores.
+        If it holds no numbers, lies outside the folder of the file, or declares more data than the file stores.
     MemoryError
         If it is too large for the free memory.
     """
-    dataset = _member(group, name)
+    dataset = member(group, name)
     if dataset is None:
         return None
-    where = f"{group.name}/{name}"
-    dtype = _type_of(dataset)
+    where = _where(group, name)
+    dtype = dtype_of(dataset)
     if dtype is None or dtype.kind not in "fiub" or dataset.shape is None:
         raise fail(where, "a dataset of numbers", _described(dataset))
-    if dataset.is_virtual or dataset.external:
-        raise fail(where, "data in the file", "a dataset that only refers to other files", _OUTSIDE)
-    _require_stored(where, dataset, math.prod(dataset.shape) * dtype.itemsize)
-    if dataset.chunks:
-        _require_stored(where, dataset, math.prod(dataset.chunks) * dtype.itemsize)
-        _require_chunks(where, dataset)
-    return dataset
+    return StoredArray(dataset, where)
 
 
-def _require_chunks(where: str, dataset: h5py.Dataset) -> None:
-    """Refuse more chunks than the file can have addresses of: each would be looked for."""
-    chunks = math.prod(-(-length // size) for length, size in zip(dataset.shape, dataset.chunks))
-    most = Path(dataset.file.filename).stat().st_size // _ADDRESS_BYTES
-    if chunks > max(most, 1):
-        raise fail(where, f"at most {most} chunks in a file of this size", f"{chunks}", "damaged file")
+def _where(group: h5py.Group, name: str) -> str:
+    """What errors call a member of a group."""
+    return f"{group.name.rstrip('/')}/{name}"
 
 
 def _described(item: Any) -> str:
     """What a file has where numbers were expected; h5py's own repr fails on types that a file has made up."""
-    return f"{type(item).__name__} of type {_type_of(item)} and shape {getattr(item, 'shape', None)}"
+    return f"{type(item).__name__} of type {dtype_of(item)} and shape {getattr(item, 'shape', None)}"
 
 
-def _type_of(dataset: Any) -> np.dtype | None:
-    """NumPy's type of a dataset; None for anything else and for types that NumPy does not have."""
-    import h5py
+def read_numbers(
+    group: h5py.Group, name: str, shape: tuple[int, ...] | None = None, *, most: int | None = None
+) -> np.ndarray:
+    """A whole dataset that must be there.
 
-    if not isinstance(dataset, h5py.Dataset):
-        return None
-    try:
-        return dataset.dtype
-    except (TypeError, ValueError):
-        return None
-
-
-def _require_stored(where: str, dataset: h5py.Dataset, declared: int) -> None:
-    file_size = Path(dataset.file.filename).stat().st_size
-    require_plausible_size(where, declared, min(dataset.id.get_storage_size(), file_size))
-
-
-def read_numbers(group: h5py.Group, name: str, shape: tuple[int, ...] | None = None) -> np.ndarray:
-    """A whole dataset that must be there, of an exact `shape` when one is given."""
+    Parameters
+    ----------
+    shape : tuple of int, or None
+        What it must have.
+    most : int or None
+        Numbers that it may have; more are refused before any is read.
+    """
     dataset = find_array(group, name)
     if dataset is None:
         raise fail("path", f"a dataset {name} in {group.name}", f"none in {group.file.filename}")
-    if shape is not None and tuple(dataset.shape) != tuple(shape):
-        raise fail(f"{group.name}/{name}", f"shape {tuple(shape)}", f"{tuple(dataset.shape)}")
+    if shape is not None and dataset.shape != tuple(shape):
+        raise fail(_where(group, name), f"shape {tuple(shape)}", f"{dataset.shape}")
+    if most is not None and dataset.size > most:
+        raise fail(_where(group, name), f"at most {most} numbers", f"shape {dataset.shape}")
     return dataset[()]
 
 
@@ -179,20 +143,42 @@ def read_text(group: h5py.Group, name: str, default: str = "") -> str:
     """A string dataset (also one of a single element, as Data Exchange writes them)."""
     import h5py
 
-    dataset = _member(group, name)
-    dtype = _type_of(dataset)
-    if dtype is None or h5py.check_string_dtype(dtype) is None or dataset.size != 1:
+    dataset = member(group, name)
+    dtype = dtype_of(dataset)
+    about = None if dtype is None else h5py.check_string_dtype(dtype)
+    if about is None or dataset.size != 1:
         return default
-    _require_stored(f"{group.name}/{name}", dataset, dtype.itemsize)
-    return _text(np.asarray(dataset[()]).reshape(-1)[0])
+    where = _where(group, name)
+    if about.length is not None:
+        return _text(StoredArray(dataset, where)[()].reshape(-1)[0])
+    reference = _stored_bytes(dataset, where)
+    if reference is None:
+        return default
+    with open(dataset.file.filename, "rb") as stream:
+        return _text(referred_text(stream, where, reference))
+
+
+def _stored_bytes(dataset: h5py.Dataset, where: str) -> bytes | None:
+    """The reference to the one text of a dataset as it is stored; None where nothing was written."""
+    import h5py
+
+    if dataset.chunks:
+        return chunk_bytes(dataset, where, _REFERENCE_BYTES)
+    place = dataset.id.get_offset()
+    with open(dataset.file.filename, "rb") as stream:
+        if place is not None:
+            stream.seek(place)
+            return stream.read(_REFERENCE_BYTES)
+        stored = layout(stream, h5py.h5o.get_info(dataset.id).addr)
+        return stored.data if stored is not None and stored.data else None
 
 
 def _text(value: Any) -> str:
     return visible(value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value))
 
 
-def read_attribute(item: h5py.HLObject, name: str) -> Any:
-    """An attribute, or None.
+def read_attribute(item: h5py.HLObject | StoredArray, name: str) -> Any:
+    """An attribute, or None where there is none, or several texts of any length.
 
     Raises
     ------
@@ -209,15 +195,31 @@ def read_attribute(item: h5py.HLObject, name: str) -> Any:
         # Of what else there is, lists of a length of their own that are damaged end the process.
         if about.dtype.kind not in "fiubS" and h5py.check_string_dtype(about.dtype) is None:
             raise TypeError(f"values of type {about.dtype}")
-        value = item.attrs[name] if size <= _LARGEST_ATTRIBUTE else None
     except (TypeError, ValueError) as error:
         raise fail(f"attribute '{name}' of {item.name}", "a number or a text", str(error)) from error
-    if value is None:
+    if size > _LARGEST_ATTRIBUTE:
         raise fail(f"attribute '{name}' of {item.name}", "a number or a text", f"{size} bytes")
-    return value
+    return _attribute(item, name, about)
 
 
-def text_attribute(item: h5py.HLObject, name: str) -> str | None:
+def _attribute(item: h5py.HLObject | StoredArray, name: str, about: Any) -> Any:
+    """Its value; a text of any length is read without HDF5, which takes the memory that it states to need."""
+    import h5py
+
+    text = h5py.check_string_dtype(about.dtype)
+    if text is None or text.length is not None or about.shape is None:
+        return item.attrs[name]
+    where = f"attribute '{name}' of {item.name}"
+    if math.prod(about.shape) != 1:
+        return None
+    with open(item.file.filename, "rb") as stream:
+        stored = attribute_bytes(stream, h5py.h5o.get_info(item.id).addr, name)
+        if stored is not None:
+            return _text(referred_text(stream, where, stored[:_REFERENCE_BYTES]))
+    return text_apart(item.file.filename, item.name, name, where)
+
+
+def text_attribute(item: h5py.HLObject | StoredArray, name: str) -> str | None:
     """An attribute that is one text; None for anything else."""
     value = read_attribute(item, name)
     if isinstance(value, np.ndarray) and value.size == 1:
@@ -225,7 +227,7 @@ def text_attribute(item: h5py.HLObject, name: str) -> str | None:
     return _text(value) if isinstance(value, (str, bytes)) else None
 
 
-def number_attribute(item: h5py.HLObject, name: str) -> float | None:
+def number_attribute(item: h5py.HLObject | StoredArray, name: str) -> float | None:
     """An attribute that is one finite number, or None where there is none."""
     value = read_attribute(item, name)
     if value is None:
@@ -239,7 +241,7 @@ def number_attribute(item: h5py.HLObject, name: str) -> float | None:
 def read_json(group: h5py.Group, name: str, default: Any) -> Any:
     """What a string dataset holds as JSON."""
     text = read_text(group, name)
-    return parse_json(text, f"{group.name}/{name}") if text else default
+    return parse_json(text, _where(group, name)) if text else default
 
 
 def write_spectrum(group: h5py.Group, spectrum: Spectrum | None) -> None:
@@ -258,4 +260,5 @@ def read_spectrum(group: h5py.Group) -> Spectrum | None:
     if lines is None:
         return None
     label = text_attribute(lines, "label") or "measured spectrum"
-    return Spectrum(read_numbers(lines, "energies"), read_numbers(lines, "weights"), label)
+    energies, weights = (read_numbers(lines, name, most=_MOST_ENERGIES) for name in ("energies", "weights"))
+    return Spectrum(energies, weights, label)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +13,11 @@ from tomo_polysplat.files import existing_file
 from tomo_polysplat.scan.data_exchange import scan_from_hdf5
 from tomo_polysplat.scan.data_exchange_writer import write_hdf5
 from tomo_polysplat.scan.npz import scan_from_npz, write_npz
+from tomo_polysplat.scan.readers.part import Part
+from tomo_polysplat.scan.readers.recognise import acquisition_of
+from tomo_polysplat.scan.readers.scan_part import scan_part
+from tomo_polysplat.scan.readers.stated import with_options
+from tomo_polysplat.scan.readers.to_scan import scan_from_acquisition
 from tomo_polysplat.scan.reading import ReadOptions
 from tomo_polysplat.scan.scan import Scan
 
@@ -35,8 +40,16 @@ def load_scan(
     proj_geom: Mapping[str, Any] | None = None,
     vol_geom: Mapping[str, Any] | None = None,
     water_correction: Sequence[float] | None = None,
+    scanner: Mapping[str, Any] | None = None,
+    rows: tuple[int, int] | None = None,
+    columns: tuple[int, int] | None = None,
+    views: Any = None,
+    binning: int = 1,
 ) -> Scan:
-    """Read a scan from a Data Exchange HDF5 file or an ``.npz`` scan.
+    """Read a scan: a Data Exchange HDF5 file, an ``.npz`` scan, or what a scanner leaves in a folder.
+
+    Of pictures in a folder, or in a file, those that are wanted alone are read. What had to be guessed is said in the
+    log and in ``scan.notes["scanner"]``, with the keys of the scanner's own text that are not used.
 
     A Data Exchange file that states no geometry is taken as a parallel beam with the angles in
     ``/exchange/theta`` (degrees). Rays without light, saturated, of dead pixels or not finite are marked in
@@ -45,7 +58,7 @@ def load_scan(
     Parameters
     ----------
     path : path
-        The file; its contents decide what it is, not its name.
+        The file or the folder; its contents decide what it is, not its name.
     spectrum : Spectrum or None
         Used instead of the file's.
     unit : str or None
@@ -68,6 +81,17 @@ def load_scan(
         then no truth is read.
     water_correction : sequence of float or None
         Polynomial that the projections have been put through, instead of the file's; see :class:`Scan`.
+    scanner : mapping, optional
+        What no file says, by the names that stand in ``docs/scanner_files.md``, such as ``{"source_object": 200,
+        "source_detector": 500, "pixel": 0.1, "arc": 360, "flats": "flat*.tif"}`` in mm. A file ``scan.toml`` in the
+        folder says the same.
+    rows, columns : (first, end), optional
+        Part of the pictures to read, counted as a viewer of pictures does, from the top left at 0; those of an HDF5
+        or ``.npz`` scan as its arrays are.
+    views : int, (first, end) or (first, end, step), optional
+        Views to read; a number alone is the step.
+    binning : int
+        Rows and columns whose light is averaged to one.
 
     Returns
     -------
@@ -85,18 +109,32 @@ def load_scan(
     """
     stated = (spectrum, unit, centre, pixel_size, theta, input, saturation, proj_geom, vol_geom)
     options = ReadOptions(*stated, water_correction)
+    part = Part(rows, columns, views, binning)
+    reader = _reader_of_scans(Path(path))
+    if reader is None:
+        told = acquisition_of(Path(path), with_options(scanner or {}, options))
+        return scan_from_acquisition(told, options, part)
+    if scanner:
+        got = ", ".join(map(str, scanner))
+        raise fail("scanner", "nothing for a scan that has its own geometry", got, "leave it out")
+    scan = reader(existing_file(path), options)
+    return scan if part.whole else scan_part(scan, part)
+
+
+def _reader_of_scans(path: Path) -> Callable[[Path, ReadOptions], Scan] | None:
+    """What reads the package's own kinds of files; None for what scanners write."""
+    if path.is_dir():
+        return None
     file = existing_file(path)
     if zipfile.is_zipfile(file):
-        return scan_from_npz(file, options)
+        return scan_from_npz
     with open(file, "rb") as stream:
         start = stream.read(4)
     if start == b"PK\x03\x04":
         raise fail(
             "path", "a complete .npz archive", str(file), "it is truncated: copy or write the file again"
         )
-    if start != b"\x89HDF":
-        raise fail("path", "a Data Exchange HDF5 file or an .npz scan", f"{file}, which is neither")
-    return scan_from_hdf5(file, options)
+    return scan_from_hdf5 if start == b"\x89HDF" else None
 
 
 def save_scan(scan: Scan, path: str | os.PathLike, *, overwrite: bool = False) -> None:

@@ -1,4 +1,4 @@
-"""ASTRA geometries for what files hold: vectors and windows, or the angles of a parallel beam."""
+"""ASTRA geometries for what files hold: vectors and windows."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from tomo_polysplat.checks import fail, require_array, require_choice, require_number, require_shape
+from tomo_polysplat.checks import fail, require_array, require_choice, require_shape
 
 __all__ = [
-    "parallel_geometry",
     "spatial_geometry",
     "vector_form",
     "vector_geometry",
@@ -45,31 +44,6 @@ def volume_geometry(shape: np.ndarray, window: np.ndarray) -> dict[str, Any]:
         raise fail("volume", "positive counts and a window with minimum < maximum", f"{shape} in {window}")
     nz, ny, nx = (int(n) for n in shape)
     return astra.create_vol_geom(ny, nx, nz, *(float(w) for w in window))
-
-
-def parallel_geometry(
-    theta: np.ndarray, rows: int, columns: int, centre: float, pixel_size: float
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """A parallel beam with square pixels, and a volume with voxels of their size around the rotation axis.
-
-    Parameters
-    ----------
-    theta : array, shape (views,)
-        Angles in radians, as in TomoPy and ASTRA.
-    centre : float
-        Rotation axis in columns from the detector's edge (``columns / 2`` is the middle).
-    pixel_size : float
-        Side of a pixel in the unit of length.
-    """
-    import astra
-
-    size = require_number("pixel_size", pixel_size, above=0)
-    centre = require_number("centre", centre, above=0, at_most=columns, remedy="in columns from the edge")
-    straight = astra.create_proj_geom("parallel3d", size, size, rows, columns, np.asarray(theta, np.float64))
-    shifted = astra.geom_postalignment(straight, (columns / 2 - centre, 0.0))
-    half_width, half_height = size * columns / 2, size * rows / 2
-    window = np.array([-half_width, half_width, -half_width, half_width, -half_height, half_height])
-    return shifted, volume_geometry(np.array([rows, columns, columns]), window)
 
 
 def vector_form(proj_geom: dict[str, Any]) -> dict[str, Any]:

@@ -1,7 +1,7 @@
-"""Are these values -log(I/I0) at all? Counts, transmissions and turned signs are told before anything is fitted.
+"""Refuse projections that are not -log(I/I0): counts, transmissions, logarithms of the wrong sign or scale.
 
-:mod:`tomo_polysplat.scan.probes.logarithm` asks the same of a file, where a wrong answer costs nothing. This refuses,
-so that it must be certain: a view from within a hollow object also has less in its middle than at its ends.
+:mod:`tomo_polysplat.scan.probes.logarithm` asks the same of a file and only warns. This module refuses a scan, so it
+must be certain. For example, a view from inside a hollow object also has less in its middle than at its ends.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ __all__ = ["require_line_integrals"]
 
 logger = logging.getLogger(__name__)
 
-# Views and rows that are looked at, and fewer columns than these have no ends to tell air by.
+# Views and rows to look at; with fewer columns than the last number the ends do not show air.
 _VIEWS, _ROWS, _FEWEST_COLUMNS = 48, 16, 8
-# Share of the columns at either end that are taken for air, which is this flat and this alike at both ends.
+# Share of the columns at each end that counts as air; air is flat, and the same at both ends, to the second number.
 _BORDER, _FLAT = 0.04, 0.05
-# Air of transmissions is this close to 1, and an object takes so much of it away.
+# In transmissions air is this close to 1, and an object takes away at least the second share of the light.
 _NEAR_ONE, _TAKEN = 0.05, 0.4
-# Air of counts is brighter than this. Only a filler is more than the second, or less than the third.
+# In counts air is brighter than the first number. A value beyond the other two marks a bad ray.
 _DIMMEST, _BRIGHTEST = 30.0, 1e9
 _BRIGHTEST_LOGARITHM = -745.0
-# Rays that see something have more than the first; no more than half of those are darker than the second, e^-100 of
-# the light. Counts and what else is large are told from a filler for bad rays by more different values than the third.
+# A ray through matter has more than the first value; at most half of these have more than the second, e^-100 of the
+# light. Large values are counts and not marks of bad rays if there are more different ones than the third number.
 _SOMETHING, _OPAQUE, _DIFFERENT = 0.3, 100.0, 16
-# So much more light behind the object than beside it is worth a warning.
+# Warn if there is this much more light behind the object than beside it.
 _LITTLE = 0.1
-# Where the light of so many rays is e times that without an object, and hardly any ray is as much darker, that is no
-# noise and no flaw of the flat field.
+# Light is e^(first number) times that without an object, in more than the second share of the rays, and fewer than the
+# third share of them are as much darker: neither noise nor a flaw of the flat field does that.
 _SURE, _MANY, _FEW = 1.0, 0.02, 0.1
 
 
@@ -42,7 +42,7 @@ def require_line_integrals(values: np.ndarray, marked: np.ndarray | None = None)
     Parameters
     ----------
     values : (views, rows, columns) float32 array
-        Some may be neither finite nor sensible.
+        Single values may be infinite, NaN or senseless.
     marked : bool array of that shape, optional
         True for rays that are not to be used.
 
@@ -82,9 +82,9 @@ def _spread(count: int, most: int) -> np.ndarray:
 
 
 def _require_some_light(finite: np.ndarray) -> None:
-    """Refuse a scan most of whose object no light passes: counts, or logarithms times a large number."""
+    """Refuse a scan where no light passes most of the object: counts, or logarithms times a large number."""
     dark = finite[finite > _OPAQUE]
-    # Noise in air is as often negative.
+    # Noise in air is as often negative as positive, so the negative values tell how many positive ones are noise.
     dim = np.count_nonzero((finite > _SOMETHING) & (finite <= _OPAQUE)) - np.count_nonzero(
         finite < -_SOMETHING
     )
@@ -96,7 +96,7 @@ def _require_some_light(finite: np.ndarray) -> None:
 
 
 def _air(some: np.ndarray, span: float) -> float | None:
-    """The value at both ends of the columns, where it is flat and the same beside the span of all; else None."""
+    """The value of air, at both ends of the columns; None unless it is flat and the same there, against `span`."""
     (known,) = (np.isfinite(some).mean(axis=(0, 1)) > 0.5).nonzero()
     if len(known) < _FEWEST_COLUMNS:
         return None

@@ -10,7 +10,7 @@ import torch
 __all__ = ["photons_per_ray"]
 
 _VIEWS = 24
-# So many rays tell it to half a percent.
+# This many rays tell the noise to half a per cent.
 _MOST = 8_000_000
 _BINS = 16
 _LARGEST_EXPONENT = 700.0
@@ -21,8 +21,8 @@ def photons_per_ray(projections: np.ndarray | torch.Tensor) -> float:
 
     Counts that are Poisson distributed give ``-log(I/I0)`` a variance ``exp(P) / I0``. The variance is taken
     from second differences along detector rows, ``p[j-1] - 2 p[j] + p[j+1]``, whose variance is six times
-    that of a pixel, by the median absolute deviation, which edges disturb little. Structure can only add to
-    it, so the quietest bins of P speak for the noise.
+    that of a pixel. It is estimated by the median absolute deviation, which edges disturb little. Structure can only
+    add to the variance, so the quietest bins of P give the noise.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def photons_per_ray(projections: np.ndarray | torch.Tensor) -> float:
     some = some[:, :: max(1, -(-math.prod(some.shape) // _MOST))]
     some = torch.from_numpy(some.astype(np.float64)) if isinstance(some, np.ndarray) else some.double()
     difference = (some[..., 3:-1] - 2 * some[..., 2:-2] + some[..., 1:-3]).abs()
-    # The pixels beside the three: binned by its own value, a pixel's noise would be sorted away.
+    # Bins go by the pixels beside the three: if they went by a pixel's own value, its noise would be sorted away.
     middle = 0.5 * (some[..., 4:] + some[..., :-4])
     good = torch.isfinite(difference) & torch.isfinite(middle)
     difference, middle = difference[good], middle[good]
@@ -50,7 +50,7 @@ def photons_per_ray(projections: np.ndarray | torch.Tensor) -> float:
     rates = []
     for values, differences in zip(middle.tensor_split(_BINS), difference[order].tensor_split(_BINS)):
         deviation = 1.4826 * _median(differences.sort().values) / math.sqrt(6)
-        # What no float's exponential holds can be measured, if only by a broken detector.
+        # A broken detector may give values whose exponential no float can hold.
         level = min(max(_median(values), -_LARGEST_EXPONENT), _LARGEST_EXPONENT)
         rates.append(deviation**2 / math.exp(level))
     variance = sorted(rates)[_BINS // 8]

@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,12 +35,6 @@ if TYPE_CHECKING:
 
 __all__ = ["scan_from_npz", "write_npz"]
 
-NAMES = (
-    *("projections", "valid", "astra_type", "vectors", "vol_shape", "vol_window", "unit"),
-    *("energies", "spectrum", "spectrum_label", "truth_mu", "metal_mask", "e_ref", "e_eff"),
-    "carries_water_correction",
-)
-
 # Numbers that those may have whose size does not go with the scan's.
 _MOST = {
     **dict.fromkeys(("astra_type", "unit", "spectrum_label", "e_ref", "e_eff"), 1),
@@ -48,12 +43,16 @@ _MOST = {
     "carries_water_correction": 100,
     **dict.fromkeys(("energies", "spectrum"), 1_000_000),
 }
+# Of the longest kind of vectors, for each view.
+_PER_VECTOR = 13
 
 
 def scan_from_npz(path: Path, options: ReadOptions) -> Scan:
     """Read a scan; see :func:`tomo_polysplat.load_scan`."""
     options.refuse_parallel_only()
-    arrays = read_archive(path, NAMES, _MOST)
+    arrays = read_archive(path, ("projections", *_MOST), _MOST)
+    sizes = _sizes(arrays)
+    arrays |= read_archive(path, sizes, sizes)
     missing = [name for name in ("projections", "vectors", "vol_shape", "vol_window") if name not in arrays]
     if missing:
         raise fail(
@@ -81,6 +80,18 @@ def scan_from_npz(path: Path, options: ReadOptions) -> Scan:
         notes={"input": "attenuation", "rays": counts},
         **_geometry(arrays, (rows, views, columns), options),
     )
+
+
+def _sizes(arrays: dict[str, np.ndarray]) -> dict[str, int]:
+    """Numbers that those may have whose size goes with the scan's."""
+    shape, projections = arrays.get("vol_shape"), arrays.get("projections")
+    found = {}
+    if projections is not None:
+        found = {"valid": projections.size, "vectors": _PER_VECTOR * len(np.atleast_1d(projections))}
+    if shape is not None and shape.dtype.kind in "iuf":
+        voxels = math.prod(int(n) for n in shape.flat if 0 < n < 2**31)
+        found |= dict.fromkeys(("truth_mu", "metal_mask"), voxels)
+    return found
 
 
 def _geometry(

@@ -1,8 +1,8 @@
-"""Rays that no light came through, told from rays of which nothing is known.
+"""Opaque rays, which no light came through, and dead pixels, of which nothing is known.
 
-A count of 0 has no logarithm, but it says something: the ray is opaque. Left out, metal may come out hollow where it
-is thickest, as only rays past it are known. So the ray gets the value that a small part of a photon has; how little
-that weighs its noise says. A dead pixel counts 0 as well, but with light around it in most views.
+A count of 0 has no logarithm, but it tells that the ray is opaque. Without such rays metal may come out hollow where it
+is thickest, because only rays past it are left. So an opaque ray gets the logarithm of a small part of a photon. Its
+large noise gives it a small weight. A dead pixel counts 0 as well, but has light around it in most views.
 """
 
 from __future__ import annotations
@@ -16,14 +16,15 @@ from tomo_polysplat.parallel import run_tasks
 
 __all__ = ["fill_opaque"]
 
-# Photons that a ray without any is taken for. With 0.1 and 0.5, without metal / everywhere: a jaw with amalgam 39.9 /
-# 35.3 and 39.8 / 32.9 dB, two hips 29.0 / 35.4 and 28.1 / 34.0, a nail 6.1 / 34.3 and 4.3 / 34.0; left out 37.4 / 35.1,
-# 28.6 / 30.6 and 0.7 / 30.6.
+# Photons of an opaque ray. dB without metal / everywhere with 0.1, with 0.5, and with opaque rays left out:
+# jaw with amalgam 39.9 / 35.3, 39.8 / 32.9, 37.4 / 35.1; two hips 29.0 / 35.4, 28.1 / 34.0, 28.6 / 30.6;
+# nail 6.1 / 34.3, 4.3 / 34.0, 0.7 / 30.6.
 _PHOTONS = 0.1
-# Next to opaque rays there is hardly any light: the upper quartile there, as a share of the logarithm of the photons of
-# an unattenuated ray. The median is 0.48 and more beside nine of ten pieces of metal, 0.1 beside dead pixels in air.
+# Rays without light are opaque if the upper quartile of -log(I/I0) around them is this share of log(photons). The
+# median there is 0.48 and more beside nine of ten pieces of metal, and 0.1 beside dead pixels in air.
 _DARK, _QUARTILE = 0.45, 0.75
-# A pixel that counts nothing in so many views is dead, unless it looks opaque in so many of these.
+# A pixel is dead if it counts nothing in more than the first share of the views, unless it looks opaque in at least
+# the second share of these.
 _DEAD, _OPAQUE = 0.9, 0.5
 _AROUND = np.ones((3, 3))
 _STEPS = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
@@ -37,7 +38,7 @@ def fill_opaque(values: np.ndarray, photons: float) -> int:
     values : (views, rows, columns) float32 array
         -log(I/I0): infinite where no light was counted, NaN where a ray is not to be used.
     photons : float
-        Of an unattenuated ray; infinity where it is not known.
+        Photons of an unattenuated ray; infinity if not known.
     """
     without, opaque = (np.zeros(values.shape[1:], np.int32) for _ in range(2))
     known = 1 < photons < math.inf
@@ -68,7 +69,7 @@ def fill_opaque(values: np.ndarray, photons: float) -> int:
 
 
 def _surrounded(view: np.ndarray, lightless: np.ndarray, dark: float) -> np.ndarray:
-    """Which rays without light belong to a piece that dark rays surround, of however many pieces there are."""
+    """Which rays without light belong to a connected piece that dark rays surround."""
     labels, number = ndimage.label(lightless, _AROUND)
     row, column = np.nonzero(lightless)
     pairs = []
@@ -78,7 +79,7 @@ def _surrounded(view: np.ndarray, lightless: np.ndarray, dark: float) -> np.ndar
         r, c, piece = r[inside], c[inside], labels[row[inside], column[inside]]
         finite = np.isfinite(view[r, c])
         pairs.append(piece[finite].astype(np.int64) * view.size + (r * view.shape[1] + c)[finite])
-    # A ray beside several of a piece's counts once.
+    # A ray that touches several rays of a piece counts once.
     border = np.unique(np.concatenate(pairs))
     piece, place = np.divmod(border, view.size)
     around = np.bincount(piece, minlength=number + 1)

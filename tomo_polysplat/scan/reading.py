@@ -19,7 +19,7 @@ INPUT_KINDS = ("counts", "transmission", "attenuation")
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """The keyword arguments of :func:`tomo_polysplat.load_scan`, checked; None leaves it to the file."""
+    """The keyword arguments of :func:`tomo_polysplat.load_scan`, checked; None means: as the file says."""
 
     spectrum: Spectrum | None = None
     unit: str | None = None
@@ -41,7 +41,7 @@ class ReadOptions:
             raise fail("vol_geom", "a volume geometry beside proj_geom", "None")
 
     def settled_unit(self, stated: str | None, otherwise: str) -> str:
-        """Unit of the lengths: what the file states; else what the caller says; else `otherwise`."""
+        """Unit of the lengths: the file's, else the caller's, else `otherwise`."""
         if stated is not None:
             require_choice("unit stated in the file", stated, LENGTH_UNITS)
             if self.unit not in (None, stated):
@@ -50,7 +50,7 @@ class ReadOptions:
         return self.unit or otherwise
 
     def refuse_parallel_only(self) -> None:
-        """Refuse arguments that only a parallel beam without a stated geometry has a use for."""
+        """Refuse arguments that make sense only for a parallel beam without a geometry in its file."""
         for name in ("centre", "pixel_size", "theta"):
             if getattr(self, name) is not None:
                 raise fail(name, "None", "a value", "the geometry is known already and places every pixel")

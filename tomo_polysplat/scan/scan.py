@@ -29,8 +29,8 @@ class Scan:
     Parameters
     ----------
     projections : array, shape (rows, views, columns)
-        Line integrals -log(I/I0), stored as float32. Values of rays marked invalid are not used, but that they
-        are infinite where no light was seen (:attr:`usable`).
+        Line integrals -log(I/I0), stored as float32. Values of invalid rays are not used, except that infinity
+        means that no light was seen (:attr:`usable`).
     proj_geom, vol_geom : dict
         ASTRA geometries of three-dimensional type (``parallel3d``, ``parallel3d_vec``, ``cone``,
         ``cone_vec``), lengths in `unit`.
@@ -49,8 +49,8 @@ class Scan:
     valid : bool array, shape (rows, views, columns), or None
         False where a ray was not measured properly; None when every ray is good.
     water_correction : tuple of float or None
-        Coefficients c_0 = 0, c_1, ... of the polynomial in -log(I/I0) that the scanner has put
-        ``projections`` through; None when it did not.
+        Coefficients c_0 = 0, c_1, ... of the polynomial in -log(I/I0) that the scanner has applied to
+        ``projections``; None if it has applied none.
     notes : dict
         Counts and choices made while reading, such as the number of rays without light.
     """
@@ -88,7 +88,7 @@ class Scan:
             require_shape("metal_mask", self.metal_mask, self.volume_shape, "(z, y, x)")
 
     def _check_shape(self) -> None:
-        """Refuse projections of another shape than the geometry's, as far as this tells one."""
+        """Refuse projections whose shape is not that of the geometry, if the geometry states one."""
         geometry = self.proj_geom
         views = geometry.get("ProjectionAngles", geometry.get("Vectors"))
         if views is None or not {"DetectorRowCount", "DetectorColCount"} <= geometry.keys():
@@ -98,9 +98,9 @@ class Scan:
 
     @property
     def usable(self) -> np.ndarray | None:
-        """What to pass as ``valid`` of `tomo_polysplat.reconstruct`: :attr:`valid` rays, and those without light.
+        """Rays to pass as ``valid`` to `tomo_polysplat.reconstruct`: those of :attr:`valid`, and those without light.
 
-        The latter are told from dead pixels there. A mask of your own goes on top: ``scan.usable & mask``.
+        `reconstruct` tells rays without light from dead pixels. Add your own mask with ``scan.usable & mask``.
         """
         return None if self.valid is None else self.valid | np.isposinf(self.projections)
 

@@ -1,6 +1,6 @@
-"""Coordinates rounded, so that those of one scan in two units are the same.
+"""Round coordinates, so that one scan in two units has the same ones.
 
-They differ in the last bit, which a fit of many steps would make a difference of a thousandth.
+Without this they differ in the last bit, and a fit of many steps makes that a difference of a thousandth.
 """
 
 from __future__ import annotations

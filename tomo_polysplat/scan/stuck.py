@@ -6,26 +6,26 @@ import numpy as np
 
 __all__ = ["stuck_pixels"]
 
-# In fewer views a value may come again by chance, and as many pixels side by side may be something else: what lies on
-# the axis looks the same from all around, where there is no noise.
+# In fewer views a value may repeat by chance. More constant pixels side by side may be real: without noise, matter on
+# the axis looks the same from all sides.
 _FEWEST_VIEWS, _SIDE_BY_SIDE = 8, 4
-# A value as large, as a share of the largest, is that of rays without light.
+# A value above this share of the largest one is that of a ray without light.
 _OPAQUE = 0.98
-# On either side of a stuck pixel values change by so much of the largest, and on one of them by more; real ones of few
-# different counts may be constant where hardly anything changes.
+# On both sides of a stuck pixel values change by the first share of the largest, and on one side by the second share.
+# Real values with few different counts may be constant where hardly anything changes.
 _CHANGES, _CHANGES_MUCH = 0.02, 0.1
 
 
 def stuck_pixels(values: np.ndarray) -> np.ndarray:
     """Which pixels are stuck, (rows, columns): constant, between pixels of their row that change.
 
-    Values of 0 and those as large as any are not told of: air without noise is constant as well, and so are rays
+    Pixels at 0 or near the largest value are not reported: air without noise is constant, too, and so are rays
     without light.
 
     Parameters
     ----------
     values : (views, rows, columns) array
-        -log(I/I0); what is not finite is no value.
+        -log(I/I0); values that are not finite are ignored.
     """
     views, rows, columns = values.shape
     stuck = np.zeros((rows, columns), bool)
@@ -53,11 +53,11 @@ def stuck_pixels(values: np.ndarray) -> np.ndarray:
 
 
 def _runs(line: np.ndarray) -> list[tuple[int, int]]:
-    """Beginnings and ends of what is True."""
+    """Begin and end of every run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(np.int8), [0]])))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist()))
 
 
 def _range(values: np.ndarray) -> np.ndarray:
-    """Largest less least of each column, NaN not counted."""
+    """Largest minus smallest value of each column, without NaN."""
     return np.fmax.reduce(values, axis=0) - np.fmin.reduce(values, axis=0)

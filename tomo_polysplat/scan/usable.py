@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 
 # No number above 0 has a logarithm beyond this in float64.
 _LARGEST_LOGARITHM = 745.0
-# A larger share of rays left out than this is said in the log: a mask may be of the other sense.
+# Warn if more than this share of the rays is left out: the mask may be inverted.
 _MOST_LEFT_OUT = 0.2
 
 
@@ -45,7 +45,7 @@ def usable_rays(
         valid = ~np.ma.getmaskarray(projections) & (
             True if valid is None else require_array("valid", valid) > 0
         )
-    # What float32 cannot hold becomes infinite, and is counted as such.
+    # Values beyond float32 become infinite, and are counted as infinite.
     with np.errstate(over="ignore"):
         values = projections_from_astra(projections, proj_geom)
     if np.may_share_memory(values, np.asarray(projections)):
@@ -54,7 +54,7 @@ def usable_rays(
     if valid is not None:
         mask = require_array("valid", valid)
         require_shape("valid", mask, np.shape(projections), "of the projections")
-        # A curved detector is resampled: a ray that takes anything of a pixel that is not valid is not, either.
+        # A curved detector is resampled: a ray that uses any invalid pixel is invalid, too.
         whole = (mask > 0.5).astype(np.float32)
         marked = ~(projections_from_astra(whole, proj_geom) >= 1)
     require_line_integrals(values, marked)
@@ -72,7 +72,7 @@ def usable_rays(
         raise fail("projections", "at least one usable ray", "none", remedy)
     values = _uncorrected(values, water_correction, spectrum)
     if proj_geom.get("type") == "cyl_cone_vec":
-        # Resampled, a ray is infinite that takes anything of one without light.
+        # After resampling, a ray that uses any ray without light is infinite.
         values[np.isposinf(values)] = np.nan
     lightless = np.isposinf(values).any() if counts["rays_not_finite"] else False
     counts["rays_opaque"] = fill_opaque(values, photons_per_ray(values)) if lightless else 0
@@ -88,7 +88,7 @@ def usable_rays(
 
 
 def _on_host(values: Any) -> Any:
-    """A tensor without its gradients and on the host, which NumPy cannot read otherwise; anything else as it is."""
+    """A tensor on the host and without gradients, as NumPy needs it; anything else as it is."""
     return values.detach().cpu() if hasattr(values, "detach") else values
 
 
@@ -104,11 +104,11 @@ def _tell_left_out(counts: Mapping[str, int], used: int) -> None:
 
 
 def _take_out(values: np.ndarray, marked: np.ndarray | None) -> dict[str, int]:
-    """Make every ray that is not to be used NaN; how many there were of each kind, and how many are used."""
+    """Make every ray that is not to be used NaN; return how many there were of each kind, and how many are used."""
     names = ["rays_not_finite", *(["rays_marked_invalid"] if marked is not None else []), "rays_out_of_range"]
     extreme = max(float(values.max()), -float(values.min())) if values.size else 0.0
     if extreme <= _LARGEST_LOGARITHM and (marked is None or not marked.any()):
-        # As of most scans: NaN, too, would be no such extreme.
+        # As in most scans; with NaN or infinity the comparison would be False.
         return dict.fromkeys(names, 0) | {"used": values.size}
     bad = ~np.isfinite(values)
     counts = {"rays_not_finite": int(np.count_nonzero(bad))}
@@ -118,7 +118,7 @@ def _take_out(values: np.ndarray, marked: np.ndarray | None) -> dict[str, int]:
     lightless = np.isposinf(values)
     if marked is not None:
         lightless &= ~marked
-    # Those are looked at once the rest is as it was measured.
+    # Rays without light stay infinite for now: `fill_opaque` judges them.
     values[bad & ~lightless] = np.nan
     impossible = (np.abs(values) > _LARGEST_LOGARITHM) & ~lightless
     counts["rays_out_of_range"] = int(np.count_nonzero(impossible))

@@ -122,6 +122,14 @@ class Geometry:
         """The same scanner in the coordinates ``(x - centre) / length``."""
         return self.shifted(-np.asarray(centre, dtype=np.float64)).scaled(1.0 / length)
 
+    def cropped(self, rows: tuple[int, int], columns: tuple[int, int]) -> Geometry:
+        """The detector's rows and columns from the first of each pair up to, and without, the second."""
+        for name, (first, last), most in (("rows", rows, self.rows), ("columns", columns, self.columns)):
+            if not 0 <= first < last <= most:
+                raise fail(name, f"first < last, from 0 to {most}", f"{first}, {last}")
+        corner = self.corner + columns[0] * self.u + rows[0] * self.v
+        return replace(self, corner=corner, rows=rows[1] - rows[0], columns=columns[1] - columns[0])
+
     def binned(self, factor: int, row_factor: int | None = None) -> Geometry:
         """The detector with ``factor`` columns and as many rows, or ``row_factor``, joined to one.
 

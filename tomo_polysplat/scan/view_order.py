@@ -1,4 +1,4 @@
-"""An order of the views that does not depend on the one in which they come."""
+"""Sort the views, so that a volume does not depend on the order in which they come."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ __all__ = ["view_order"]
 def view_order(geometry: Geometry, projections: np.ndarray) -> np.ndarray:
     """Indices (views,) that sort the views by angle, or along the axis where the scanner moves along it.
 
-    A fit draws views at random, holds back rays by the number of their view, and adds up in floats. Sorted, the
-    views of one scan give one volume in whatever order they come.
+    A fit draws views at random, chooses held-out rays by the number of their view, and adds up floats. All of this
+    depends on the order of the views; with sorted views one scan gives one volume.
 
     Parameters
     ----------
     geometry : Geometry
         Angles are taken about z through the origin, from ASTRA's angle of zero.
     projections : (views, rows, columns) array
-        Their sums tell views of the same geometry apart, as those at 0 and 360 degrees.
+        Their sums order views of the same geometry, such as those at 0 and 360 degrees.
     """
     vectors = np.hstack([geometry.origin, geometry.corner, geometry.u, geometry.v])
     angle = np.mod(np.arctan2(geometry.origin[:, 0], -geometry.origin[:, 1]), 2 * np.pi)
     height = geometry.centre[:, 2]
-    # Turns of a helix stay apart: of neighbours each half-way round the next one, subsets would see one turn only.
+    # Turns of a helix stay apart. If they alternated, a subset of the views could see one turn only.
     moves = np.ptp(height) > geometry.rows * np.median(np.linalg.norm(geometry.v, axis=1))
     keys = [*vectors.T[::-1], angle, height if moves else np.zeros_like(height)]
     order = np.lexsort(keys)

@@ -14,9 +14,6 @@ from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 
 __all__ = ["JosephProjector"]
 
-# Memory for the adjoint's private copies of the volume, one a thread.
-_COPIES_BYTES = 2 * 1024**3
-
 
 class JosephProjector:
     """The linear map from a volume to its projections, and its adjoint.
@@ -53,64 +50,79 @@ class JosephProjector:
         """The volume (nz, ny, nx) float32 with ``<forward(x), p> = <x, adjoint(p)>``."""
         vectors = self._vectors if views is None else self._vectors[views]
         projections = np.ascontiguousarray(projections, dtype=np.float32)
-        copies = max(1, min(cpu_threads(), _COPIES_BYTES // (4 * int(np.prod(self.grid.shape)))))
+        volume = np.zeros(self.grid.shape, np.float32)
+        slabs = slabs_of(self.grid.shape, cpu_threads())
+        run_tasks(lambda axis, a, b: self._run(vectors, volume, projections, True, axis, a, b), slabs)
+        return volume
 
-        def spread(a: int, b: int) -> np.ndarray:
-            volume = np.zeros(self.grid.shape, np.float32)
-            self._run(vectors[a:b], volume, projections[a:b], True)
-            return volume
+    def _run(
+        self,
+        vectors: np.ndarray,
+        volume: np.ndarray,
+        projections: np.ndarray,
+        adjoint: bool,
+        *slab: int,
+    ) -> None:
+        axis, first, last = slab or (2, 0, volume.shape[0])
+        cone, size = self.geometry.beam == "cone", self.grid.voxel_size
+        voxels = volume.reshape(-1)
+        _trace(vectors, cone, size, voxels, volume.shape, projections, adjoint, axis, first, last)
 
-        volumes = run_tasks(spread, split_range(len(vectors), copies))
-        for other in volumes[1:]:
-            volumes[0] += other
-        return volumes[0]
 
-    def _run(self, vectors: np.ndarray, volume: np.ndarray, projections: np.ndarray, adjoint: bool) -> None:
-        size = self.grid.voxel_size
-        _trace(
-            vectors,
-            self.geometry.beam == "cone",
-            size,
-            volume.reshape(-1),
-            volume.shape,
-            projections,
-            adjoint,
-        )
+def slabs_of(shape: tuple[int, ...], parts: int) -> list[tuple[int, int, int]]:
+    """A volume (nz, ny, nx) cut into slabs: axis (0 for x) and half-open range of voxels along it.
+
+    Every voxel is in one slab, which meets the rays in the same order whichever slab it is: its sum has the same bits
+    for any number of slabs.
+    """
+    axis = int(np.argmax(shape[:2]))
+    return [(2 - axis, a, b) for a, b in split_range(shape[axis], parts)]
 
 
 @njit(nogil=True, cache=True, fastmath=True)
-def _trace(vectors, cone, size, voxels, shape, projections, adjoint):  # type: ignore[no-untyped-def]
+def _trace(vectors, cone, size, voxels, shape, projections, adjoint, axis, first, last):  # type: ignore[no-untyped-def]
+    """Project the voxels first..last along an axis (0 for x), or add to them what is projected back."""
     counts = (shape[2], shape[1], shape[0])
     strides = (1, shape[2], shape[1] * shape[2])
+    pixel, ray = np.empty(3), np.empty(3)
     for view in range(projections.shape[0]):
-        source, corner, u, v = vectors[view]
+        source, corner, u, v = vectors[view, 0], vectors[view, 1], vectors[view, 2], vectors[view, 3]
         for i in range(projections.shape[1]):
             for j in range(projections.shape[2]):
-                pixel = corner + j * u + i * v
-                ray = pixel - source if cone else source
-                m = np.argmax(np.abs(ray))
+                for c in range(3):
+                    pixel[c] = corner[c] + j * u[c] + i * v[c]
+                    ray[c] = pixel[c] - source[c] if cone else source[c]
+                m = _longest(ray)
                 a, b = (m + 1) % 3, (m + 2) % 3
                 slope_a, slope_b = ray[a] / ray[m], ray[b] / ray[m]
                 start_a, start_b = pixel[a] - pixel[m] * slope_a, pixel[b] - pixel[m] * slope_b
-                low, high = _clip(start_a, slope_a, counts[a], 0.0, counts[m] - 1.0)
-                low, high = _clip(start_b, slope_b, counts[b], low, high)
+                low, high = _clip(start_a, slope_a, 0, counts[a], 0.0, counts[m] - 1.0)
+                low, high = _clip(start_b, slope_b, 0, counts[b], low, high)
                 if cone and ray[m] > 0:
                     low = max(low, source[m])
                 elif cone:
                     high = min(high, source[m])
-                length = np.sqrt(np.sum((ray * size) ** 2)) / abs(ray[m])
+                k0, k1 = int(np.ceil(low)), int(np.floor(high)) + 1
+                if adjoint:
+                    k0, k1 = _within(k0, k1, axis, first, last, m, a, start_a, slope_a, start_b, slope_b)
+                if k0 >= k1:
+                    continue
+                a0, a1 = (first, last) if a == axis else (0, counts[a])
+                b0, b1 = (first, last) if b == axis else (0, counts[b])
+                square = (ray[0] * size[0]) ** 2 + (ray[1] * size[1]) ** 2 + (ray[2] * size[2]) ** 2
+                length = np.sqrt(square) / abs(ray[m])
                 value = projections[view, i, j] * length
                 total = 0.0
-                for k in range(int(np.ceil(low)), int(np.floor(high)) + 1):
+                for k in range(k0, k1):
                     pa, pb = start_a + k * slope_a, start_b + k * slope_b
                     ia, ib = int(np.floor(pa)), int(np.floor(pb))
                     fa, fb = pa - ia, pb - ib
                     at = k * strides[m] + ia * strides[a] + ib * strides[b]
                     for da in range(2):
-                        if 0 <= ia + da < counts[a]:
+                        if a0 <= ia + da < a1:
                             wa = fa if da else 1.0 - fa
                             for db in range(2):
-                                if 0 <= ib + db < counts[b]:
+                                if b0 <= ib + db < b1:
                                     weight = wa * (fb if db else 1.0 - fb)
                                     voxel = at + da * strides[a] + db * strides[b]
                                     if adjoint:
@@ -122,9 +134,29 @@ def _trace(vectors, cone, size, voxels, shape, projections, adjoint):  # type: i
 
 
 @njit(nogil=True, cache=True)
-def _clip(start, slope, count, low, high):  # type: ignore[no-untyped-def]
-    """The part of ``low .. high`` where ``start + k slope`` is within a voxel of the volume."""
+def _longest(ray):  # type: ignore[no-untyped-def]
+    """The axis along which a ray goes farthest, the first of equals."""
+    x, y, z = abs(ray[0]), abs(ray[1]), abs(ray[2])
+    if x >= y and x >= z:
+        return 0
+    return 1 if y >= z else 2
+
+
+@njit(nogil=True, cache=True)
+def _within(k0, k1, axis, first, last, m, a, start_a, slope_a, start_b, slope_b):  # type: ignore[no-untyped-def]
+    """The steps k0..k1 that may touch a slab; some beside it may be among them."""
+    if m == axis:
+        return max(k0, first), min(k1, last)
+    start, slope = (start_a, slope_a) if a == axis else (start_b, slope_b)
+    low, high = _clip(start, slope, first, last, k0, k1)
+    # Outwards, as rounding must not decide.
+    return max(k0, int(np.floor(low))), min(k1, int(np.ceil(high)) + 1)
+
+
+@njit(nogil=True, cache=True)
+def _clip(start, slope, first, last, low, high):  # type: ignore[no-untyped-def]
+    """The part of ``low .. high`` where ``start + k slope`` is within a voxel of those from first to last."""
     if abs(slope) < 1e-12:
-        return (low, high) if -1.0 < start < count else (1.0, 0.0)
-    k0, k1 = (-1.0 - start) / slope, (count - start) / slope
+        return (low, high) if first - 1.0 < start < last else (1.0, 0.0)
+    k0, k1 = (first - 1.0 - start) / slope, (last - start) / slope
     return max(low, min(k0, k1)), min(high, max(k0, k1))

@@ -1,4 +1,4 @@
-"""Where metal lies in a volume and in its projections, as methods that replace its rays want to know."""
+"""Find metal in a volume and in its projections, for methods that replace its rays."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class MetalTrace:
-    """Metal as a threshold finds it.
+    """Metal, found by a threshold.
 
     Attributes
     ----------
     start : (nz, ny, nx) float32
-        The smooth first reconstruction that was thresholded, in 1/unit.
+        The smooth first reconstruction to which the threshold was applied, in 1/unit.
     soft : float
         Attenuation of the object's main matter in it.
     mask : (nz, ny, nx) bool
         Its voxels of metal.
     rays : (views, rows, columns) bool
-        Rays that pass through them.
+        Rays through these voxels.
     """
 
     start: np.ndarray
@@ -49,7 +49,7 @@ def find_metal(
     level: float | None = None,
     device: str = "cpu",
 ) -> MetalTrace:
-    """Threshold a first reconstruction and project what lies above.
+    """Apply a threshold to a first reconstruction and project the voxels above it.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def find_metal(
             times,
         )
     path = forward_project(mask.astype(np.float32), geometry, grid, device=device)
-    # Half a voxel: less is the blur of the threshold's edge, and a wider trace loses more than it heals.
+    # Half a voxel of metal. Less is the blur of its edge; a wider trace would replace too many good rays.
     return MetalTrace(start, soft, mask, path > 0.5 * float(grid.voxel_size.min()))
 
 
@@ -86,5 +86,5 @@ def forward_project(
 
 
 def replace_trace(volume: np.ndarray, metal: MetalTrace) -> np.ndarray:
-    """The volume with the metal put back as the first reconstruction has it."""
+    """The volume with the metal of the first reconstruction put back."""
     return np.where(metal.mask, metal.start, volume)

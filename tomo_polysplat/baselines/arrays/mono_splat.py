@@ -1,4 +1,4 @@
-"""Gaussians without a spectrum: every energy taken for one, as R2-Gaussian (arXiv:2405.20693) does."""
+"""Gaussians without a spectrum: one energy for all, as in R2-Gaussian (arXiv:2405.20693)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def mono_splat(
     Returns
     -------
     Result
-        Whose ``volume`` (nz, ny, nx) is in 1/unit.
+        Its ``volume`` (nz, ny, nx) is in 1/unit.
     """
     proj_geom, vol_geom = to_astra(geometry, grid)
     ordered = np.ascontiguousarray(projections.swapaxes(0, 1))

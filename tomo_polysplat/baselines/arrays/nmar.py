@@ -29,7 +29,7 @@ def nmar(
 ) -> np.ndarray:
     """Normalised metal artefact reduction (Meyer et al. 2010, doi:10.1118/1.3484090).
 
-    The prior is the interpolated reconstruction with air and soft matter made uniform and bone kept.
+    The prior is the interpolated reconstruction, with air and soft matter made uniform. Bone stays as it is.
     Parameters and result are those of :func:`tomo_polysplat.baselines.arrays.limar.limar`.
     """
     corrected = water_corrected(projections, spectrum)

@@ -1,4 +1,4 @@
-"""SIRT: the least-squares volume that the measured line integrals allow, with nothing known of energies."""
+"""SIRT: the least-squares volume of the line integrals, without a model of energies."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def sirt(
         ``-log(I / I0)``; NaN is left out.
     geometry, grid : Geometry, VolumeGrid
     iterations : int
-        Times that every view is used.
+        How often every view is used.
     subsets : int
-        Groups of views that are each followed by an update; ASTRA's takes all views at once.
+        Groups of views; the volume is updated after each. ASTRA's SIRT takes all views at once.
     device : {"cpu", "cuda", "cuda:N"}
         On a GPU, ASTRA's SIRT3D_CUDA.
 
@@ -56,7 +56,7 @@ def _sirt_cuda(
     data, algorithm = [], None
 
     def link(kind: str, array: np.ndarray) -> int:
-        # This algorithm wants its data in host memory, and copies it once; the arrays are shared with it.
+        # This algorithm needs its data in host memory and copies it once; it shares these arrays.
         data.append(astra.data3d.link(kind, vol_geom if kind == "-vol" else proj_geom, array))
         return data[-1]
 

@@ -1,4 +1,4 @@
-"""Voxels with an attenuation and a material number each: what Gaussians describe, described by voxels."""
+"""The unknowns of the voxel baseline: an attenuation and a material number for each voxel."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ class VoxelModel:
     own : (free,) tensor
         Material number of the voxels that have one to fit.
     size : (nz, ny, nx) tensor
-        What the attenuation of a voxel is measured by, so that one step means as much in metal as in water.
+        Unit of the attenuation of each voxel, so that one step means as much in metal as in water.
     fixed : (nz * ny * nx,) tensor
         Material number of every voxel, used for those that are not free.
     free : (free,) int64 tensor
-        Flat indices of the free voxels: near dense matter, where the start cannot tell what is what. Free
-        everywhere, soft matter would trade density for material.
+        Flat indices of the voxels whose material number is fitted: those near dense matter, where the start does not
+        tell materials. If all were free, density and material number of soft matter would drift against each other.
     """
 
     relative: torch.Tensor
@@ -40,11 +40,11 @@ class VoxelModel:
     free: torch.Tensor
 
     def copy(self) -> VoxelModel:
-        """With copies of what is fitted."""
+        """A model with copies of the fitted tensors."""
         return replace(self, relative=self.relative.detach().clone(), own=self.own.detach().clone())
 
     def finite(self) -> bool:
-        """Whether what is fitted is finite."""
+        """Whether the fitted tensors are finite."""
         return all(bool(torch.isfinite(tensor).all()) for tensor in (self.relative, self.own))
 
     def weights(self, curve: torch.Tensor) -> torch.Tensor:
@@ -59,7 +59,7 @@ class VoxelModel:
 
     @torch.no_grad()
     def hold(self) -> None:
-        """Back within what matter can be."""
+        """Clamp the fitted tensors to physical values."""
         self.relative.clamp_(min=0.0)
         self.own.clamp_(0.0, 1.0)
 

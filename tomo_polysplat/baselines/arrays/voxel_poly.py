@@ -15,16 +15,16 @@ import torch
 
 from tomo_polysplat.baselines.arrays.voxel_model import VoxelModel, start_voxels
 from tomo_polysplat.fit.loss import misfit, total_variation
+from tomo_polysplat.fit.problem import OPAQUE
 from tomo_polysplat.fit.rays import Rays
-from tomo_polysplat.fit.spectral_model import OPAQUE
 from tomo_polysplat.fit.step import held_out_mean
-from tomo_polysplat.fit.stopping import FitState, Watch, is_true, patience_of
-from tomo_polysplat.fit.texture import tv_corners
+from tomo_polysplat.fit.stopping import FitState, Watch, is_true, usual_patience
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.quadrature import fit_quadrature
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.transmission import polychromatic_projection
 from tomo_polysplat.physics.water import areal_density, transmitted_energy
+from tomo_polysplat.plan.decisions.tv_corner import tv_corners
 from tomo_polysplat.render.renderer import detector_views
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.scan.noise import photons_per_ray
@@ -122,7 +122,7 @@ class _Fit:
         self.model, self.pair, self.settings, self.cm = model, pair, settings, cm_per(unit)
         values = np.where(np.isfinite(projections), projections, np.float32(np.nan))
         largest = float(np.clip(np.nanmax(values), 1.0, OPAQUE))
-        self.quadrature = fit_quadrature(spectrum, materials, largest, settings.spectral_nodes or None)
+        self.quadrature = fit_quadrature(spectrum, materials, largest, settings.spectral_nodes)
         target = model.relative.device
         energies = [transmitted_energy(values, spectrum), spectrum.effective_energy]
         curves = materials.mass_attenuation(energies)
@@ -159,7 +159,7 @@ class _Fit:
         groups = _interleaved(len(self.rays.views))
         passes = self.settings.passes or _PASSES
         steps = math.ceil(passes * len(groups))
-        watch: Watch[VoxelModel] = Watch(patience_of(self.settings, passes))
+        watch: Watch[VoxelModel] = Watch(self.settings.patience or usual_patience(passes))
 
         def share() -> float:
             used = 0.0 if deadline is None else (time.perf_counter() - begun) / max(deadline - begun, 1e-9)

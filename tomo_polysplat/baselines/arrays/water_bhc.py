@@ -1,4 +1,4 @@
-"""Filtered backprojection after the usual beam-hardening correction for water."""
+"""Filtered backprojection after the common beam-hardening correction for water."""
 
 from __future__ import annotations
 
@@ -30,5 +30,5 @@ def water_bhc(
 
 
 def water_corrected(projections: np.ndarray, spectrum: Spectrum | None) -> np.ndarray:
-    """Projections as a monochromatic scan of water would have them; unchanged without a spectrum."""
+    """Projections corrected to those of a monochromatic scan of water; unchanged without a spectrum."""
     return projections if spectrum is None else water_linearised(projections, spectrum).astype(np.float32)

@@ -53,7 +53,7 @@ def _uniform(device: str) -> Findings:
     findings = sound(result)
     left = _line_integrals(result, geometry) - projections_from_astra(values, scan.proj_geom)
     findings.at_most("rms of P left", float(np.sqrt(np.mean(left**2))), explains(classical, scan))
-    told = "the object reaches beyond the detector and the volume" in result.plan["window"]
+    told = "the object reaches beyond the detector and the volume" in result.plan["window"].why
     findings.equal("what lies beside the window is told", told, True)
     return findings
 

@@ -21,15 +21,16 @@ from tomo_polysplat.bench.hard_cases.easy import (
 )
 from tomo_polysplat.bench.hard_cases.gaussians import compare_precisions
 from tomo_polysplat.bench.hard_cases.same import relative_rms
-from tomo_polysplat.fit.first_gaussians import first_gaussians
-from tomo_polysplat.fit.first_volume import first_volume
 from tomo_polysplat.fit.optimise import fit as optimise
-from tomo_polysplat.fit.plan import make_plan
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.quadrature import fit_quadrature
 from tomo_polysplat.physics.transmission import polychromatic_projection
+from tomo_polysplat.plan.first_gaussians import first_gaussians
+from tomo_polysplat.plan.first_volume import first_volume
+from tomo_polysplat.plan.model import rays_of, scene_of
+from tomo_polysplat.plan.order import plan_from_start
 from tomo_polysplat.render.renderer import detector_views
 from tomo_polysplat.scan.geometry import from_astra, projections_from_astra
 from tomo_polysplat.scan.scan import Scan
@@ -82,9 +83,9 @@ def _fit_in(scan: Scan, dtype: torch.dtype) -> np.ndarray:
     values = projections_from_astra(scan.projections, scan.proj_geom)
     problem = Problem.of(values.copy(), geometry, grid, "cm", scan.spectrum, None)
     start, _ = first_volume(problem, target, settings)
-    plan = make_plan(start, problem, settings, "cpu")
-    scene, rays = problem.scene(plan, settings, target), problem.rays(plan, settings, target)
-    seeds = first_gaussians(start, plan, problem, settings, target)
+    plan = plan_from_start(start, problem, settings, target)
+    scene, rays = scene_of(problem, plan, settings, target), rays_of(problem, plan, settings, target)
+    seeds, _ = first_gaussians(start, plan, problem, settings, target)
     curves = {name: getattr(scene, name).to(dtype) for name in ("reference_curve", "output_curve")}
     scene, rays = replace(scene, **curves), replace(rays, projections=rays.projections.to(dtype))
     parts = {field.name: getattr(seeds, field.name) for field in fields(seeds)}

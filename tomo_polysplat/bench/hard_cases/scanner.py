@@ -101,7 +101,7 @@ def _source_near(device: str) -> Findings:
     result = fit(scan, device)
     findings = sound(result)
     findings.at_least("PSNR, dB", psnr_of(result.volume, scan), sirt_psnr(scan) - SPREAD_OF_A_SLICE)
-    findings.equal("what is left out is told", "beyond the sources" in result.plan["start"], True)
+    findings.equal("what is left out is told", "beyond the sources" in result.plan["start"].value, True)
     return findings
 
 

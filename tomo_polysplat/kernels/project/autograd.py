@@ -22,27 +22,31 @@ def project(
     *,
     kernel: str,
     cutoff: float,
+    vectors: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, int]:
     """Line integrals of weighted Gaussians over every pixel; arguments and results as in ``reference.project``.
 
-    ``kernel`` is ``"reference"``, ``"numba"`` or ``"triton"``; the compiled ones take float32 only.
+    ``kernel`` is ``"reference"``, ``"numba"`` or ``"triton"``; the compiled ones take float32 only. ``vectors``,
+    (views, 4, 3) float64 on the CPU, take the place of ``views.vectors`` and get a gradient.
     """
+    if vectors is not None:
+        views = views.moved(vectors.detach().numpy())
     if kernel == "reference":
-        return reference.project(position, scale, rotation, weight, views, cutoff)
+        return reference.project(position, scale, rotation, weight, views, cutoff, vectors)
     skipped: Any  # on the device, for the triton kernel: reading it would wait for the device
     if kernel == "triton":
         from tomo_polysplat.kernels.project import triton_kernel
 
-        image, skipped = triton_kernel.project(position, scale, rotation, weight, views, cutoff)
+        image, skipped = triton_kernel.project(position, scale, rotation, weight, views, cutoff, vectors)
         return image, skipped
-    image, skipped = _NumbaProject.apply(position, scale, rotation, weight, views, cutoff)
-    factor = math.sqrt(2 * math.pi) * views.ray_lengths(position.device, position.dtype)
+    image, skipped = _NumbaProject.apply(position, scale, rotation, weight, views, cutoff, vectors)
+    factor = math.sqrt(2 * math.pi) * views.ray_lengths(position.device, position.dtype, vectors)
     return image * factor, skipped
 
 
 class _NumbaProject(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, position, scale, rotation, weight, views, cutoff):
+    def forward(ctx, position, scale, rotation, weight, views, cutoff, vectors):
         from tomo_polysplat.kernels.project import numba_kernel
 
         arrays = [t.detach().contiguous().numpy() for t in (position, scale, rotation, weight)]
@@ -57,6 +61,8 @@ class _NumbaProject(torch.autograd.Function):
 
         position, scale, rotation, weight = ctx.arrays
         grads = numba_kernel.backward(
-            position, scale, rotation, weight, ctx.views, ctx.cutoff, ctx.state, grad_image.numpy()
-        )
-        return (*map(torch.from_numpy, grads), None, None)
+            position, scale, rotation, weight, ctx.views, ctx.cutoff, ctx.state, grad_image.numpy(),
+            of_views=ctx.needs_input_grad[6],
+        )  # fmt: skip
+        of_views = torch.from_numpy(grads[4]) if ctx.needs_input_grad[6] else None
+        return (*map(torch.from_numpy, grads[:4]), None, None, of_views)

@@ -14,7 +14,7 @@ from numba import njit
 
 from tomo_polysplat.kernels.project.numba_group import GROUP, SIZE, matrix_of, put, put_group, three
 
-__all__ = ["MOMENTS", "RECORD", "pull_back", "ray_frame", "rows_of", "set_up"]
+__all__ = ["MOMENTS", "RECORD", "pull_back", "pull_back_view", "ray_frame", "rows_of", "set_up"]
 
 RECORD = 12  # numbers of a footprint, in the order of _described
 MOMENTS = 11  # sums over a footprint, in the order read by pull_back
@@ -181,13 +181,13 @@ def set_up(
 
 
 @_step
-def pull_back(cone, planar, frame, inverse, matrix, white, m):
-    """dL/dposition (3) and dL/dW (9, row by row) of one view, from the moments ``m`` of its footprint.
+def _slopes(cone, planar, frame, m):
+    """dL/d(column, row, depth) of the centre and dL/d(W r), dL/d(W U), dL/d(W V), from moments of a footprint.
 
     With t = r11 x + r12 y and u = r22 y, m holds the sums of h (t, u, t^2, t u, u^2) and of
     s (1, t, u, t^2, t u, u^2), where h = dL/d(distance^2 |e|^2) and s = dL/d|e|^2.
     """
-    (column0, row0, kappa), r, w, wu, wv = frame
+    (column0, row0, kappa), _, w, wu, wv = frame
     (m0, m1, m2), (m3, m4, m5), (m6, m7, m8), (m9, m10, _) = m
     q1, q2, r11, r12, r22 = _triangle(_cross(w, wu), _cross(w, wv))
     # x = by_t t - back u, y = by_u u.
@@ -211,19 +211,51 @@ def pull_back(cone, planar, frame, inverse, matrix, white, m):
         g_column -= _dot(g_e, wu)
         g_row = 0.0 if planar else g_row - _dot(g_e, wv)
         g_depth = -kappa * (g_column * column0 + g_row * row0 + kappa * _dot(g_e, w))
-        point = _mix(g_w[0], white[0], g_w[1], white[1])
-        point = _mix(1.0, point, g_w[2], white[2])
-        point = _mix(1.0, point, kappa * g_column, inverse[0])
-        point = _mix(1.0, point, kappa * g_row, inverse[1])
-        point = _mix(1.0, point, g_depth, inverse[2])
     else:
         g_row = 0.0 if planar else g_row
+        g_depth = 0.0
         g_w = _mix(1.0, g_w, 2 * m5, w)
+    return (kappa * g_column, kappa * g_row, g_depth), g_w, g_wu, g_wv
+
+
+@_step
+def pull_back(cone, planar, frame, inverse, matrix, white, m):
+    """dL/dposition (3) and dL/dW (9, row by row) of one view, from the moments ``m`` of its footprint."""
+    (g_column, g_row, g_depth), g_w, g_wu, g_wv = _slopes(cone, planar, frame, m)
+    if cone:
+        point = _mix(g_w[0], white[0], g_w[1], white[1])
+        point = _mix(1.0, point, g_w[2], white[2])
+        point = _mix(1.0, point, g_column, inverse[0])
+        point = _mix(1.0, point, g_row, inverse[1])
+        point = _mix(1.0, point, g_depth, inverse[2])
+    else:
         point = _mix(g_column, inverse[0], g_row, inverse[1])
-    u, v = _column(matrix, 0), _column(matrix, 1)
+    r, u, v = frame[1], _column(matrix, 0), _column(matrix, 1)
     rows = (
         _mix(1.0, _mix(g_w[0], r, g_wu[0], u), g_wv[0], v),
         _mix(1.0, _mix(g_w[1], r, g_wu[1], u), g_wv[1], v),
         _mix(1.0, _mix(g_w[2], r, g_wu[2], u), g_wv[2], v),
     )
     return point, rows
+
+
+@_step
+def _back(white, x):
+    """W^T x."""
+    return _mix(1.0, _mix(x[0], white[0], x[1], white[1]), x[2], white[2])
+
+
+@_step
+def pull_back_view(cone, planar, point, frame, origin, inverse, white, m):
+    """dL/d(origin, U, V, D) of a view, as far as the Gaussian at ``point`` makes it, from its moments ``m``.
+
+    The image of the offset p - o under the inverse is (a, b, c), and that of dL/d(a, b, c) under its transpose is t:
+    then the inverse's part of dL/d(U, V, D) is -(a, b, c) t.
+    """
+    (g_column, g_row, g_depth), g_w, g_wu, g_wv = _slopes(cone, planar, frame, m)
+    t = _mix(1.0, _mix(g_column, inverse[0], g_row, inverse[1]), g_depth, inverse[2])
+    a, b, c = _apply(inverse, (point[0] - origin[0], point[1] - origin[1], point[2] - origin[2]))
+    along, by_u, by_v = _back(white, g_w), _back(white, g_wu), _back(white, g_wv)
+    # w is W (p - o) in a cone, and W D where rays are parallel.
+    by_origin = _mix(-1.0, t, -1.0 if cone else 0.0, along)
+    return by_origin, _mix(1.0, by_u, -a, t), _mix(1.0, by_v, -b, t), _mix(0.0 if cone else 1.0, along, -c, t)

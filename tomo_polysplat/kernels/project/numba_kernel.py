@@ -17,6 +17,7 @@ from tomo_polysplat.kernels.project.numba_footprint import (
     MOMENTS,
     RECORD,
     pull_back,
+    pull_back_view,
     ray_frame,
     rows_of,
     set_up,
@@ -172,12 +173,30 @@ def _take_back(cone, planar, origin, inverse, matrix, group, moments, grads):
         add_where(seen, grads, 9, k, rows[2])
 
 
+@njit(inline="always")
+def _take_back_view(cone, planar, origin, inverse, matrix, group, moments, sums):
+    """Fill ``sums`` (12) with dL/d(origin, U, V, D) of a view, summed over a group."""
+    sums[:] = 0.0
+    for k in range(GROUP):
+        m = three(moments, 0, k), three(moments, 3, k), three(moments, 6, k), three(moments, 9, k)
+        if m[3][2] > 0.0:
+            white, point = matrix_of(group, 6, k), three(group, 0, k)
+            frame = ray_frame(point, cone, origin, inverse, matrix, white)
+            parts = pull_back_view(cone, planar, point, frame, origin, inverse, white, m)
+            for a in range(3):
+                sums[a] += parts[0][a]
+                sums[3 + a] += parts[1][a]
+                sums[6 + a] += parts[2][a]
+                sums[9 + a] += parts[3][a]
+
+
 @njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def _gather_range(
     start, stop, position, scale, rotation, weight, cone, planar, origin, inverse, matrix, cutoff, columns,
-    record, span, grad_image, grad_position, grad_scale, grad_rotation, grad_weight,
+    record, span, grad_image, grad_position, grad_scale, grad_rotation, grad_weight, grad_views,
 ):  # fmt: skip
-    """The gradients of the Gaussians start..stop, summed over the views."""
+    """The gradients of the Gaussians start..stop, summed over the views, and where there is room for them
+    (groups, views, 12) those of the views, summed over each group: ``start`` begins one."""
     white, grad_white = np.empty((3, 3)), np.empty((3, 3))
     value, total = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
     # As many sums as `lane_sums` makes at once.
@@ -203,7 +222,11 @@ def _gather_range(
                         of_group[m * GROUP + k] = sums[m]
                     of_group[MOMENTS * GROUP + k] = 1.0
             place = origin[v, 0], origin[v, 1], origin[v, 2]
-            _take_back(cone, planar, place, rows_of(inverse[v]), rows_of(matrix[v]), group, of_group, grads)
+            inverted, direct = rows_of(inverse[v]), rows_of(matrix[v])
+            _take_back(cone, planar, place, inverted, direct, group, of_group, grads)
+            if len(grad_views):
+                of_view = grad_views[first // GROUP, v]
+                _take_back_view(cone, planar, place, inverted, direct, group, of_group, of_view)
         for k in range(some):
             n = first + k
             for a in range(3):
@@ -233,15 +256,24 @@ def forward(position, scale, rotation, weight, views: DetectorViews, cutoff: flo
     return image[..., : views.columns].transpose(2, 0, 1, 3), skipped, (record, span, inverse)
 
 
-def backward(position, scale, rotation, weight, views: DetectorViews, cutoff: float, state, grad_image):
-    """Gradients of position, scale, rotation and weight for ``grad_image`` (channels, views, rows, columns)."""
+def backward(
+    position, scale, rotation, weight, views: DetectorViews, cutoff: float, state, grad_image, of_views=False
+):
+    """Gradients of position, scale, rotation and weight for ``grad_image`` (channels, views, rows, columns).
+
+    With ``of_views`` that of ``views.vectors`` comes fifth, (views, 4, 3) float64, without what the pixel factor adds.
+    """
     record, span, inverse = state
     padded = np.zeros((len(views), views.rows, len(weight), views.columns + LANES), np.float32)
     padded[..., : views.columns] = grad_image.transpose(1, 2, 0, 3)
     grads = tuple(np.zeros_like(a) for a in (position, scale, rotation, weight))
+    groups = -(-len(position) // GROUP)
+    # Sums of groups, so that the order of all additions is the same for any number of threads.
+    by_group = np.zeros((groups if of_views else 0, len(views), 12))
     scene = (position, scale, rotation, weight, views.cone, views.planar, views.origin, inverse, views.matrix)
+    rest = (*scene, cutoff, views.columns, record, span, padded, *grads, by_group)
     run_tasks(
-        lambda a, b: _gather_range(a, b, *scene, cutoff, views.columns, record, span, padded, *grads),
-        split_range(len(position), 16 * cpu_threads()),
+        lambda a, b: _gather_range(a * GROUP, min(b * GROUP, len(position)), *rest),
+        split_range(groups, 16 * cpu_threads()),
     )
-    return grads
+    return (*grads, by_group.sum(axis=0).reshape(-1, 4, 3)) if of_views else grads

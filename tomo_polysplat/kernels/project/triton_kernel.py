@@ -15,7 +15,7 @@ from tomo_polysplat.kernels.project.triton_image import finish_image, lay_out_gr
 from tomo_polysplat.kernels.project.triton_pull_back import pull_back
 from tomo_polysplat.kernels.project.triton_setup import footprints
 from tomo_polysplat.kernels.triton_maths import require_scene
-from tomo_polysplat.kernels.views import DetectorViews
+from tomo_polysplat.kernels.views import DetectorViews, length_gradient
 
 __all__ = ["project"]
 
@@ -27,8 +27,9 @@ def project(
     weight: torch.Tensor,
     views: DetectorViews,
     cutoff: float,
+    vectors: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Line integrals of weighted Gaussians; arguments as for the reference.
+    """Line integrals of weighted Gaussians; arguments as for the reference, ``vectors`` on the CPU.
 
     Returns
     -------
@@ -42,12 +43,12 @@ def project(
         If a tensor is not float32 or there are more than four channels.
     """
     require_scene(position, scale, rotation, weight)
-    return _Project.apply(position, scale, rotation, weight, views, cutoff)
+    return _Project.apply(position, scale, rotation, weight, views, cutoff, vectors)
 
 
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, position, scale, rotation, weight, views, cutoff):
+    def forward(ctx, position, scale, rotation, weight, views, cutoff, vectors):
         position, scale, rotation, weight = (
             t.detach().contiguous() for t in (position, scale, rotation, weight)
         )
@@ -55,17 +56,25 @@ class _Project(torch.autograd.Function):
         skipped = torch.zeros((), dtype=torch.int64, device=position.device)
         record = footprints(position, scale, rotation, weight, views, table, cutoff, skipped)
         image = finish_image(splat(record, len(weight), views, cutoff), table, len(weight), views)
-        ctx.save_for_backward(position, scale, rotation, weight, table, record)
+        # The image is read again only for what the factor of its pixels adds to the gradient of the vectors.
+        kept = image if ctx.needs_input_grad[6] else None
+        ctx.save_for_backward(position, scale, rotation, weight, table, record, kept)
         ctx.views = views
         ctx.mark_non_differentiable(skipped)
         return image, skipped
 
     @staticmethod
     def backward(ctx, grad_image, _):
-        position, scale, rotation, weight, table, record = ctx.saved_tensors
+        position, scale, rotation, weight, table, record, image = ctx.saved_tensors
+        of_views = ctx.needs_input_grad[6]
         if not (record.numel() and grad_image.numel()):
-            return (*map(torch.zeros_like, (position, scale, rotation, weight)), None, None)
+            nothing = torch.zeros((len(ctx.views), 4, 3), dtype=torch.float64) if of_views else None
+            return (*map(torch.zeros_like, (position, scale, rotation, weight)), None, None, nothing)
         pixels = lay_out_gradient(grad_image, table, ctx.views)
         moments = sum_moments(record, pixels, len(grad_image), ctx.views)
-        grads = pull_back(position, scale, rotation, weight, table, ctx.views, moments)
-        return (*grads, None, None)
+        scene = (position, scale, rotation, weight)
+        if not of_views:
+            return (*pull_back(*scene, table, ctx.views, moments), None, None, None)
+        *grads, of_vectors = pull_back(*scene, table, ctx.views, moments, of_views=True)
+        of_vectors = of_vectors + length_gradient((grad_image * image).sum(dim=0), ctx.views)
+        return (*grads, None, None, of_vectors.cpu())

@@ -57,11 +57,25 @@ def _mix(a, x0, x1, x2, b, y0, y1, y2):
     return a * x0 + b * y0, a * x1 + b * y1, a * x2 + b * y2
 
 
+@triton.jit
+def _back(m00, m01, m02, m10, m11, m12, m20, m21, m22, x0, x1, x2):
+    """W^T x."""
+    return dot(m00, m10, m20, x0, x1, x2), dot(m01, m11, m21, x0, x1, x2), dot(m02, m12, m22, x0, x1, x2)
+
+
+@triton.jit
+def _add_up(to, x0, x1, x2, seen):
+    """Store three sums over the Gaussians that are seen; of others there may be no number."""
+    tl.store(to, tl.sum(tl.where(seen, x0, 0.0), 0))
+    tl.store(to + 1, tl.sum(tl.where(seen, x1, 0.0), 0))
+    tl.store(to + 2, tl.sum(tl.where(seen, x2, 0.0), 0))
+
+
 @triton.jit(do_not_specialize=SIZES)
 def _pull_back_kernel(
     position, scale, rotation, views, moments,
-    grad_position, grad_scale, grad_rotation, grad_weight, count, beyond, many,
-    CHANNELS: tl.constexpr, CONE: tl.constexpr, PLANAR: tl.constexpr, BLOCK: tl.constexpr,
+    grad_position, grad_scale, grad_rotation, grad_weight, grad_views, count, beyond, many,
+    CHANNELS: tl.constexpr, CONE: tl.constexpr, PLANAR: tl.constexpr, OF_VIEWS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = n < count
@@ -74,11 +88,13 @@ def _pull_back_kernel(
     G00, G01, G02, G10, G11, G12, G20, G21, G22 = none, none, none, none, none, none, none, none, none
     P0, P1, P2 = none, none, none
     C0, C1, C2, C3 = none, none, none, none
+    if OF_VIEWS:
+        grad_views += tl.program_id(0).to(tl.int64) * many * 12
     for _view in range(many):
         k0, k1, k2, k3, k4, k5, k6, k7, k8, k9, k10, k11, c1, c2, c3, unit = _load_moments(sums)
         seen, inverse = live & (unit > 0), unit.to(tl.float64)
         (
-            _, kappa, column, row, r0, r1, r2, w0, w1, w2, a0, a1, a2, b0, b1, b2,
+            depth, kappa, column, row, r0, r1, r2, w0, w1, w2, a0, a1, a2, b0, b1, b2,
             nu0, nu1, nu2, nv0, nv1, nv2,
         ) = chain(p0, p1, p2, at, m00, m01, m02, m10, m11, m12, m20, m21, m22, CONE)  # fmt: skip
         # dL/d(distance^2 |e|^2) = -h / 2 and dL/d|e|^2 = -s / 2, here doubled: every use has a factor 2. The
@@ -153,6 +169,25 @@ def _pull_back_kernel(
         P0 += dot(tl.load(at + 3), tl.load(at + 6), tl.load(at + 9), g_column, g_row, g_depth)
         P1 += dot(tl.load(at + 4), tl.load(at + 7), tl.load(at + 10), g_column, g_row, g_depth)
         P2 += dot(tl.load(at + 5), tl.load(at + 8), tl.load(at + 11), g_column, g_row, g_depth)
+        if OF_VIEWS:
+            # The offset of the Gaussian is (a, b, c) under the inverse, and (g_column, g_row, g_depth) is t under its
+            # transpose: the inverse's part of dL/d(U, V, D) is -(a, b, c) t.
+            t0 = dot(tl.load(at + 3), tl.load(at + 6), tl.load(at + 9), g_column, g_row, g_depth)
+            t1 = dot(tl.load(at + 4), tl.load(at + 7), tl.load(at + 10), g_column, g_row, g_depth)
+            t2 = dot(tl.load(at + 5), tl.load(at + 8), tl.load(at + 11), g_column, g_row, g_depth)
+            a, b = column / kappa, row / kappa
+            e0, e1, e2 = _back(m00, m01, m02, m10, m11, m12, m20, m21, m22, gw0, gw1, gw2)
+            if CONE:
+                _add_up(grad_views, -t0 - e0, -t1 - e1, -t2 - e2, seen)
+                _add_up(grad_views + 9, -depth * t0, -depth * t1, -depth * t2, seen)
+            else:
+                _add_up(grad_views, -t0, -t1, -t2, seen)
+                _add_up(grad_views + 9, e0 - depth * t0, e1 - depth * t1, e2 - depth * t2, seen)
+            e0, e1, e2 = _back(m00, m01, m02, m10, m11, m12, m20, m21, m22, ga0, ga1, ga2)
+            _add_up(grad_views + 3, e0 - a * t0, e1 - a * t1, e2 - a * t2, seen)
+            e0, e1, e2 = _back(m00, m01, m02, m10, m11, m12, m20, m21, m22, gb0, gb1, gb2)
+            _add_up(grad_views + 6, e0 - b * t0, e1 - b * t1, e2 - b * t2, seen)
+            grad_views += 12
         at += VIEW
         sums += tl.cast(beyond, tl.int64) * SUMS
     tl.store(grad_position + n * 3, P0.to(tl.float32), mask=live)
@@ -172,14 +207,30 @@ def _pull_back_kernel(
 
 
 def pull_back(
-    position, scale, rotation, weight, table: torch.Tensor, views: DetectorViews, moments
+    position,
+    scale,
+    rotation,
+    weight,
+    table: torch.Tensor,
+    views: DetectorViews,
+    moments,
+    *,
+    of_views: bool = False,
 ) -> tuple[torch.Tensor, ...]:
-    """Gradients of position, scale, rotation and weight from the moments, summed over the views."""
+    """Gradients of position, scale, rotation and weight from the moments, summed over the views.
+
+    With ``of_views`` that of ``views.vectors`` comes fifth, (views, 4, 3) float64, without what the length of the
+    pixels' rays adds (`tomo_polysplat.kernels.views.length_gradient`).
+    """
     grads = tuple(torch.empty_like(t) for t in (position, scale, rotation, weight))
+    programs = triton.cdiv(len(position), _BLOCK)
+    shape = (programs, len(views), 12) if of_views else (0,)
+    by_program = torch.empty(shape, dtype=torch.float64, device=position.device)
     with on_device(position):
-        _pull_back_kernel[(triton.cdiv(len(position), _BLOCK),)](
-            position, scale, rotation, table, moments, *grads, len(position), moments.shape[1], len(views),
-            CHANNELS=len(weight), CONE=views.cone, PLANAR=views.planar, BLOCK=_BLOCK, num_warps=2,
-            maxnreg=_REGISTERS[len(views) > 1],
+        _pull_back_kernel[(programs,)](
+            position, scale, rotation, table, moments, *grads, by_program,
+            len(position), moments.shape[1], len(views),
+            CHANNELS=len(weight), CONE=views.cone, PLANAR=views.planar, OF_VIEWS=of_views, BLOCK=_BLOCK,
+            num_warps=2, maxnreg=255 if of_views else _REGISTERS[len(views) > 1],
         )  # fmt: skip
-    return grads
+    return (*grads, by_program.sum(dim=0).reshape(-1, 4, 3)) if of_views else grads

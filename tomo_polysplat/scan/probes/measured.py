@@ -1,8 +1,8 @@
-"""What the probes look at, and what they answer."""
+"""What the probes look at, computed once."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -10,55 +10,35 @@ import numpy as np
 from tomo_polysplat.scan.defects import fill_invalid
 from tomo_polysplat.scan.dropouts import dropped_rays
 from tomo_polysplat.scan.geometry import Geometry, from_astra
+from tomo_polysplat.scan.probes.air import Air, look_for_air
 from tomo_polysplat.scan.scan import Scan
+from tomo_polysplat.scan.volume_grid import VolumeGrid
 
-__all__ = ["Finding", "Measured"]
+__all__ = ["Measured"]
 
-# Rows and views that a probe of the whole scan looks at, evenly spread.
+# Rows that a probe of the whole scan looks at, evenly spread.
 _MOST_ROWS = 32
 
 
 @dataclass(frozen=True)
-class Finding:
-    """The answer of one probe.
-
-    Attributes
-    ----------
-    probe : str
-        What was looked for.
-    verdict : {"ok", "defect", "unknown"}
-        "unknown" where the scan cannot tell; the text says why.
-    text : str
-        What was found.
-    remedy : str
-        How to mend a defect.
-    values : dict
-        The numbers behind it.
-    """
-
-    probe: str
-    verdict: str
-    text: str
-    remedy: str = ""
-    values: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def misleading(self) -> bool:
-        """Whether it would mislead other probes: any defect but one of a few views."""
-        return self.verdict == "defect" and self.values.get("misplaced", 1.0) > 0.1
-
-
-@dataclass(frozen=True)
 class Measured:
-    """A scan with what several probes need of it, computed once."""
+    """A scan with what several probes need of it."""
 
     scan: Scan
     dead_pixels: np.ndarray | None = None
     """Pixels not to look at, (rows, columns)."""
 
     @cached_property
+    def _told(self) -> tuple[Geometry, VolumeGrid]:
+        return from_astra(self.scan.proj_geom, self.scan.vol_geom)
+
+    @property
     def geometry(self) -> Geometry:
-        return from_astra(self.scan.proj_geom, self.scan.vol_geom)[0]
+        return self._told[0]
+
+    @property
+    def grid(self) -> VolumeGrid:
+        return self._told[1]
 
     @cached_property
     def valid(self) -> np.ndarray:
@@ -71,18 +51,55 @@ class Measured:
         return good
 
     @cached_property
+    def chosen_rows(self) -> np.ndarray:
+        """The rows of :attr:`filled`: at most 32 of those with a good ray, evenly spread."""
+        rows = np.flatnonzero(self.valid.any(axis=(1, 2)))
+        if not len(rows):
+            rows = np.arange(self.scan.rows)
+        return rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), _MOST_ROWS)).round().astype(int))]
+
+    @cached_property
+    def good(self) -> np.ndarray:
+        """Which rays of :attr:`filled` were measured."""
+        values, valid = self.scan.projections[self.chosen_rows], self.valid[self.chosen_rows]
+        return valid & ~dropped_rays(np.where(valid, values, np.nan))
+
+    @cached_property
     def filled(self) -> np.ndarray:
-        """Some rows of the projections, at most 32, with bad rays interpolated, (rows, views, columns)."""
-        rows = np.unique(
-            np.linspace(0, self.scan.rows - 1, min(self.scan.rows, _MOST_ROWS)).round().astype(int)
-        )
-        values, valid = self.scan.projections[rows], self.valid[rows]
-        return fill_invalid(values, valid & ~dropped_rays(np.where(valid, values, np.nan)))
+        """The chosen rows of the projections, with bad rays interpolated, (rows, views, columns)."""
+        return fill_invalid(self.scan.projections[self.chosen_rows], self.good)
 
     @cached_property
     def level(self) -> float:
         """What counts as large in this scan: the 99th percentile of its values."""
         return float(np.percentile(self.filled, 99))
+
+    @cached_property
+    def span(self) -> float:
+        """By how much the values differ: from the 1st to the 99th percentile."""
+        low, high = np.percentile(self.filled, [1, 99])
+        return float(high - low)
+
+    @cached_property
+    def air(self) -> Air | None:
+        """Rays beside the object, or None where there are none."""
+        return look_for_air(self.filled, self.span)
+
+    @cached_property
+    def places(self) -> np.ndarray:
+        """Where each view looks from, (views, n): pixel coordinates of points about the middle of the volume.
+
+        The distance between two views is how far points half-way to the volume's border move, in pixels.
+        """
+        geometry, grid = self.geometry, self.grid
+        steps = np.vstack([np.zeros(3), np.eye(3), -np.eye(3)]) * grid.extent / 4
+        if geometry.planar:
+            steps = steps[[0, 1, 2, 4, 5]]
+        points = geometry.project_points(grid.centre + steps)
+        if geometry.planar:
+            points = points[..., :1]
+        spread = points.reshape(geometry.views, -1) / np.sqrt(len(steps))
+        return np.nan_to_num(spread, nan=0.0)
 
     @cached_property
     def azimuth(self) -> np.ndarray:

@@ -1,64 +1,101 @@
-"""Do the views come in the order of their angles?"""
+"""Do the views belong to their places?"""
 
 from __future__ import annotations
 
 import numpy as np
 
-from tomo_polysplat.scan.probes.measured import Finding, Measured
+from tomo_polysplat.scan.probes.alike import Alike
+from tomo_polysplat.scan.probes.finding import DEFECT, OK, UNKNOWN, Finding
+from tomo_polysplat.scan.probes.measured import Measured
 
-__all__ = ["probe_order"]
+__all__ = ["ORDER", "blurred_views", "probe_order"]
 
-_MOST_VIEWS, _BINS = 400, 64
-# Median distance between views that are neighbours by angle: over that between views that are most alike, and
-# over that between any two. Only both together mean disorder: views of a symmetric object are alike in pairs.
-_UNLIKE, _ANY = 1.8, 0.75
-# A view in a wrong place: its deviation from the mean of its neighbours, over the median deviation; and how much
-# further it is from either neighbour than they are from each other.
-_DEVIATES, _FURTHER = 2.5, 1.5
+ORDER = "order of views"
+_MOST_VIEWS, _FEWEST_VIEWS, _FEWEST_BINS = 400, 8, 3
+# Bins of fewer columns see a needle in one of their two halves only.
+_BINS, _NARROWEST = 64, 4.0
+# Bins are so many times as wide as the object's border moves from a view to the next, so that neighbours are alike.
+_BLUR = 2.0
+# Squared difference between neighbours by place, over that between any two views, and share of all views that are more
+# alike than those: 1 and 1/2 for views in disorder, the second with a standard deviation of 0.29 over root n.
+_UNLIKE, _RANDOM, _DEVIATION = 0.5, 0.35, 0.29
+_SURE = 4.0
+# A view in a wrong place differs from its neighbours by so many times as much as these do, squared, and by such a share
+# of what any two views differ by; where it belongs it differs by less than half.
+_FURTHER, _FAR, _ELSEWHERE = 2.5, 0.3, 0.5
 
 
 def probe_order(measured: Measured) -> Finding:
-    """Compare views that are neighbours by angle with each other and with the views most like them."""
-    if measured.scan.views < 12:
-        return Finding("order of views", "unknown", "too few views to tell")
-    order = np.argsort(measured.azimuth, kind="stable")
-    step = -(-len(order) // _MOST_VIEWS)
-    images = _images(measured.filled)[order[::step]]
-    distance = np.sqrt(np.maximum(_squared_distances(images), 0))
-    count = len(images)
-    following = distance[np.arange(count - 1), np.arange(1, count)]
-    usual = float(np.median(distance[np.triu_indices(count, 1)]))
-    np.fill_diagonal(distance, np.inf)
-    ratio = float(np.median(following) / max(np.median(distance.min(axis=1)), 1e-30))
-    if ratio > _UNLIKE and np.median(following) > _ANY * usual:
-        text = f"views at neighbouring angles differ {ratio:.1f} times more than views that are alike"
+    """Compare views that are neighbours by place with each other and with all others."""
+    chosen = np.unique(
+        np.linspace(0, measured.scan.views - 1, min(_MOST_VIEWS, measured.scan.views)).round().astype(int)
+    )
+    if len(chosen) < _FEWEST_VIEWS:
+        return Finding(ORDER, UNKNOWN, "too few views to tell", f"{_FEWEST_VIEWS} views or more")
+    places = measured.places[chosen]
+    near, step = _neighbours(places)
+    views = blurred_views(measured, chosen, float(np.median(step[:, 0])))
+    if views.bins < _FEWEST_BINS:
+        return Finding(ORDER, UNKNOWN, "neighbouring views are too far apart to be alike", "more views")
+    squared = views.all_pairs()
+    count = len(chosen)
+    usual = float(squared.sum() / (count * (count - 1)))
+    by_place = squared[np.arange(count), near[:, 0]]
+    if usual < _SURE * max(float(views.error(usual)) / np.sqrt(count), 1e-12):
+        text = "the views do not differ beyond their noise: any order is as good"
+        return Finding(ORDER, UNKNOWN, text, "more light, or an object that is not round")
+    ratio = float(by_place.mean() / usual)
+    more_alike = (squared < by_place[:, None]) & ~np.eye(count, dtype=bool)
+    rank = float(more_alike.mean())
+    # Views count in pairs of neighbours.
+    doubt = _DEVIATION / np.sqrt(count / 2)
+    numbers = {"ratio": ratio, "rank": rank, "misplaced": 1.0}
+    if ratio > _UNLIKE and rank > max(0.5 - 3 * doubt, _RANDOM):
+        text = f"of any two views {100 * rank:.0f} % are more alike than those from neighbouring places"
         remedy = "the angles do not belong to the views in this order: check the order of the files"
-        return Finding("order of views", "defect", text, remedy, {"ratio": ratio, "misplaced": 1.0})
-    deviation = np.linalg.norm(images[1:-1] - 0.5 * (images[:-2] + images[2:]), axis=1)
-    skipping = distance[np.arange(count - 2), np.arange(2, count)]
-    nearer = np.minimum(following[:-1], following[1:])
-    misplaced = (deviation > _DEVIATES * np.median(deviation)) & (nearer > _FURTHER * skipping)
-    wrong = np.sort(order[::step][1:-1][misplaced]).tolist()
-    numbers = {"ratio": ratio, "misplaced": len(wrong) / count}
-    if wrong:
-        named = ", ".join(map(str, wrong[:8])) + (", ..." if len(wrong) > 8 else "")
-        text = f"views {named} do not look like their neighbours, which look like each other"
-        return Finding(
-            "order of views", "defect", text, "leave them out, or mend their order or angle", numbers
-        )
-    return Finding("order of views", "ok", "every view looks like its neighbours", "", numbers)
+        return Finding(ORDER, DEFECT, text, remedy, numbers, doubt)
+    wrong = _misplaced(views, squared, near, usual)
+    numbers["misplaced"] = len(wrong) / count
+    if len(wrong):
+        named = ", ".join(map(str, chosen[wrong[:8]])) + (", ..." if len(wrong) > 8 else "")
+        text = f"views {named} do not look like their neighbours, but like views from elsewhere"
+        return Finding(ORDER, DEFECT, text, "leave them out, or mend their order or angle", numbers, doubt)
+    text = f"views from neighbouring places differ {100 * max(ratio, 0):.2g} % as much as any two views"
+    if ratio < _UNLIKE and rank < _RANDOM:
+        return Finding(ORDER, OK, text, "", numbers, doubt)
+    return Finding(ORDER, UNKNOWN, text, "more views, or more light", numbers, doubt)
 
 
-def _images(values: np.ndarray) -> np.ndarray:
-    """Views as vectors of a few hundred values, (views, n)."""
-    rows, views, columns = values.shape
-    across = np.array_split(np.arange(columns), min(_BINS, columns))
-    down = np.array_split(np.arange(rows), min(8, rows))
-    binned = np.stack([values[..., part].mean(axis=2) for part in across], axis=2)
-    return np.stack([binned[part].mean(axis=0) for part in down], axis=1).reshape(views, -1)
+def blurred_views(measured: Measured, chosen: np.ndarray, step: float) -> Alike:
+    """Some of the views, blurred so that those are alike that are `step` pixels apart half-way to the border."""
+    values = measured.filled[:, chosen]
+    width = max(2 * _BLUR * step, values.shape[2] / _BINS, _NARROWEST)
+    spacing = measured.scan.rows / len(measured.chosen_rows)
+    return Alike(values, width, max(int(np.ceil(width / spacing)), len(values) // 8))
 
 
-def _squared_distances(images: np.ndarray) -> np.ndarray:
-    images = images.astype(np.float64)
-    squares = (images**2).sum(axis=1)
-    return squares[:, None] + squares[None] - 2 * images @ images.T
+def _neighbours(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The two views nearest by place and their distances in pixels, (views, 2) each."""
+    from scipy.spatial import cKDTree
+
+    distance, index = cKDTree(places).query(places, k=3)
+    own = np.arange(len(places))
+    # Of views in the same place any may come first.
+    others = np.array([line[line != view][:2] for line, view in zip(index, own)])
+    apart = np.linalg.norm(places[others] - places[:, None], axis=2)
+    return others, apart
+
+
+def _misplaced(views: Alike, squared: np.ndarray, near: np.ndarray, usual: float) -> np.ndarray:
+    """Views unlike both of their neighbours, which are like each other, and like views from elsewhere."""
+    own = np.arange(len(near))
+    nearer = np.minimum(squared[own, near[:, 0]], squared[own, near[:, 1]])
+    between = squared[near[:, 0], near[:, 1]]
+    error = views.error(nearer)
+    apart = nearer - _FURTHER * np.maximum(between, 0) > _SURE * error
+    apart &= nearer > _FAR * usual
+    elsewhere = squared.copy()
+    elsewhere[own[:, None], near] = elsewhere[own, own] = np.inf
+    # The best of many: chance finds one more easily.
+    like = elsewhere.min(axis=1)
+    return np.flatnonzero(apart & (like < _ELSEWHERE * nearer) & (nearer - like > _SURE * 1.5 * error))

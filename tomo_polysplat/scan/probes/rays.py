@@ -7,9 +7,10 @@ from functools import reduce
 import numpy as np
 
 from tomo_polysplat.scan.dropouts import dropped_rays
-from tomo_polysplat.scan.probes.measured import Finding, Measured
+from tomo_polysplat.scan.probes.finding import DEFECT, OK, Finding
+from tomo_polysplat.scan.probes.measured import Measured
 
-__all__ = ["DEAD", "bad_rays", "probe_rays"]
+__all__ = ["DEAD", "RAYS", "bad_rays", "probe_rays"]
 
 # Shares of rays, and of the views of a pixel, from which they count as a defect of the detector.
 _TOLERATED, _MOSTLY = 0.002, 0.5
@@ -23,6 +24,7 @@ _OPAQUE = 0.6
 _THROUGH = 0.1
 
 
+RAYS = "bad rays"
 DEAD, ZERO = "of dead pixels", "zero in the middle of the object"
 STARVED = "without light behind dense matter"
 # Rays looked at, of so many views at least.
@@ -65,8 +67,8 @@ def probe_rays(measured: Measured, kinds: dict[str, np.ndarray]) -> Finding:
         remedy = (
             "mark them in valid= (False is not used); correct flat fields, or saturation=, mend many of them"
         )
-        return Finding("bad rays", "defect", listed, remedy, shares)
-    return Finding("bad rays", "ok", listed or "none", "", shares)
+        return Finding(RAYS, DEFECT, listed, remedy, shares)
+    return Finding(RAYS, OK, listed or "none", "", shares)
 
 
 def _starved(projections: np.ndarray, valid: np.ndarray, level: float) -> np.ndarray:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from tomo_polysplat.scan.probes.measured import Finding, Measured
+from tomo_polysplat.scan.probes.finding import DEFECT, OK, UNKNOWN, Finding
+from tomo_polysplat.scan.probes.measured import Measured
 
-__all__ = ["probe_truncation"]
+__all__ = ["TRUNCATION", "probe_truncation"]
 
+TRUNCATION = "truncation"
 # Share of the scan's large values that the outermost columns reach where there is more than air, and share of
 # the views in which they must do so.
 _NOT_AIR, _SOME_VIEWS = 0.06, 0.02
+_SURE = 4.0
 
 
 def probe_truncation(measured: Measured) -> Finding:
@@ -18,21 +21,29 @@ def probe_truncation(measured: Measured) -> Finding:
     values = measured.filled
     width = max(1, min(3, values.shape[2] // 20))
     ends = {"first": values[..., :width], "last": values[..., -width:]}
-    # The rows with most matter decide; noise is averaged over a few of them.
-    shares = {}
+    zero = measured.air.level if measured.air is not None else 0.0
+    # The rows with most matter decide, the same in all views: each view's own would be those with most noise.
+    most = np.argsort(values.mean(axis=(1, 2)))[-max(1, len(values) // 4) :]
+    shares, errors = {}, {}
     for name, end in ends.items():
-        by_row = np.sort(np.median(end, axis=2), axis=0)
-        top = by_row[-max(1, len(by_row) // 4) :].mean(axis=0)
-        shares[name] = float(np.mean(top > _NOT_AIR * measured.level))
+        some = end[most] - zero
+        noise = float(np.median(np.abs(np.diff(some, axis=1)))) * 1.4826 / np.sqrt(2)
+        errors[name] = noise / np.sqrt(width * len(most))
+        limit = max(_NOT_AIR * measured.level, _SURE * errors[name])
+        shares[name] = float(np.mean(np.median(some, axis=2).mean(axis=0) > limit))
+    error = max(errors.values())
     cut = [name for name, share in shares.items() if share > _SOME_VIEWS]
+    if not cut and _SURE * error > 2 * _NOT_AIR * measured.level:
+        text = "the noise in the outermost columns hides what is there"
+        return Finding(TRUNCATION, UNKNOWN, text, "more light", shares, error)
     if not cut:
-        return Finding("truncation", "ok", "air at both ends of the detector", "", shares)
+        return Finding(TRUNCATION, OK, "air at both ends of the detector", "", shares, error)
     views = ", ".join(f"the {name} column in {100 * shares[name]:.0f} % of the views" for name in cut)
     if len(cut) == 1 and _is_offset(measured):
         text = f"the object reaches {views}, as it does with a detector that is offset on purpose"
-        return Finding("truncation", "ok", text, "", shares)
+        return Finding(TRUNCATION, OK, text, "", shares, error)
     remedy = "make the volume larger than the object, so that what lies outside the view has room"
-    return Finding("truncation", "defect", f"the object reaches beyond {views}", remedy, shares)
+    return Finding(TRUNCATION, DEFECT, f"the object reaches beyond {views}", remedy, shares, error)
 
 
 def _is_offset(measured: Measured) -> bool:

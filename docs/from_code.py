@@ -1,0 +1,101 @@
+"""Parts of the docs that are made from the code at each build: the table of decisions and the way of a scan."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+from pathlib import Path
+
+from tomo_polysplat.plan.order import ORDER
+
+PACKAGE = Path(__file__).parents[1] / "tomo_polysplat"
+# Functions whose calls are the way of a scan; see `way`.
+STAGES = (
+    ("reconstruction.py", "reconstruct"),
+    ("plan/solver.py", "solve"),
+    ("plan/preparation.py", "prepare"),
+    ("plan/solver.py", "_fit"),
+    ("fit/optimise.py", "fit"),
+    ("reconstruction.py", "_result"),
+)
+
+
+def decisions_table() -> str:
+    """A row a decision, in the order in which they are asked."""
+    rows = ["| Decision | Question | Asked | Reads |", "|---|---|---|---|"]
+    for kind in ORDER:
+        page = Path(__file__).parent / "decisions" / f"{kind.name}.md"
+        name = f"[`{kind.name}`](../decisions/{kind.name}.md)" if page.exists() else f"`{kind.name}`"
+        words = " ".join((inspect.getdoc(kind) or "").split("\n\n")[0].split())
+        needs = ", ".join(f"`{needed.name}`" for needed in kind.needs)
+        rows.append(f"| {name} | {words} | {kind.when.value} | {needs} |")
+    return "\n".join(rows) + "\n"
+
+
+def way() -> list[tuple[str, str, list[tuple[str, str]]]]:
+    """File, function, and what it calls of the package in the order of the source: (name, its module)."""
+    found = []
+    for file, name in STAGES:
+        tree = ast.parse((PACKAGE / file).read_text(encoding="utf-8"))
+        home = {
+            alias.asname or alias.name: node.module.removeprefix("tomo_polysplat.")
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("tomo_polysplat.")
+            for alias in node.names
+        }
+        function = next(n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef) and n.name == name)
+        calls = [n for n in ast.walk(function) if isinstance(n, ast.Call)]
+        calls.sort(key=lambda call: (call.lineno, call.col_offset))
+        called: list[tuple[str, str]] = []
+        for call in calls:
+            words = ast.unparse(call.func)
+            first = words.partition(".")[0]
+            entry = (words, home.get(first, ""))
+            if (
+                entry[1]
+                and entry not in called
+                and not entry[1].startswith(("checks", "transfer", "progress"))
+            ):
+                called.append(entry)
+        found.append((file, name, called))
+    return found
+
+
+def draw_way(path: Path) -> None:
+    """The stages as boxes, one below the other, with what each calls and where that lives."""
+    from matplotlib.figure import Figure
+
+    stages = way()
+    lines = [1.6 + len(called) for _, _, called in stages]
+    figure = Figure(figsize=(7.5, 0.24 * sum(lines) + 0.2 * len(stages)))
+    axis = figure.add_axes((0.01, 0.01, 0.98, 0.98))
+    axis.set_axis_off()
+    height = sum(lines) + 0.8 * len(stages)
+    axis.set_xlim(0, 10)
+    axis.set_ylim(-height, 0)
+    top = 0.0
+    for (file, name, called), size in zip(stages, lines):
+        axis.add_patch(_box(top, size))
+        axis.text(0.3, top - 0.8, f"{name}()", weight="bold", va="center", fontsize=9)
+        axis.text(9.7, top - 0.8, f"tomo_polysplat/{file}", va="center", ha="right", fontsize=8, color="0.4")
+        for number, (words, module) in enumerate(called):
+            y = top - 1.7 - number
+            axis.text(0.7, y, words, va="center", fontsize=8, family="monospace")
+            axis.text(9.7, y, module, va="center", ha="right", fontsize=8, color="0.4", family="monospace")
+        top -= size + 0.8
+    figure.savefig(path)
+
+
+def _box(top: float, size: float):
+    from matplotlib.patches import FancyBboxPatch
+
+    return FancyBboxPatch(
+        (0.1, top - size - 0.1), 9.8, size, boxstyle="round,pad=0.05", facecolor="#f4f6f8", edgecolor="0.6"
+    )
+
+
+def make(folder: Path) -> None:
+    """Write all of it into a folder."""
+    folder.mkdir(exist_ok=True)
+    (folder / "decisions_table.md").write_text(decisions_table(), encoding="utf-8")
+    draw_way(folder / "way.svg")

@@ -1,0 +1,218 @@
+"""Small HDF5 files that ask for gigabytes, for ever, or for the end of the process: all refused in one process."""
+
+import resource
+import struct
+import subprocess
+import sys
+import zlib
+
+import h5py
+import numpy as np
+import pytest
+from hostile_files import EXCHANGE, OURS, RESULT, RESULT_ATTRIBUTES, image
+
+from tomo_polysplat.scan.hdf5 import opened, read_text
+from tomo_polysplat.scan.hdf5_heaps import heap_object
+from tomo_polysplat.scan.io import load_scan
+
+GEOMETRY = {("polysplat/geometry", "astra_type"): "cone_vec", ("polysplat/geometry", "unit"): "mm"}
+MEGABYTES = 600
+SHAPE = (3, 2, 4)
+
+
+def deflated(megabytes=MEGABYTES):
+    packer = zlib.compressobj(9)
+    block = bytes(2**20)
+    return b"".join(packer.compress(block) for _ in range(megabytes)) + packer.flush()
+
+
+BOMB = deflated()
+
+
+def replaced(file, name, chunk, **filters):
+    """A dataset of one chunk, whose bytes are given as they are stored."""
+    shape, dtype = file[name].shape, file[name].dtype
+    del file[name]
+    made = file.create_dataset(name, shape, dtype, chunks=shape, **filters)
+    made.id.write_direct_chunk((0,) * len(shape), chunk)
+
+
+def packed_zeros(file, name):
+    dtype = file[name].dtype
+    del file[name]
+    made = file.create_dataset(name, (2**24 * 5,), dtype, chunks=(2**24,), compression="gzip")
+    chunk = zlib.compress(bytes(2**24 * dtype.itemsize), 9)
+    for first in range(0, len(made), 2**24):
+        made.id.write_direct_chunk((first,), chunk)
+
+
+def check_sum_of_packed(file, name):
+    """Check sum first, deflate second: what deflate gives is too short for the sum."""
+    shape = file[name].shape
+    del file[name]
+    plist = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    plist.set_chunk(shape)
+    plist.set_fletcher32()
+    plist.set_deflate(1)
+    made = h5py.h5d.create(
+        file.id, name.encode(), h5py.h5t.NATIVE_UINT16, h5py.h5s.create_simple(shape), plist
+    )
+    made.write_direct_chunk((0,) * len(shape), zlib.compress(b"\1\2"), 0)
+
+
+def links(file, name):
+    file.move(name, "x")
+    file["s0"] = h5py.SoftLink("/")
+    for depth in range(1, 13):
+        file[f"s{depth}"] = h5py.SoftLink("/" + "/".join([f"s{depth - 1}"] * 10))
+    file[name] = h5py.SoftLink("/s12/x")
+
+
+def long_path(file, name):
+    file.move(name, "x")
+    file["s"] = h5py.SoftLink("/" + "./" * 20000 + "x")
+    file[name] = h5py.SoftLink("/".join(["/exchange/.."] * 3000))
+
+
+TRICKS = {
+    "deflate behind a true shape": lambda file: replaced(file, "exchange/data", BOMB, compression="gzip"),
+    "the same in a mask": lambda file: replaced(file, "polysplat/valid", BOMB, compression="gzip"),
+    "the same under shuffle": lambda file: replaced(
+        file, "exchange/data_white", BOMB, compression="gzip", shuffle=True
+    ),
+    "three numbers of 640 MB": lambda file: packed_zeros(file, "polysplat/geometry/volume_shape"),
+    "energies": lambda file: packed_zeros(file, "polysplat/spectrum/energies"),
+    "vectors": lambda file: packed_zeros(file, "polysplat/geometry/vectors"),
+    "truth": lambda file: packed_zeros(file, "polysplat/truth"),
+    "open-beam images": lambda file: packed_zeros(file, "exchange/data_white"),
+    "check sum of 2 bytes": lambda file: replaced(file, "exchange/data", b"\1\2", fletcher32=True),
+    "check sum in a packed chunk": lambda file: check_sum_of_packed(file, "exchange/data"),
+    "lzf of nothing": lambda file: replaced(file, "exchange/data", b"\1", compression="lzf"),
+    "scale and offset": lambda file: replaced(file, "exchange/data", b"\xff" * 5, scaleoffset=0),
+    "plain chunk too short": lambda file: replaced(file, "exchange/data", b"\1"),
+    "plain chunk too long": lambda file: replaced(file, "exchange/data", bytes(2**20)),
+    "soft links by number": lambda file: links(file, "exchange/data"),
+    "a long path": lambda file: long_path(file, "exchange/data"),
+}
+READ = """
+import resource, sys, time
+from tomo_polysplat.scan.io import load_scan
+from tomo_polysplat.result.result import Result
+import astra, h5py
+import tomo_polysplat.physics.spectrum
+load_scan(sys.argv[1])
+for path in sys.argv[2:]:
+    begun, before = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    try:
+        (Result.load if "result" in path else load_scan)(path)
+        print("ACCEPTED", path)
+    except (ValueError, MemoryError) as error:
+        taken = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+        print("ok" if taken < 2e5 and time.process_time() - begun < 4 else f"COSTS {taken}", str(error)[:150])
+"""
+
+
+def results(folder):
+    """Results of which the stored length of one text, in a dataset or in an attribute, says 2 GB."""
+    content = image(RESULT, RESULT_ATTRIBUTES, {})
+    (folder / "result.h5").write_bytes(content)
+    with h5py.File(folder / "result.h5") as file:
+        place = file["polysplat/plan"].id.get_offset()
+    reference = content.index(struct.pack("<I", 2) + content[place + 4 : place + 12])
+    for number, at in enumerate((place, reference)):
+        broken = bytearray(content)
+        broken[at : at + 4] = struct.pack("<I", 2**31 - 1)
+        path = folder / f"result{number}.h5"
+        path.write_bytes(broken)
+        yield path
+
+
+def test_each_is_refused_at_no_cost(tmp_path):
+    assert hasattr(resource, "getrusage")
+    sound = image(EXCHANGE | OURS, GEOMETRY, {})
+    (tmp_path / "sound").write_bytes(sound)
+    paths = [tmp_path / "sound"]
+    for name, trick in TRICKS.items():
+        paths.append(tmp_path / name)
+        paths[-1].write_bytes(sound)
+        with h5py.File(paths[-1], "r+") as file:
+            trick(file)
+        assert paths[-1].stat().st_size < 5e6
+    paths += results(tmp_path)
+    done = subprocess.run([sys.executable, "-c", READ, *map(str, paths)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-500:]
+    lines = done.stdout.splitlines()
+    assert len(lines) == len(paths) - 1
+    bad = [f"{path.name}: {line}" for path, line in zip(paths[1:], lines) if not line.startswith("ok")]
+    assert not bad, "\n".join(bad)
+
+
+def heap(tmp_path, *objects, size=None):
+    """A file of nothing but one heap at byte 64; objects are (index, length, bytes)."""
+    body = b"".join(
+        struct.pack("<HHIQ", index, 1, 0, length) + content.ljust(-(-len(content) // 8) * 8, b"\0")
+        for index, length, content in objects
+    )
+    path = tmp_path / "heap"
+    size = 16 + len(body) if size is None else size
+    path.write_bytes(bytes(64) + b"GCOL\1\0\0\0" + struct.pack("<Q", size) + body)
+    return open(path, "rb")
+
+
+def test_objects_of_a_heap(tmp_path):
+    with heap(tmp_path, (1, 5, b"hallo"), (7, 3, b"abc"), (0, 16, b"")) as stream:
+        assert heap_object(stream, "x", 64, 7) == b"abc"
+        assert heap_object(stream, "x", 64, 1, 2) == b"ha"
+        for index, length in ((2, 1), (0, 1), (1, 6)):
+            with pytest.raises(ValueError, match="of a heap"):
+                heap_object(stream, "x", 64, index, length)
+        for place in (0, 63, 10**6, 2**63 - 1):
+            with pytest.raises(ValueError, match="damaged heap"):
+                heap_object(stream, "x", place, 1)
+
+
+@pytest.mark.parametrize(
+    ("objects", "size"),
+    [
+        ([(0, 0, b"")], None),
+        ([(1, 5, b"hallo"), (0, 8, b"")], None),
+        ([(1, 2**63, b"hallo")], None),
+        ([(1, 5, b"hallo")], 2**40),
+        ([(1, 0, b"")] * 70_000, None),
+    ],
+)
+def test_heaps_that_would_hold_hdf5_for_ever(tmp_path, objects, size):
+    with heap(tmp_path, *objects, size=size) as stream, pytest.raises(ValueError, match="damaged heap"):
+        heap_object(stream, "x", 64, 1)
+
+
+def test_a_virtual_dataset_with_a_damaged_heap_is_not_opened(tmp_path):
+    path = tmp_path / "scan.h5"
+    layout = h5py.VirtualLayout(SHAPE, "f4")
+    layout[:] = h5py.VirtualSource(".", "own", SHAPE)
+    with h5py.File(path, "w", libver="latest") as file:
+        file["own"] = np.ones(SHAPE, "f4")
+        file.create_virtual_dataset("exchange/data", layout)
+    content = bytearray(path.read_bytes())
+    place = content.index(b"GCOL\1\0\0\0")
+    content[place + 16 : place + 32] = bytes(16)
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match="/exchange/data: .*damaged heap"):
+        load_scan(path)
+
+
+def test_texts_within_a_heap_are_read_though_another_heap_is_damaged(tmp_path):
+    """Only what is asked for is looked at."""
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file["first"] = "x" * 3000
+        file["second"] = "y" * 3000
+    content = bytearray(path.read_bytes())
+    place = content.rindex(b"GCOL\1\0\0\0")
+    assert place != content.index(b"GCOL\1\0\0\0")
+    content[place + 16 : place + 32] = bytes(16)
+    path.write_bytes(content)
+    with opened(path) as file:
+        assert read_text(file, "first") == "x" * 3000
+        with pytest.raises(ValueError, match="/second: .*damaged heap"):
+            read_text(file, "second")

@@ -1,0 +1,117 @@
+"""Whether pixels average their light: scans of one ray a pixel and of several, and when nobody needs to ask."""
+
+import time
+from functools import partial
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from killed_runs import assert_same, resumed_after
+from planned import planned
+
+import tomo_polysplat as tps
+from tomo_polysplat.fit.optimise import Run
+from tomo_polysplat.fit.stopping import Clock
+from tomo_polysplat.plan.answer import Status
+from tomo_polysplat.plan.decisions.pixel_rays import PixelRays
+from tomo_polysplat.plan.lab import Lab
+from tomo_polysplat.plan.order import ask_between
+
+QUICK = {"passes": 10.0, "edges": "blurred", "tv_factor": 1.0}
+
+
+def pins(subrays=1, metal=True):
+    return tps.simulate_scan("pins", size=64, views=60, geometry="fan", subrays=subrays, metal=metal)
+
+
+def reconstruct(scan, settings=None, **options):
+    options = {"unit": scan.unit, "spectrum": scan.spectrum, "progress": False} | options
+    settings = QUICK | (settings or {})
+    return tps.reconstruct(scan.projections, scan.proj_geom, scan.vol_geom, settings=settings, **options)
+
+
+def error(result, scan):
+    return float(np.sqrt(np.mean((result.volume - scan.truth) ** 2)))
+
+
+@pytest.mark.parametrize(("subrays", "taken", "other"), [(1, 1, 2), (3, 2, 1)])
+def test_the_rays_at_metal_tell_it(subrays, taken, other):
+    scan = pins(subrays)
+    told = reconstruct(scan)
+    assert told.plan["pixel_rays"].value == taken and "averaged light leaves" in told.plan["pixel_rays"].why
+    wrong = reconstruct(scan, {"pixel_rays": other})
+    assert wrong.plan["pixel_rays"].status is Status.GIVEN
+    assert error(told, scan) < 0.7 * error(wrong, scan)
+
+
+def test_the_loser_leaves_no_trace_of_itself():
+    """Infinitely thin rays that were asked about are those that were asked for."""
+    scan = pins()
+    told, wanted = reconstruct(scan), reconstruct(scan, {"pixel_rays": 1})
+    assert np.array_equal(told.volume, wanted.volume)
+
+
+@pytest.mark.parametrize(
+    ("metal", "changes", "options", "words"),
+    [
+        (False, {}, {}, "without metal"),
+        (True, {"passes": 9.0}, {}, "in so few passes"),
+        (True, {}, {"time_budget": 0.5}, "time budget"),
+        (True, {}, {"spectrum": None}, "without metal"),
+    ],
+)
+def test_nobody_asks_where_it_cannot_be_told(metal, changes, options, words):
+    told = reconstruct(pins(metal=metal), changes, **options).plan["pixel_rays"]
+    assert told.value == 1 and told.status is Status.USUAL and words in told.why
+
+
+def test_a_budget_with_time_to_spare_does_not_hinder_it():
+    told, hurried = reconstruct(pins(3)), reconstruct(pins(3), time_budget=3600.0)
+    assert told.plan["pixel_rays"] == hurried.plan["pixel_rays"]
+    assert np.array_equal(told.volume, hurried.volume)
+
+
+def amid(ahead, clock, steps=30):
+    """The answer to the question of a run whose passes are ``ahead``, and the run."""
+    other = SimpleNamespace(ahead=ahead)
+    fitter = SimpleNamespace(ahead=ahead, branch=lambda pixel_rays: other, steps_of_a_pass=steps)
+    run, lab = Run(fitter, clock), Lab(None, None, None, None, plan=planned(passes=15.0))
+    clock.done = clock.steps // 2
+    ask_between(lab, run, (PixelRays,))
+    return lab.plan.answers["pixel_rays"], run, fitter
+
+
+@pytest.mark.parametrize("passes", [0, 1])
+def test_a_budget_that_ends_amid_the_question_leaves_the_run_as_it_was(passes):
+    """However few passes it was able to make."""
+    made = [(0.2, 0.3, 1)] * passes
+
+    def slowly(clock, passes):
+        clock.deadline = time.perf_counter() - 1
+        return made
+
+    answer, run, fitter = amid(slowly, Clock(10, time.perf_counter() + 3600))
+    assert run.fitter is fitter and run.made == (made[0] if made else None)
+    assert answer.value == 1 and "time budget" in answer.why
+
+
+@pytest.mark.parametrize(("steps", "passes"), [(90, 2), (30, 2), (24, 3), (1, 3)])
+def test_each_way_has_steps_enough_to_get_used_to_it_but_no_more_than_a_fifth_of_the_run(steps, passes):
+    asked = []
+
+    def ahead(clock, some):
+        asked.append(some)
+        clock.deadline = time.perf_counter() - 1
+        return []
+
+    amid(ahead, Clock(10, None), steps)
+    assert asked == [passes, passes]
+
+
+def test_a_run_resumed_around_the_question_is_the_uninterrupted_one(tmp_path, monkeypatch):
+    monkeypatch.setattr("tomo_polysplat.plan.checkpoint._LARGEST_SHARE", 1e9)
+    scan = pins(3)
+    whole = reconstruct(scan)
+    for share in (0.3, 0.4, 0.6):
+        run = partial(reconstruct, scan)
+        assert_same(resumed_after(share, run, tmp_path / f"{share}.npz"), whole, share)

@@ -1,0 +1,156 @@
+"""Scatter that nobody has told of: found in the middle of a run, which begins anew with it, and when nobody asks."""
+
+import dataclasses
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+import tomo_polysplat as tps
+from tomo_polysplat.physics.scatter import light_around
+from tomo_polysplat.plan import calibration, solver
+from tomo_polysplat.plan.answer import Status
+from tomo_polysplat.plan.preparation import prepare
+
+QUICK = {"passes": 6.0, "tv_factor": 1.0, "edges": "blurred", "pixel_rays": 1}
+
+
+@cache
+def pins(scatter=0.0, views=60):
+    return tps.simulate_scan("pins", size=40, views=views, geometry="fan", scatter=scatter)
+
+
+def reconstruct(scan, **options):
+    options = {"unit": scan.unit, "spectrum": scan.spectrum, "settings": QUICK, "progress": False} | options
+    return tps.reconstruct(scan.projections, scan.proj_geom, scan.vol_geom, **options)
+
+
+def error(result, scan):
+    return float(np.sqrt(np.mean((result.volume - scan.truth) ** 2)))
+
+
+def test_scatter_that_nobody_told_of_is_modelled():
+    scan = pins(0.05)
+    asked, told, without = (reconstruct(scan, calibrate=calibrate) for calibrate in (None, True, False))
+    assert asked.plan["scatter"].why.startswith("modelled: ")
+    assert asked.plan["calibration"].value["fitted"]["scatter"] == pytest.approx(0.05, rel=0.1)
+    assert asked.plan["scatter"].value == told.plan["scatter"].value
+    # Begun anew, the run is that of a scan whose scatter was known from the first.
+    assert np.array_equal(asked.volume, told.volume)
+    assert without.plan["scatter"].why == "not looked for: asked for"
+    assert error(asked, scan) < 0.6 * error(without, scan)
+
+
+def test_a_scan_without_any_is_fitted_as_if_nobody_had_asked():
+    scan = pins()
+    asked, without = reconstruct(scan), reconstruct(scan, calibrate=False)
+    assert asked.plan["scatter"].why.startswith("the rays show") and "calibration" not in asked.plan
+    assert np.array_equal(asked.volume, without.volume)
+
+
+def test_a_beam_that_drifts_does_not_scatter():
+    scan = pins()
+    brighter = 0.02 * (1 + np.sin(np.arange(scan.projections.shape[1]) / 5.0))[None, :, None]
+    drifting = dataclasses.replace(scan, projections=(scan.projections - brighter).astype(np.float32))
+    assert "drift" in reconstruct(drifting).plan["scatter"].why
+
+
+@pytest.mark.parametrize(
+    ("views", "options", "words"),
+    [(39, {}, "fewer than 40 views"), (60, {"time_budget": 0.5}, "time budget")],
+)
+def test_nobody_asks_where_it_cannot_be_told(views, options, words):
+    told = reconstruct(pins(0.05, views), **options).plan["scatter"]
+    assert told.status is Status.USUAL and words in told.why
+
+
+def test_one_energy_knows_no_scatter():
+    assert "one energy" in reconstruct(pins(0.05), spectrum=None).plan["scatter"].why
+
+
+class Stopped(Exception):
+    pass
+
+
+@pytest.mark.parametrize("passes", [1, 4])
+def test_an_interrupted_run_goes_on_whether_it_had_begun_anew_or_not(passes, tmp_path):
+    scan, path, seen = pins(0.05), tmp_path / "fit.npz", []
+
+    def stop(state):
+        seen.append(state)
+        if len(seen) > passes:
+            raise Stopped
+
+    whole = reconstruct(scan)
+    with pytest.raises(Stopped):
+        reconstruct(scan, checkpoint=path, callbacks=[stop])
+    rest = reconstruct(scan, checkpoint=path, resume=True)
+    assert rest.plan["scatter"] == whole.plan["scatter"]
+    assert np.array_equal(rest.volume, whole.volume)
+
+
+def test_a_run_with_scatter_that_varies_goes_on_as_if_nothing_had_happened(tmp_path, monkeypatch):
+    scan, path, seen = pins(), tmp_path / "fit.npz", []
+    fitted = {"scatter": 0.08, "scatter_of_light": -0.07}
+    found = {"fitted": fitted, "accepted": {"scatter": True}, "why": "told"}
+    monkeypatch.setattr(solver, "calibrate", lambda *scan: found)
+    light = light_around(torch.from_numpy(scan.projections.swapaxes(0, 1).copy())).numpy().swapaxes(0, 1)
+    scattered = -np.log(np.exp(-scan.projections) + 0.08 - 0.07 * light).astype(np.float32)
+    scan = dataclasses.replace(scan, projections=scattered)
+
+    def stop(state):
+        seen.append(state)
+        if len(seen) > 4:
+            raise Stopped
+
+    whole = reconstruct(scan)
+    assert whole.plan["scatter"].why.endswith("0.08 of the open beam and -0.07 of the light around a ray")
+    assert error(whole, scan) < 0.7 * error(reconstruct(scan, calibrate=False), scan)
+    with pytest.raises(Stopped) as stopped:
+        reconstruct(scan, checkpoint=path, callbacks=[stop])
+    # What ended the first fit is not behind what ends the second.
+    assert stopped.value.__context__ is None
+    assert np.array_equal(reconstruct(scan, checkpoint=path, resume=True).volume, whole.volume)
+
+
+def test_what_ends_the_short_fits_does_not_end_the_run(monkeypatch, caplog):
+    def no_room(*scan, **options):
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(calibration, "short_fit", no_room)
+    result = reconstruct(pins(0.05))
+    assert result.plan["scatter"].why == "out of memory" and "out of memory" in caplog.text
+    assert np.array_equal(result.volume, reconstruct(pins(0.05), calibrate=False).volume)
+
+
+def test_a_beam_that_may_drift_is_left_alone_where_no_air_tells():
+    scan = pins(0.05)
+    cut = scan.projections.copy()
+    cut[..., :12] = cut[..., -12:] = np.nan
+    assert "too few rays" in reconstruct(dataclasses.replace(scan, projections=cut)).plan["scatter"].why
+
+
+def test_scatter_shows_where_rays_are_straight_sums():
+    """Beside the object, though nothing is hardened."""
+    spectrum = tps.Spectrum([60.0, 60.5], [0.5, 0.5])
+    scan = pins()
+    projections = -np.log(np.exp(-scan.projections) + 0.05).astype(np.float32)
+    told = reconstruct(dataclasses.replace(scan, projections=projections), spectrum=spectrum).plan["scatter"]
+    assert told.status is Status.ASKED and not told.why.startswith("the rays show")
+
+
+def test_ctrl_c_while_it_begins_anew_returns_what_it_had_come_to(monkeypatch):
+    begun = []
+
+    def once(*scan):
+        begun.append(scan)
+        if len(begun) > 1:
+            raise KeyboardInterrupt
+        return prepare(*scan)
+
+    monkeypatch.setattr(solver, "prepare", once)
+    result = reconstruct(pins(0.05))
+    assert result.plan["stop"].value == "interrupted" and len(begun) == 2
+    assert result.history and result.plan["scatter"].why.startswith("not modelled: interrupted")
+    assert result.volume.max() > 0.5 * pins(0.05).truth.max() and np.isfinite(result.volume).all()

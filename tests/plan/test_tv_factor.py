@@ -1,0 +1,115 @@
+"""How much is smoothed: by how much light an object takes away, and by what rays held out of short fits say."""
+
+import numpy as np
+import pytest
+
+from tomo_polysplat import reconstruct
+
+SIZE, VIEWS = 64, 90
+FLAT = ((0.0, 0.0, 0.85, 0.5), (0.3, 0.2, 0.2, 0.1), (-0.35, 0.1, 0.15, -0.2), (0.0, -0.4, 0.1, 0.2))
+# A laminate: rings of 2 pixels.
+RINGS = tuple((0.0, 0.0, radius, 0.5 * (-1) ** k) for k, radius in enumerate(np.arange(0.85, 0.1, -0.0625)))
+
+
+def slice_of(discs, noise, denser=1.0, views=VIEWS):
+    """Exact line integrals of discs (x, y, radius, attenuation) in a parallel beam, their geometries, and the truth."""
+    discs = [(x, y, radius, denser * mu) for x, y, radius, mu in discs]
+    angles = np.linspace(0, np.pi, views, endpoint=False)
+    pixel, columns = 2 / SIZE, round(1.3 * SIZE)
+    s = pixel * (np.arange(columns) - (columns - 1) / 2)
+    # Nine points across a voxel and either way tell its mean well enough.
+    fine = (np.arange(9 * SIZE) + 0.5) / (9 * SIZE) * 2 - 1
+    projections, truth = np.zeros((views, columns)), np.zeros((9 * SIZE,) * 2)
+    for x, y, radius, mu in discs:
+        off = s - (x * np.cos(angles) + y * np.sin(angles))[:, None]
+        projections += 2 * mu * np.sqrt(np.maximum(radius**2 - off**2, 0))
+        truth += mu * ((fine - x) ** 2 + (fine[::-1, None] - y) ** 2 < radius**2)
+    projections += np.random.default_rng(0).normal(0, noise, projections.shape)
+    proj_geom = {
+        "type": "parallel",
+        "DetectorWidth": pixel,
+        "DetectorCount": columns,
+        "ProjectionAngles": angles,
+    }
+    window = {"WindowMinX": -1.0, "WindowMaxX": 1.0, "WindowMinY": -1.0, "WindowMaxY": 1.0}
+    vol_geom = {"GridRowCount": SIZE, "GridColCount": SIZE, "option": window}
+    return (
+        projections.astype(np.float32),
+        proj_geom,
+        vol_geom,
+        truth.reshape(SIZE, 9, SIZE, 9).mean(axis=(1, 3)),
+    )
+
+
+def fitted(scan, **settings):
+    settings = {"passes": 10, "held_out": 0.03} | settings
+    return reconstruct(*scan[:3], unit="cm", settings=settings, progress=False)
+
+
+def relative_error(volume, truth):
+    return np.sqrt(np.square(volume - truth).mean()) / truth.max()
+
+
+@pytest.mark.parametrize(
+    ("discs", "noise", "denser", "more"), [(FLAT, 0.05, 1, True), (RINGS, 0.05, 1.6, False)]
+)
+def test_more_smoothing_is_taken_where_held_out_rays_want_it_and_lowers_the_error(discs, noise, denser, more):
+    scan = slice_of(discs, noise, denser)
+    found, once, thrice = (fitted(scan, **chosen) for chosen in ({}, {"tv_factor": 1}, {"tv_factor": 3}))
+    assert (
+        "misfit of the held-out rays" in found.plan["tv_factor"].why
+        and "asked for" in once.plan["tv_factor"].why
+    )
+    # The short fits leave no trace: it is the run that asks for what they told.
+    assert np.array_equal(found.volume, (thrice if more else once).volume)
+    once, thrice = (np.square(result.volume - scan[3]).mean() for result in (once, thrice))
+    assert thrice < 0.8 * once if more else once < 0.8 * thrice
+
+
+@pytest.mark.parametrize("discs", [FLAT, RINGS])
+@pytest.mark.parametrize("passes", [10, 5])
+def test_a_tenth_of_the_attenuation_and_of_the_noise_gives_a_tenth_of_the_volume(discs, passes):
+    errors = []
+    for denser in (1.0, 0.1):
+        scan = slice_of(discs, 0.002 * denser, denser)
+        errors.append(relative_error(fitted(scan, passes=passes).volume, scan[3]))
+    assert errors[1] < 1.5 * errors[0]
+    # What the usual weight makes of it.
+    assert relative_error(fitted(scan, passes=passes, tv_factor=1).volume, scan[3]) > 2 * errors[1]
+
+
+def test_where_smooth_things_are_thin_held_out_rays_keep_the_usual_weight():
+    # Its noise is all that varies.
+    scan = slice_of(FLAT[:1], 0.02, 0.3)
+    found = fitted(scan)
+    assert found.plan["tv_factor"].why.startswith("the usual weight: after")
+    assert relative_error(found.volume, scan[3]) < 0.5 * relative_error(
+        fitted(scan, tv_factor=0.2).volume, scan[3]
+    )
+
+
+@pytest.mark.parametrize(
+    ("changed", "because"),
+    [
+        ({"passes": 5}, "in so few passes"),
+        ({"held_out": 0}, "no rays are held out"),
+        ({"tv_weight": 0}, "nothing to smooth"),
+    ],
+)
+def test_when_nothing_is_asked(changed, because):
+    assert because in fitted(slice_of(FLAT, 0.05), **changed).plan["tv_factor"].why
+
+
+@pytest.mark.parametrize(("discs", "noise", "more"), [(FLAT, 0.05, True), (RINGS, 0.005, False)])
+def test_a_slice_of_few_views_is_asked_as_well(discs, noise, more):
+    scan = slice_of(discs, noise, views=30)
+    found, other = fitted(scan), fitted(scan, tv_factor=1 if more else 3)
+    assert "misfit of the held-out rays" in found.plan["tv_factor"].why
+    assert (found.plan["tv_factor"].value == 3) == more
+    assert relative_error(found.volume, scan[3]) < 0.8 * relative_error(other.volume, scan[3])
+
+
+def test_many_rays_a_voxel_need_no_more_smoothing():
+    projections, proj_geom, vol_geom, _ = slice_of(FLAT, 0.05)
+    coarse = vol_geom | {"GridRowCount": 32, "GridColCount": 32}
+    assert "3 rays a voxel" in fitted((projections, proj_geom, coarse)).plan["tv_factor"].why

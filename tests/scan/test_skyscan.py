@@ -1,0 +1,164 @@
+"""A SkyScan's folder: what its log says, what it leaves open, and what it cannot mean."""
+
+import numpy as np
+import pytest
+import tifffile
+from folders import marked, require_the_same_volume
+
+import tomo_polysplat as tps
+from tomo_polysplat.scan.readers.filter_text import filters_of
+from tomo_polysplat.simulate.folders.scene import pictures_of
+from tomo_polysplat.simulate.folders.skyscan import log_text
+from tomo_polysplat.simulate.folders.tiffs import write_pictures
+from tomo_polysplat.simulate.folders.write import write_folder
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_folder("skyscan", tmp_path / "sample", marked())
+    return tmp_path / "sample"
+
+
+def change(folder, *pairs):
+    log = folder / "marker_.log"
+    text = log.read_text()
+    for old, new in pairs:
+        assert old in text
+        text = text.replace(old, new)
+    log.write_text(text)
+
+
+def guesses(scan):
+    return " | ".join(scan.notes["scanner"]["guessed"])
+
+
+def test_the_log_is_kept_and_nothing_but_the_detector_is_guessed(folder):
+    scan = tps.load_scan(folder)
+    told = scan.notes["scanner"]
+    assert (told["kind"], told["tube_kv"], told["filter"]) == ("Bruker SkyScan (.log)", "90.0", "1 mm Al")
+    assert told["exposure_s"] == "0.057" and scan.name == "marker" and len(told["guessed"]) == 1
+    assert told["keys"]["System/Scanner"] == "SkyScan1275" and "Acquisition/Exposure (ms)" not in told["keys"]
+    # Air is brighter than the open beam in half of the pixels, and never saturated.
+    assert scan.valid is None and (scan.projections < 0).mean() > 0.2
+
+
+def test_raw_pictures_with_flats_and_darks_that_turn_the_other_way(tmp_path):
+    pictures = pictures_of(marked())
+    for prefix, frames in (
+        ("marker_", pictures.projections),
+        ("flat", pictures.flats),
+        ("dark", pictures.darks),
+    ):
+        write_pictures(tmp_path, prefix, frames[:, :, ::-1])
+    (tmp_path / "marker_.log").write_text(log_text(pictures))
+    change(tmp_path, ("Correction=ON", "Correction=OFF"), ("Direction=CC", "Direction=CW"))
+    require_the_same_volume(tps.load_scan(tmp_path), marked())
+
+
+def test_a_renamed_folder_and_the_log_alone(folder):
+    for file in folder.glob("marker_*"):
+        file.rename(folder / file.name.replace("marker_", "other"))
+    require_the_same_volume(tps.load_scan(folder / "other.log"), marked())
+
+
+def test_the_optical_axis_is_counted_from_the_lowest_line(folder):
+    """Lines above it, of 0.64 mm at the axis, are as many more that the volume has above the source's plane."""
+    change(folder, ("(line)=  16", "(line)=  12"))
+    scan = tps.load_scan(folder)
+    option = scan.vol_geom["option"]
+    assert (option["WindowMinZ"] + option["WindowMaxZ"]) / 2 == pytest.approx(4 * 0.64)
+
+
+def test_a_rolled_camera_is_said_and_undone_on_request(tmp_path):
+    """The pictures of a camera that is turned by 3 degrees are those of the same geometry with roll=3."""
+    change_to = {"roll": 3.0}
+    write_folder("skyscan", tmp_path / "a", marked())
+    change(tmp_path / "a", ("Rotation=0.00000", "Rotation=3.00000"))
+    plain, rolled = tps.load_scan(tmp_path / "a"), tps.load_scan(tmp_path / "a", scanner=change_to)
+    assert "rotation of 3 degrees is not undone" in guesses(plain)
+    upright, turned = (scan.proj_geom["Vectors"][0] for scan in (plain, rolled))
+    angle = np.deg2rad(3.0)
+    # Counterclockwise for one who looks along +y, x to the right and z up, about the detector's own middle.
+    np.testing.assert_allclose(turned[6:9], 1.6 * np.array([np.cos(angle), 0, np.sin(angle)]), atol=1e-9)
+    np.testing.assert_allclose(turned[9:], 1.6 * np.array([-np.sin(angle), 0, np.cos(angle)]), atol=1e-9)
+    np.testing.assert_allclose(turned[:6], upright[:6], atol=1e-9)
+
+
+def test_what_the_log_leaves_open_is_said(folder):
+    change(
+        folder,
+        ("Postalignment=-1.50", "Postalignment=0"),
+        ("Reference Intensity=57000", ""),
+        ("Rotation Direction=CC", ""),
+        ("X/Y Ratio=1.0000", "X/Y Ratio=1.0740"),
+        ("Filter=Al 1.0mm", "Filter=something"),
+        ("Files=  48", "Files=  50"),
+    )
+    scan = tps.load_scan(folder)
+    for words in (
+        "no Postalignment",
+        "no flat field: the open beam is taken to be 57",
+        "taken to be CC",
+        "1.074 times as wide as high",
+        "its filter is not known",
+        "48 pictures are there, the log tells of 50",
+    ):
+        assert words in guesses(scan)
+    assert scan.spectrum is None
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            "Rows=  33",
+            "Rows=  512",
+            "pictures of 512 x 37 pixels, as the log says, got 33 x 37; reconstructed slices",
+        ),
+        ("Object to Source (mm)=100.000", "Object to Source (mm)=far", "a number as 'Object to Source"),
+        ("Camera to Source (mm)=250.000", "Camera to Source (mm)=50", "at least source_object"),
+        ("Prefix=marker_", "Prefix=no", None),
+    ],
+)
+def test_logs_that_cannot_be_meant(folder, old, new, message):
+    change(folder, (old, new))
+    if message is None:  # the log's own name says which pictures are meant
+        assert tps.load_scan(folder).views == 48
+        return
+    with pytest.raises(ValueError, match=message):
+        tps.load_scan(folder)
+
+
+def test_two_scans_in_a_folder_are_to_be_named(folder):
+    (folder / "second.log").write_text((folder / "marker_.log").read_text())
+    with pytest.raises(
+        ValueError, match=r"one scan in the folder, got marker_.log, second.log; name its .log"
+    ):
+        tps.load_scan(folder)
+    assert tps.load_scan(folder / "marker_.log").views == 48
+
+
+def test_pictures_of_another_size_in_between(folder):
+    tifffile.imwrite(folder / "marker_0007.tif", np.ones((3, 4), np.uint16))
+    with pytest.raises(ValueError, match=r"\(33, 37\) as in marker_0000.tif"):
+        tps.load_scan(folder)
+
+
+@pytest.mark.parametrize(
+    ("text", "filters"),
+    [
+        ("Al 1.0mm", {"Al": 0.1}),
+        ("Al 1mm", {"Al": 0.1}),
+        ("0.5 mm Cu", {"Cu": 0.05}),
+        ("Al 0.5mm + Cu 0.038mm", {"Al": 0.05, "Cu": 0.0038}),
+        ("brass 250um", {"brass": 0.025}),
+        ("No Filter", {}),
+        ("", {}),
+        ("Al+Cu", None),
+        ("LE4", None),
+        ("Al 1", None),
+    ],
+)
+def test_filters_as_scanners_write_them(text, filters):
+    found = filters_of(text)
+    assert found == (None if filters is None else pytest.approx(filters))

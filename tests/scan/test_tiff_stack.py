@@ -1,0 +1,192 @@
+"""A plain stack of TIFFs: what is stated, what is guessed and said, and which part is read."""
+
+import logging
+
+import numpy as np
+import pytest
+import tifffile
+from folders import marked, require_the_same_volume
+
+import tomo_polysplat as tps
+from tomo_polysplat.scan.geometry import from_astra
+from tomo_polysplat.simulate.folders.scene import pictures_of
+from tomo_polysplat.simulate.folders.write import write_folder
+
+STATED = {"sod": 100.0, "sdd": 250.0, "pixel": 1.6, "offset": (2.4, 0.0), "arc": 360.0}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("stack") / "sample"
+    write_folder("tiffs", place, marked())
+    return place
+
+
+@pytest.fixture
+def bare(folder, tmp_path):
+    """The pictures alone."""
+    for file in folder.glob("*.tif"):
+        (tmp_path / file.name).symlink_to(file)
+    return tmp_path
+
+
+def test_counts_become_line_integrals_through_flats_and_darks(folder):
+    scan = tps.load_scan(folder)
+    assert scan.valid is None and scan.name == "sample" and scan.unit == "mm"
+    # Counts are whole numbers: half of one in the 30000 behind nothing.
+    np.testing.assert_allclose(scan.projections, marked().projections, atol=1e-4)
+
+
+def test_arguments_say_what_the_toml_file_says(bare, folder):
+    scan, told = tps.load_scan(bare, scanner=STATED), tps.load_scan(folder)
+    np.testing.assert_array_equal(scan.projections, told.projections)
+    assert scan.proj_geom.keys() == told.proj_geom.keys()
+    np.testing.assert_allclose(scan.proj_geom["Vectors"], told.proj_geom["Vectors"], atol=1e-12)
+    assert scan.spectrum is None  # the tube stands in the file only
+
+
+def test_pictures_sorted_into_folders_and_angles_from_a_file(tmp_path):
+    pictures = pictures_of(marked())
+    for name, frames in (
+        ("Flats", pictures.flats),
+        ("dark_field", pictures.darks),
+        ("proj", pictures.projections),
+    ):
+        (tmp_path / name).mkdir()
+        for k, frame in enumerate(frames):
+            # Picture 10 comes after picture 9, whatever the letters say.
+            tifffile.imwrite(tmp_path / name / f"a{k}.tiff", frame)
+    lines = [f"{k} {angle}" for k, angle in enumerate(pictures.degrees)]
+    (tmp_path / "angles.txt").write_text("# view and degrees\n" + "\n".join(lines))
+    stated = {key: value for key, value in STATED.items() if key != "arc"} | {"degrees": "angles.txt"}
+    require_the_same_volume(tps.load_scan(tmp_path, scanner=stated), marked())
+
+
+def test_one_file_of_many_pictures_seen_from_behind_and_upside_down(tmp_path):
+    """A panel is often read out from its back, and a picture may begin at the bottom."""
+    pictures = pictures_of(marked())
+    turned = {"first_row": "bottom", "seen_from": "detector", "flats": "flats.tif", "darks": "darks.tif"}
+    for name in ("projections", "flats", "darks"):
+        frames = getattr(pictures, name)[:, ::-1, ::-1]
+        tifffile.imwrite(tmp_path / f"{name}.tif", frames, photometric="minisblack")
+    scan = tps.load_scan(tmp_path / "projections.tif", scanner=STATED | turned)
+    require_the_same_volume(scan, marked())
+
+
+def test_a_parallel_beam(tmp_path):
+    own = marked("parallel")
+    write_folder("tiffs", tmp_path / "sample", own)
+    (tmp_path / "sample" / "scan.toml").unlink()
+    stated = {"beam": "parallel", "pixel": 0.64, "offset": (0.96, 0.0)}
+    require_the_same_volume(tps.load_scan(tmp_path / "sample", scanner=stated), own)
+
+
+def test_rows_columns_views_and_binning(folder):
+    whole = tps.load_scan(folder)
+    part = tps.load_scan(folder, rows=(2, 31), columns=(5, 36), views=(1, 47, 3), binning=2)
+    assert part.projections.shape == (14, 16, 15)
+    # The light of four pixels: rows run upwards in the scan, downwards in the pictures.
+    light = np.exp(-whole.projections.astype(np.float64))
+    four = light[33 - 4 : 33 - 2, 1, 5:7].mean()
+    assert -np.log(four) == pytest.approx(part.projections[13, 0, 0], abs=2e-3)
+    # A point falls on the same place of the detector.
+    point = np.array([[3.0, -2.0, 1.0]])
+    fine, coarse = (
+        from_astra(scan.proj_geom, scan.vol_geom)[0].project_points(point) for scan in (whole, part)
+    )
+    first = np.array([5, 33 - 2 - 28])
+    np.testing.assert_allclose(coarse[:, 0], (fine[1:47:3, 0] - first - 0.5) / 2, atol=1e-9)
+    assert from_astra(part.proj_geom, part.vol_geom)[1].voxel_size[0] == pytest.approx(2 * 0.64)
+
+
+def test_the_package_s_own_file_in_part(folder, tmp_path):
+    tps.save_scan(tps.load_scan(folder), tmp_path / "scan.h5")
+    # Its rows ascend with z: the same part is counted from the other end.
+    ours = tps.load_scan(tmp_path / "scan.h5", rows=(3, 31), columns=(5, 35), views=3, binning=2)
+    pictures = tps.load_scan(folder, rows=(2, 30), columns=(5, 35), views=3, binning=2)
+    np.testing.assert_allclose(ours.projections, pictures.projections, atol=2e-3)
+    np.testing.assert_allclose(ours.proj_geom["Vectors"], pictures.proj_geom["Vectors"], atol=1e-9)
+
+
+def test_saturated_dead_and_dark_pixels_are_marked(tmp_path):
+    pictures = pictures_of(marked())
+    pictures.projections[3, 4, 5] = 65535
+    pictures.projections[6, 7, 8] = 100
+    pictures.flats[:, 9, 10] = 100
+    from tomo_polysplat.simulate.folders import tiffs
+
+    tiffs.write(tmp_path, pictures)
+    scan = tps.load_scan(tmp_path)
+    assert scan.notes["rays"] == {"not_finite": 0, "saturated": 1, "dead_pixel": 48, "no_light": 1}
+    assert not scan.valid[33 - 1 - 4, 3, 5] and scan.projections[33 - 1 - 7, 6, 8] == np.inf
+    binned = tps.load_scan(tmp_path, binning=3)
+    # Of 33 rows from the top, 11 squares: the saturated pixel is in the second, and so is the whole square.
+    assert not binned.valid[11 - 1 - 1, 3, 1]
+
+
+def test_what_is_guessed_is_said(bare, caplog):
+    for file in [*bare.glob("flat*"), *bare.glob("dark*")]:
+        file.unlink()
+    with caplog.at_level(logging.WARNING):
+        scan = tps.load_scan(bare, scanner={"sod": 100, "sdd": 250, "pixel": 1.6})
+    for words in ("no flat field", "no angles: 48 views", "on the detector's middle"):
+        assert words in caplog.text and any(words in guess for guess in scan.notes["scanner"]["guessed"])
+
+
+@pytest.mark.parametrize(
+    ("stated", "message"),
+    [
+        ({}, "the distances and the pixel of the scanner.*--sod, --sdd, --pixel"),
+        ({"pixel": 1.6, "sod": 100.0}, "both distances of a cone beam, got not both"),
+        (STATED | {"sdd": 50.0}, "source_detector: expected at least source_object"),
+        (STATED | {"degrees": np.arange(5.0)}, "degrees, arc: expected one of the two"),
+        ({**STATED, "arc": None, "degrees": np.arange(5.0)}, "one angle for each of 48 pictures, got 5"),
+        (STATED | {"piksel": 1.0}, "did you mean pixel"),
+        (STATED | {"filter": "a bit of metal"}, "a material and its thickness"),
+        (STATED | {"flats": "none_*.tif"}, "flats: .* of which there is none"),
+        (STATED | {"seen_from": "above"}, "one of source, detector"),
+        (STATED | {"unit": "inch"}, "unit: expected one of"),
+    ],
+)
+def test_what_does_not_fit_is_refused(bare, stated, message):
+    with pytest.raises(ValueError, match=message):
+        tps.load_scan(bare, scanner=stated)
+
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [
+        ({"rows": (5, 99)}, "rows: expected first < end, from 0 to 33, got 5, 99"),
+        ({"views": 0}, "views: expected a positive whole number"),
+        ({"binning": 50}, "binning: expected at most the 33 rows"),
+        ({"columns": 7}, "columns: expected two whole numbers"),
+    ],
+)
+def test_a_part_outside_the_pictures_is_refused(folder, part, message):
+    with pytest.raises(ValueError, match=message):
+        tps.load_scan(folder, **part)
+
+
+def test_pictures_that_do_not_go_together_are_refused(bare):
+    tifffile.imwrite(bare / "flat_0009.tif", np.ones((5, 6), np.uint16))
+    with pytest.raises(ValueError, match=r"\(33, 37\) as in flat_0000.tif, got uint16 of \(5, 6\)"):
+        tps.load_scan(bare, scanner=STATED)
+    (bare / "flat_0009.tif").write_bytes(b"II*\0 something else")
+    with pytest.raises(ValueError, match="a readable TIFF file"):
+        tps.load_scan(bare, scanner=STATED)
+
+
+def test_a_folder_without_pictures_is_refused(tmp_path):
+    with pytest.raises(
+        ValueError, match="a Data Exchange HDF5 file, an .npz scan, or one of: .*stack of TIFFs"
+    ):
+        tps.load_scan(tmp_path)
+    with pytest.raises(FileNotFoundError):
+        tps.load_scan(tmp_path / "missing")
+
+
+def test_texts_of_files_are_shown_as_they_are(folder, bare):
+    text = (folder / "scan.toml").read_text() + 'comment = "\\u001b[31mred"\n'
+    (bare / "scan.toml").write_text(text)
+    keys = tps.load_scan(bare).notes["scanner"]["keys"]
+    assert keys == {"operator": "nobody", "comment": "\\x1b[31mred"}

@@ -1,0 +1,45 @@
+"""Whether rays are seen through the detector's blur."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tomo_polysplat.physics.detector_blur import describe_blur
+from tomo_polysplat.plan.answer import Answer, Status
+from tomo_polysplat.plan.decision import Decision, Known
+from tomo_polysplat.plan.decisions.soft_reference import SoftReference
+from tomo_polysplat.plan.lab import Lab
+from tomo_polysplat.settings import Settings
+
+__all__ = ["DetectorBlur"]
+
+
+class DetectorBlur(Decision):
+    """Are rays seen through a blur of the detector?
+
+    Where the blur is to be fitted, metal must show that edges are sharp; see ``physics.detector_blur``.
+    """
+
+    name = "detector_blur"
+    needs = (SoftReference,)
+
+    def given(self, settings: Settings) -> Any | None:
+        """The settings say how much it is and whether it is fitted; see `ask`."""
+        return None
+
+    def valid(self, value: object) -> bool:
+        """Yes or no."""
+        return isinstance(value, bool)
+
+    def ask(self, known: Known, lab: Lab) -> Answer:
+        """Where the start has metal."""
+        settings = lab.settings
+        if not settings.learning_rate_blur:
+            return Answer(settings.blur > 0, describe_blur(settings.blur, fitted=False), Status.GIVEN)
+        soft = known[SoftReference]["first"] * lab.problem.depth
+        if bool((lab.start > settings.metal_level * soft).any()):
+            why = f"fitted, from a variance of {settings.blur:g} squared pixels on: metal has edges that hold it"
+            return Answer(True, why, Status.ASKED)
+        return Answer(
+            False, "none: without metal, a smooth object and a detector that blurs look alike", Status.ASKED
+        )

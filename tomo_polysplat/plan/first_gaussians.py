@@ -1,0 +1,111 @@
+"""Gaussians to start a fit from, and what they cost."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+
+from tomo_polysplat.fit.memory import most_gaussians, require_room, room_for_gaussians
+from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.model.seed import seed_gaussians
+from tomo_polysplat.plan.costs import work
+from tomo_polysplat.plan.plan import Plan
+from tomo_polysplat.plan.resolution import finest_spacing
+from tomo_polysplat.settings import Settings
+
+__all__ = ["AVERAGED_RAYS", "first_gaussians", "room_to_grow"]
+
+# Rays a pixel and axis where the light is averaged: with three pins of 36^3 are no better than with two (45.4 and 48.4
+# dB everywhere).
+AVERAGED_RAYS = 2
+
+
+def first_gaussians(
+    start: np.ndarray | torch.Tensor, plan: Plan, problem: Problem, settings: Settings, device: torch.device
+) -> tuple[Gaussians, dict[str, Any]]:
+    """Seeds of a start volume, and their number, work and memory as facts for the plan.
+
+    Parameters
+    ----------
+    start : (nz, ny, nx) array or tensor
+        First reconstruction in the solver's units (`plan.first_volume`).
+    plan : Plan
+    problem : Problem
+    settings : Settings
+    device : torch.device
+
+    Raises
+    ------
+    ValueError
+        If a CUDA device has too little memory left.
+    """
+    relative = start / (problem.depth * plan.reference)
+    spacing = plan.spacing * problem.voxel
+    # A spacing that was asked for is nobody's lack of Gaussians, which thin ones make up for.
+    finest = math.inf if settings.seed_spacing else finest_spacing(problem)[0] * problem.voxel
+    finest = 0.0 if plan.sharp else finest
+    several = plan.curves > 1
+    gaussians = seed_gaussians(
+        relative,
+        problem.grid,
+        spacing,
+        plan.adapted(settings),
+        several,
+        problem.planar,
+        device,
+        plan.finer,
+        finest,
+    )
+    free = int((gaussians.group < 0).sum())
+    kinds = "none with a material number of its own"
+    if several:
+        kinds = f"the material number free for {free} and for {len(gaussians.shared_material) - 1} pieces of metal"
+    values = problem.measured(device)
+    memory = require_room(
+        device,
+        gaussians=math.ceil(_runs(plan) * max(settings.growth or 1.0, 1.0) * len(gaussians)),
+        **_all_else(plan, problem),
+        projections=values.nbytes if values.device.type == device.type else 0,
+    )
+    return gaussians, {
+        "gaussians": (len(gaussians), kinds),
+        "work": ("", work(plan, problem, settings, len(gaussians))),
+        "memory": ("", memory),
+    }
+
+
+def room_to_grow(gaussians: int, plan: Plan, problem: Problem, device: torch.device) -> float:
+    """How many times as many Gaussians there would be memory for.
+
+    Parameters
+    ----------
+    gaussians : int
+    plan : Plan
+    problem : Problem
+    device : torch.device
+    """
+    room = room_for_gaussians(device, **_all_else(plan, problem)) / _runs(plan)
+    return min(room, most_gaussians(device)) / max(gaussians, 1)
+
+
+def _runs(plan: Plan) -> int:
+    """How many runs there are at once.
+
+    While it is asked whether pixels average light there are two, of thin rays and of averaged ones; while it is asked
+    whether light matter is fat, two of the same.
+    """
+    return 1 if plan.pixel_rays and plan.fat is not None else 2
+
+
+def _all_else(plan: Plan, problem: Problem) -> dict[str, int]:
+    """What memory is needed for besides Gaussians, as `fit.memory` asks."""
+    rays = _runs(plan) * plan.pixel_rays**2 if plan.pixel_rays else 1 + AVERAGED_RAYS**2
+    return {
+        "views": plan.views_per_step,
+        "pixels": rays * problem.geometry.rows * problem.geometry.columns,
+        "voxels": math.prod(problem.grid.shape),
+    }

@@ -1,0 +1,56 @@
+"""The first reconstruction, from which a fit is planned and seeded."""
+
+from __future__ import annotations
+
+import torch
+
+from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.physics.materials import mass_attenuation
+from tomo_polysplat.physics.water import areal_density, transmitted_energy
+from tomo_polysplat.plan.decisions.soft_reference import soft_reference
+from tomo_polysplat.settings import Settings
+from tomo_polysplat.start.bridged import bridged_start
+from tomo_polysplat.start.initial import initial_volume_on
+
+__all__ = ["first_volume"]
+
+# An object of one solid looks too light as long as it is taken for water, and less so each time it is looked at.
+_TIMES = 2
+
+
+def first_volume(problem: Problem, device: torch.device, settings: Settings) -> tuple[torch.Tensor, str]:
+    """A volume (nz, ny, nx) by classical means, and how it was made.
+
+    Under a spectrum it is an attenuation in that of the first material of 1 g/cm3, else one per unit of length; either
+    times ``problem.depth``. Rays through what shows as metal are bridged where that helps.
+    """
+    primary = problem.primary(device)
+    values = _as_if_soft(problem, primary)
+    volume, done = initial_volume_on(values, problem.geometry, problem.grid)
+    reference = soft_reference(volume, problem, settings)
+    problem.remember_solid(reference.value != reference.first)
+    for _ in range(_TIMES if problem.solid else 0):
+        values = _as_if_solid(problem, primary, reference.number)
+        volume, done = initial_volume_on(values, problem.geometry, problem.grid)
+        reference = soft_reference(volume, problem, settings, problem.solid)
+    metal = reference.adapted(settings).metal_level * problem.depth * reference.value
+    volume, bridged = bridged_start(
+        values, volume, done["method"], problem.geometry, problem.grid, metal=metal
+    )
+    return volume, f"{done['method'].upper()}: {done['reason']}{bridged}"
+
+
+def _as_if_soft(problem: Problem, primary: torch.Tensor) -> torch.Tensor:
+    """Line integrals, were the object all of the first material, of its density; for one energy of attenuation."""
+    if problem.spectrum is None or problem.materials is None:
+        return primary
+    return areal_density(primary, problem.spectrum, problem.materials.soft)
+
+
+def _as_if_solid(problem: Problem, primary: torch.Tensor, number: float) -> torch.Tensor:
+    """Line integrals, were the object all of one material number, of attenuation in that of the first material."""
+    assert problem.spectrum is not None and problem.materials is not None
+    solid = problem.materials.mixed(max(number, 0.0))
+    energy = transmitted_energy(primary, problem.spectrum)
+    ratio = mass_attenuation(solid, energy) / mass_attenuation(problem.materials.soft, energy)
+    return areal_density(primary, problem.spectrum, solid) * float(ratio)

@@ -1,0 +1,142 @@
+"""What a question may use: the scan, its start volume, and the one recipe of a short fit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import torch
+
+from tomo_polysplat.fit.optimise import FitOutcome, Run
+from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.plan.first_gaussians import first_gaussians
+from tomo_polysplat.plan.model import rays_of, scene_of
+from tomo_polysplat.plan.plan import Plan
+from tomo_polysplat.plan.trial import TOO_SHORT, fitted_shortly
+from tomo_polysplat.plan.unit_check import doubt_lengths
+from tomo_polysplat.settings import Settings
+
+__all__ = ["Lab", "Untold"]
+
+
+class Untold(Exception):
+    """A question that the data could not answer, and why."""
+
+
+@dataclass(eq=False)
+class Lab:
+    """One scan, ready to be asked.
+
+    Attributes
+    ----------
+    problem : Problem
+    start : (nz, ny, nx) tensor or None
+        First reconstruction in the solver's units (`plan.first_volume`); None during a run.
+    settings : Settings
+        The caller's.
+    device : torch.device
+    seed : int
+    time_budget : float or None
+        Seconds of the whole reconstruction.
+    plan : Plan
+        What has been decided so far.
+    short_fit : callable or None
+        Fits the start under other settings, for so many steps (`plan.short_fit.short_fit`).
+    calibrate : callable or None
+        Makes the short fits that tell scatter, and returns their record.
+    gaussians : Gaussians or None
+        That the run begins with, or goes on with from a checkpoint.
+    run : Run or None
+        The run, between two of its passes.
+    """
+
+    problem: Problem
+    start: Any
+    settings: Settings
+    device: torch.device
+    seed: int = 0
+    time_budget: float | None = None
+    plan: Plan = field(default_factory=Plan)
+    short_fit: Callable[..., Any] | None = None
+    calibrate: Callable[[], dict[str, Any]] | None = None
+    gaussians: Gaussians | None = None
+    run: Run | None = None
+    _seeds: dict[Any, tuple[Gaussians, dict[str, Any]]] = field(default_factory=dict, init=False)
+    _trials: dict[Any, FitOutcome] = field(default_factory=dict, init=False)
+
+    @cached_property
+    def relative(self) -> torch.Tensor:
+        """(nz, ny, nx) the start in soft references."""
+        return torch.as_tensor(self.start) / (self.plan.reference * self.problem.depth)
+
+    @cached_property
+    def support(self) -> int:
+        """Voxels of the start that are not empty."""
+        return int((self.start > self.least).sum())
+
+    @property
+    def least(self) -> float:
+        """What the start holds less of is empty, in its own units."""
+        return self.plan.support_level * self.plan.reference * self.problem.depth
+
+    @cached_property
+    def scene(self) -> FitScene:
+        """The forward model under what was decided from the start."""
+        return scene_of(self.problem, self.plan, self.settings, self.device)
+
+    @cached_property
+    def rays(self) -> Rays:
+        """The measured rays."""
+        return rays_of(self.problem, self.plan, self.settings, self.device)
+
+    @property
+    def seeding(self) -> Settings:
+        """The settings of the fit to come, with what the search for an agent has changed."""
+        return replace(self.settings, **self.plan.value("agent", {}))
+
+    def seeds(self, **assumed: Any) -> Gaussians:
+        """Seeds of the plan, or of one with other values of some answers; made once, to be copied before a fit."""
+        return self._seeded(self.plan.assuming(**assumed))[0]
+
+    def facts_of_seeds(self) -> Mapping[str, Any]:
+        """What was counted when the seeds of the plan were made."""
+        return self._seeded(self.plan)[1]
+
+    def _seeded(self, plan: Plan) -> tuple[Gaussians, dict[str, Any]]:
+        key = (plan.spacing, plan.sharp, self.seeding)
+        if key not in self._seeds:
+            self._seeds[key] = first_gaussians(self.start, plan, self.problem, self.seeding, self.device)
+        return self._seeds[key]
+
+    def trial(self, settings: Settings, rays: Rays | None = None, **assumed: Any) -> FitOutcome:
+        """A short fit of the seeds of the plan, or of one with other values of some answers; made once.
+
+        Raises
+        ------
+        Untold
+            If the time budget ended it.
+        """
+        plan, rays = self.plan.assuming(**assumed), rays or self.rays
+        key = (settings, rays.held_out, plan.spacing, plan.sharp, self.seeding)
+        if key not in self._trials:
+            seeds = self._seeded(plan)[0].copy()
+            parts = (seeds, plan, self.problem, self.scene, rays, settings)
+            self._trials[key] = fitted_shortly(*parts, self.seed, self.time_budget)
+        outcome = self._trials[key]
+        if outcome.stop is not None and outcome.stop.by_time:
+            raise Untold(TOO_SHORT)
+        return outcome
+
+    def forget_trials(self) -> None:
+        """Let go of what short fits hold in memory."""
+        self._trials.clear()
+        self._seeds.clear()
+
+    def doubt_lengths(self, words: str) -> None:
+        """Say that the unit of length looks wrong."""
+        doubt_lengths(self.plan.facts, words)

@@ -1,0 +1,92 @@
+"""The forward model of a scan under a plan, and the measured rays that it is compared with."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.kernels import select
+from tomo_polysplat.physics.base_materials import Materials
+from tomo_polysplat.physics.solids import number_of_solid
+from tomo_polysplat.plan.plan import Plan
+from tomo_polysplat.plan.spectral_model import spectral_model
+from tomo_polysplat.render.renderer import detector_views, voxel_box
+from tomo_polysplat.settings import Settings
+
+__all__ = ["all_curves", "rays_of", "scene_of"]
+
+logger = logging.getLogger(__name__)
+
+
+def scene_of(problem: Problem, plan: Plan, settings: Settings, device: torch.device) -> FitScene:
+    """The forward model; what was chosen for it is noted in the plan."""
+    kernel, why = select.choose(device, settings.kernel)
+    plan.note("kernel", kernel, why)
+    quadrature, reference_curve, output_curve, least_u = spectral_model(problem, plan, settings, device)
+    # One node of one curve: -log(I/I0) is in proportion to the areal density.
+    straight = quadrature is not None and quadrature.attenuation.size == 1
+    slope = float(quadrature.attenuation[0, 0]) if quadrature is not None and straight else 1.0
+    closed, words = problem.closed(device)
+    plan.note("window", "closed" if closed else "open", words)
+    return FitScene(
+        box=voxel_box(problem.grid),
+        quadrature=None if straight else quadrature,
+        areal_scale=problem.depth * plan.reference * slope,
+        reference_curve=reference_curve,
+        output_curve=output_curve,
+        least_u=least_u,
+        kernel=kernel,
+        cutoff=settings.cutoff,
+        metal_tail=settings.metal_tail,
+        blurring=plan.blurred,
+        tv_corners=plan.tv_corners,
+        closed=closed,
+        tv_every=plan.tv_every,
+        smallest_scale=plan.smallest_scale,
+        pixel_rays=max(plan.pixel_rays, 1),
+        light_u=settings.light_u if plan.fat else 0.0,
+        solid_number=_solid_number(problem, plan, settings),
+    )
+
+
+def rays_of(problem: Problem, plan: Plan, settings: Settings, device: torch.device) -> Rays:
+    """The measured rays on the device."""
+    photons = float("inf") if settings.loss == "l1" else problem.photons(device)
+    plan.note("photons_per_ray", photons, "from the scatter of neighbouring pixels")
+    views = detector_views(problem.geometry, problem.planar)
+    values = problem.measured(device)
+    target = None if values.device.type == device.type else device
+    return Rays(values, views, photons, settings.model_error, settings.held_out, target)
+
+
+def _solid_number(
+    problem: Problem, plan: Plan, settings: Settings
+) -> Callable[[np.ndarray], np.ndarray] | None:
+    """Numbers of solids by attenuation at the volume's energy, for curves that they are known for."""
+    other = problem.materials != Materials() or settings.metal_u != Settings().metal_u
+    if problem.spectrum is None or other:
+        return None
+    energy = problem.spectrum.effective_energy
+    return lambda levels: number_of_solid(plan.reference * levels, energy)
+
+
+def all_curves(problem: Problem, basis: np.ndarray, plan: Plan, dense: float) -> np.ndarray:
+    """(3, nz, ny, nx) densities of the material curves from those of the model, which may lack two.
+
+    Matter denser than so many soft references, which the start did not show, is told in the log and the plan.
+    """
+    if problem.materials is None or len(basis) > 1:
+        return basis
+    found = float(basis.max(initial=0.0)) / plan.reference
+    if found > dense:
+        words = f"the fit found {found:.2g} soft references where the start had none above {dense:g}"
+        words += f"; settings={{'bone_level': {0.7 * dense:.2g}}} would free material numbers there"
+        plan.note("dense_matter", found, words)
+        logger.warning("One curve may be too few: %s.", words)
+    return np.concatenate([basis, np.zeros((2, *basis.shape[1:]), np.float32)])

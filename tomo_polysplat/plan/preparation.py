@@ -1,0 +1,200 @@
+"""What a fit begins with: a caller's options, the physics, the plan, and the first Gaussians."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from tomo_polysplat.checks import fail, require_number
+from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.stopping import FitState
+from tomo_polysplat.kernels.select import pick_fast_device
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.plan.answer import Answer, Status
+from tomo_polysplat.plan.calibrated_physics import describe_scatter, with_fitted
+from tomo_polysplat.plan.calibration import Calibration, calibrated
+from tomo_polysplat.plan.checkpoint import Checkpoint
+from tomo_polysplat.plan.decision import When
+from tomo_polysplat.plan.first_volume import first_volume
+from tomo_polysplat.plan.lab import Lab
+from tomo_polysplat.plan.model import rays_of, scene_of
+from tomo_polysplat.plan.order import alternatives, decide, decide_start
+from tomo_polysplat.plan.plan import Plan
+from tomo_polysplat.plan.short_fit import ShortFit, short_fit
+from tomo_polysplat.settings import Settings, make_settings
+
+__all__ = ["PreparedFit", "RunOptions", "calibrate", "fit_start", "physics", "prepare", "under"]
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How a caller wants a scan fitted, checked.
+
+    Attributes
+    ----------
+    settings : Settings
+    time_budget : float or None
+        Seconds.
+    seed : int
+    device : torch.device
+    callbacks : list of callables
+    """
+
+    settings: Settings
+    time_budget: float | None
+    seed: int
+    device: torch.device
+    callbacks: list[Callable[[FitState], Any]]
+
+    @classmethod
+    def of(
+        cls, quality: str, settings: Any, time_budget: Any, seed: Any, device: str, callbacks: Any
+    ) -> RunOptions:
+        """Those of `reconstruct`'s arguments."""
+        chosen = make_settings(quality, settings)
+        if time_budget is not None:
+            time_budget = require_number("time_budget", time_budget, above=0)
+        return cls(chosen, time_budget, _whole(seed), pick_fast_device(device), _functions(callbacks))
+
+    def to_dict(self) -> dict[str, Any]:
+        """All that the result depends on, for a checkpoint."""
+        return self.settings.to_dict() | {"seed": self.seed, "time_budget": self.time_budget}
+
+
+@dataclass(frozen=True)
+class PreparedFit:
+    """All that a fit starts from."""
+
+    plan: Plan
+    gaussians: Gaussians
+    scene: FitScene
+    rays: Rays
+
+
+def physics(
+    problem: Problem,
+    wanted: Calibration | None,
+    run_options: RunOptions,
+    saved: Checkpoint | None,
+    report: Callable[[float, str], Any],
+) -> tuple[Problem, Plan]:
+    """The problem under the physics that short fits, or those of a checkpoint, have found, and a plan that says so."""
+    if saved is not None and saved.plan is not None:
+        found = saved.plan.facts.get("calibration")
+        return under(problem, None if found is None else found.value)
+    if wanted is None:
+        return problem, Plan()
+    report(0.0, "calibration")
+    return under(problem, calibrate(problem, wanted, run_options))
+
+
+def calibrate(problem: Problem, wanted: Calibration, run_options: RunOptions) -> dict[str, Any]:
+    """The record of a calibration."""
+    return calibrated(
+        problem, wanted, run_options.settings, run_options.device, run_options.seed, run_options.time_budget
+    )
+
+
+def under(problem: Problem, found: dict[str, Any] | None) -> tuple[Problem, Plan]:
+    """The problem under what a calibration has found, and a plan that tells of it."""
+    plan = Plan()
+    if found is None:
+        return problem, plan
+    plan.note("calibration", found)
+    if "scatter" in found["accepted"]:
+        modelled = bool(found["accepted"]["scatter"])
+        why = f"modelled: {describe_scatter(found['fitted'])}" if modelled else f"none: {found['why']}"
+        plan.answers["scatter"] = Answer(found["fitted"] if modelled else {}, why, Status.ASKED)
+    return with_fitted(problem, found["fitted"]), plan
+
+
+def prepare(
+    problem: Problem,
+    plan: Plan,
+    run_options: RunOptions,
+    saved: Checkpoint | None,
+    report: Callable[[float, str], Any],
+) -> PreparedFit:
+    """Decide, seed and set up, or go on from where a checkpoint was.
+
+    Parameters
+    ----------
+    problem : Problem
+    plan : Plan
+        What is known of the physics; that of a checkpoint tells it already.
+    run_options : RunOptions
+    saved : Checkpoint or None
+    report : callable
+        Gets the share done, none, and words.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        After Ctrl-C: there is no result yet.
+    """
+    settings, device = run_options.settings, run_options.device
+    try:
+        if saved is not None and saved.snapshot is not None and saved.plan is not None:
+            plan, gaussians = saved.plan, saved.snapshot.gaussians.to(device)
+            scene = scene_of(problem, plan, settings, device)
+            return PreparedFit(plan, gaussians, scene, rays_of(problem, plan, settings, device))
+        report(0.0, "start volume")
+        start, why = first_volume(problem, device, settings)
+        lab = Lab(
+            problem, start, settings, device, run_options.seed, run_options.time_budget, plan, fit_start
+        )
+        decide_start(lab)
+        scene, rays = lab.scene, lab.rays
+        report(0.0, "seeds")
+        plan.note("start", why)
+        decide(lab, When.TRIAL)
+        gaussians, facts = lab.seeds(), lab.facts_of_seeds()
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("interrupted before the fit had begun: there is no result yet") from None
+    _tell(plan, problem, facts)
+    plan.note("alternatives", alternatives(lab))
+    if saved is not None:
+        saved.plan = plan
+    return PreparedFit(plan, gaussians, scene, rays)
+
+
+def fit_start(lab: Lab, settings: Settings, steps: int) -> ShortFit:
+    """A short fit of the start of a ``lab`` under other settings."""
+    assert lab.start is not None
+    return short_fit(
+        lab.problem, lab.start, {}, settings, lab.device, lab.seed, lab.time_budget, fewest_steps=steps
+    )
+
+
+def _tell(plan: Plan, problem: Problem, facts: Mapping[str, tuple[Any, str]]) -> None:
+    """Note what is no choice: the kind of model, and what the seeds came to."""
+    known = (
+        ("polychromatic", "a spectrum was given")
+        if problem.polychromatic
+        else ("monochromatic", "no spectrum was given, or one of a single energy")
+    )
+    plan.note("model", *known)
+    flat, solid = "one row and one slice in one plane", "several rows or slices, or rays that leave the plane"
+    plan.note("dimensions", problem.dimensions, flat if problem.planar else solid)
+    for name, (value, why) in facts.items():
+        plan.note(name, value, why)
+
+
+def _whole(seed: Any) -> int:
+    number = require_number("seed", seed, at_least=0)
+    if number != int(number):
+        raise fail("seed", "a whole number", repr(seed))
+    return int(number)
+
+
+def _functions(callbacks: Any) -> list[Callable[[FitState], Any]]:
+    functions = [callbacks] if callable(callbacks) else list(callbacks)
+    for function in functions:
+        if not callable(function):
+            raise fail("callbacks", "functions of a FitState", repr(function), error=TypeError)
+    return functions

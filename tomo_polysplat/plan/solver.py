@@ -1,0 +1,163 @@
+"""The fit of a scan from its physics to the fitted Gaussians, begun anew where the rays show other physics."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from tomo_polysplat.fit.optimise import FitOutcome, Run, fit
+from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.stopping import Stop, StopReason
+from tomo_polysplat.fit.surroundings import cut_out
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.plan.answer import Answer, Status
+from tomo_polysplat.plan.calibration import Calibration
+from tomo_polysplat.plan.checkpoint import Checkpoint
+from tomo_polysplat.plan.decision import When
+from tomo_polysplat.plan.lab import Lab
+from tomo_polysplat.plan.order import ask_between, decide
+from tomo_polysplat.plan.plan import Plan
+from tomo_polysplat.plan.preparation import PreparedFit, RunOptions, calibrate, physics, prepare, under
+from tomo_polysplat.transfer import to_host
+
+__all__ = ["Solver"]
+
+logger = logging.getLogger(__name__)
+
+# Seconds that are kept for what comes after the fit besides the volume, where there is a time budget.
+_FINISHING = 0.03
+
+
+@dataclass(frozen=True)
+class Solver:
+    """How a scan is fitted.
+
+    Attributes
+    ----------
+    run_options : RunOptions
+    saved : Checkpoint or None
+    started : float
+        When the reconstruction began, in seconds of ``time.perf_counter``.
+    flipped : bool
+        Whether callbacks get slices with row 0 at the largest y.
+    report : callable
+        Gets the share done, and words.
+    """
+
+    run_options: RunOptions
+    saved: Checkpoint | None
+    started: float
+    flipped: bool
+    report: Callable[[float, str], Any]
+
+    def solve(
+        self, problem: Problem, wanted: Calibration | None, *, ask_scatter: bool
+    ) -> tuple[Problem, PreparedFit, FitOutcome]:
+        """The problem under the physics that were found, with what its fit began from and came to.
+
+        Parameters
+        ----------
+        problem : Problem
+        wanted : Calibration or None
+            What is calibrated first.
+        ask_scatter : bool
+            Whether the rays are asked about scatter on the way.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            After Ctrl-C before the fit has begun.
+        """
+        problem, plan = physics(problem, wanted, self.run_options, self.saved, self.report)
+        prepared = prepare(problem, plan, self.run_options, self.saved, self.report)
+        outcome = self._fit(prepared, problem, ask_scatter)
+        if outcome.restart is None:
+            return problem, prepared, outcome
+        return self._anew(problem, prepared, outcome)
+
+    def _anew(
+        self, problem: Problem, prepared: PreparedFit, so_far: FitOutcome
+    ) -> tuple[Problem, PreparedFit, FitOutcome]:
+        """What `solve` gives, under other physics than those that a fit had begun with."""
+        found = so_far.restart
+        other, plan = under(problem, found)
+        try:
+            anew = prepare(other, plan, self.run_options, self.saved, self.report)
+            outcome = self._fit(anew, other, ask_scatter=False)
+            if outcome.history or outcome.stop is None or outcome.stop.reason is not StopReason.INTERRUPTED:
+                return other, anew, outcome
+        except KeyboardInterrupt:
+            logger.warning("Interrupted before the fit had begun anew; what it had come to is returned.")
+        prepared.plan.answers["scatter"] = Answer(
+            {}, f"not modelled: interrupted; {found['why']}", Status.USUAL
+        )
+        so_far.stop = Stop(StopReason.INTERRUPTED, "interrupted")
+        return problem, prepared, so_far
+
+    def _fit(self, prepared: PreparedFit, problem: Problem, ask_scatter: bool) -> FitOutcome:
+        plan, scene, run_options = prepared.plan, prepared.scene, self.run_options
+        settings = plan.adapted(run_options.settings)
+        return fit(
+            prepared.gaussians,
+            plan.spacing * problem.voxel,
+            prepared.rays,
+            scene,
+            replace(settings, passes=plan.passes),
+            views_per_step=plan.views_per_step,
+            rng=np.random.default_rng(run_options.seed),
+            started=self.started,
+            deadline=self._deadline(prepared),
+            volume=_volume_of(scene, plan, problem, self.flipped),
+            callbacks=[lambda state: self.report(state.share, state.describe()), *run_options.callbacks],
+            checkpoint=self.saved,
+            between=self._questions(prepared, problem, ask_scatter),
+        )
+
+    def _questions(self, prepared: PreparedFit, problem: Problem, ask_scatter: bool) -> Callable[[Run], None]:
+        """What asks between two passes what the plan has left open; what need not be asked is answered now."""
+        options = self.run_options
+
+        def scatter() -> dict[str, Any]:
+            self.report(0.0, "scatter")
+            found = calibrate(problem, Calibration(("scatter",), None, suspected=True), options)
+            if not found["accepted"]["scatter"]:
+                problem.let_go_of_level()
+            return found
+
+        lab = Lab(problem, None, options.settings, options.device, plan=prepared.plan)
+        lab.calibrate, lab.gaussians = scatter if ask_scatter else None, prepared.gaussians
+        decide(lab, When.DURING)
+        lab.gaussians = None
+        return lambda run: ask_between(lab, run)
+
+    def _deadline(self, prepared: PreparedFit) -> float | None:
+        """When the fit ends at the latest, so that the volume is made in time."""
+        budget = self.run_options.time_budget
+        if budget is None:
+            return None
+        # A volume that takes most of the budget still needs a fit: then the end is late.
+        end = self.started + budget
+        left = max(end - time.perf_counter(), 0.0)
+        volume = prepared.plan.growth * prepared.scene.seconds_of_basis(prepared.gaussians)
+        return end - min(volume + _FINISHING, 0.5 * left)
+
+
+def _volume_of(
+    scene: FitScene, plan: Plan, problem: Problem, flipped: bool
+) -> Callable[[Gaussians], np.ndarray]:
+    """A function from Gaussians to the volume in 1/unit, for callbacks."""
+    factor = plan.reference * problem.soft_attenuation()
+
+    def volume(gaussians: Gaussians) -> np.ndarray:
+        with torch.no_grad():
+            whole = cut_out(to_host(scene.volume(gaussians) * factor), problem.margin)
+        return np.ascontiguousarray(whole[0, ::-1]) if flipped else whole
+
+    return volume

@@ -1,0 +1,141 @@
+"""What a scanner's folder tells, whatever scanner it was."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tomo_polysplat.scan.circular import cone_geometry, parallel_geometry
+from tomo_polysplat.scan.geometry import Geometry, geometry_from_astra
+
+if TYPE_CHECKING:
+    from tomo_polysplat.scan.readers.frames import Frames
+
+__all__ = ["Acquisition", "Setup", "Tube"]
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A circular scan about z, for pictures as one sees them who looks from the source, z up.
+
+    Attributes
+    ----------
+    degrees : array, shape (views,)
+        Angles of the source, counterclockwise seen from +z.
+    pixel : float, or (width, height)
+        On the detector.
+    source_object, source_detector : float or None
+        None for a parallel beam.
+    offset : (u, v)
+        Of the detector's middle from the foot of the ray through the axis, to the right and up.
+    roll : float
+        Degrees by which the detector is turned about its middle, counterclockwise.
+    """
+
+    degrees: np.ndarray
+    pixel: float | tuple[float, float]
+    source_object: float | None = None
+    source_detector: float | None = None
+    offset: tuple[float, float] = (0.0, 0.0)
+    roll: float = 0.0
+
+    def geometry(self, rows: int, columns: int) -> Geometry:
+        """Of a detector whose rows ascend with z."""
+        known: dict[str, Any] = {"pixel": self.pixel, "degrees": self.degrees, "offset": self.offset}
+        known |= {"detector": (rows, columns)}
+        if self.source_object is None or self.source_detector is None:
+            proj_geom, _ = parallel_geometry(**known)
+        else:
+            known |= {"source_object": self.source_object, "source_detector": self.source_detector}
+            proj_geom, _ = cone_geometry(**known)
+        return _rolled(geometry_from_astra(proj_geom), self.roll)
+
+
+def _rolled(geometry: Geometry, degrees: float) -> Geometry:
+    if not degrees:
+        return geometry
+    width, height = (np.linalg.norm(step, axis=1, keepdims=True) for step in (geometry.u, geometry.v))
+    right, up, angle = geometry.u / width, geometry.v / height, np.deg2rad(degrees)
+    u = width * (np.cos(angle) * right + np.sin(angle) * up)
+    v = height * (np.cos(angle) * up - np.sin(angle) * right)
+    corner = geometry.centre - 0.5 * (geometry.columns - 1) * u - 0.5 * (geometry.rows - 1) * v
+    return replace(geometry, corner=corner, u=u, v=v)
+
+
+@dataclass(frozen=True)
+class Tube:
+    """The tube as the folder tells of it; None where it does not.
+
+    Attributes
+    ----------
+    kvp : float or None
+        In kV.
+    filters : mapping or None
+        Material and thickness in cm; empty if there is said to be none.
+    anode : str
+    """
+
+    kvp: float | None = None
+    filters: Mapping[str, float] | None = None
+    anode: str = "W"
+
+
+@dataclass(frozen=True, eq=False)
+class Acquisition:
+    """Pictures that are read when they are asked for, and what is known about them.
+
+    Attributes
+    ----------
+    kind : str
+        Of scanner or file, in words.
+    frames : Frames
+        The projections.
+    setup : Setup or Geometry
+        Where the rays run. A `Geometry` has rows that ascend with z and columns as seen from the source.
+    name : str
+    unit : str
+        Of the lengths.
+    input : str
+        ``"counts"``, ``"transmission"`` or ``"attenuation"``.
+    flats, darks : Frames or None
+        Pictures without the object, and without light.
+    white : float or None
+        Counts of the open beam, the same in each pixel, where there are no flats.
+    saturates : bool
+        Whether the largest value that the integers can have means a saturated pixel.
+    top_first : bool
+        Whether the first row is the top one.
+    from_detector : bool
+        Whether pictures are as seen from the detector, left and right exchanged.
+    tube : Tube
+    exposure : float or None
+        Seconds a picture.
+    said : tuple of str
+        What had to be guessed.
+    other : mapping of texts
+        What else there was to read, as it stands.
+    """
+
+    kind: str
+    frames: Frames
+    setup: Setup | Geometry
+    name: str = "scan"
+    unit: str = "mm"
+    input: str = "counts"
+    flats: Frames | None = None
+    darks: Frames | None = None
+    white: float | None = None
+    saturates: bool = True
+    top_first: bool = True
+    from_detector: bool = False
+    tube: Tube = Tube()
+    exposure: float | None = None
+    said: tuple[str, ...] = ()
+    other: Mapping[str, str] = field(default_factory=dict)
+
+    def saying(self, *guesses: str) -> Acquisition:
+        """The same with more guesses told."""
+        return replace(self, said=(*self.said, *guesses))

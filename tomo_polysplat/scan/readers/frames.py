@@ -1,0 +1,113 @@
+"""Stacks of pictures that are read one at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from tomo_polysplat.checks import fail
+from tomo_polysplat.files import existing_file, require_plausible_size
+
+__all__ = ["ArrayFrames", "Frames", "TiffFrames"]
+
+
+class Frames(Protocol):
+    """Pictures of one size."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """``(pictures, rows, columns)``."""
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Of the numbers as they are stored."""
+
+    def read(self, index: int, rows: slice, columns: slice) -> np.ndarray:
+        """Part of one picture as it is stored."""
+
+
+class ArrayFrames:
+    """Pictures of an array, which may be a memory map or a dataset of an open file, (pictures, rows, columns)."""
+
+    def __init__(self, array: Any, chosen: Sequence[int] | None = None) -> None:
+        if array.ndim != 3 or 0 in array.shape or array.dtype.kind not in "fiu":
+            got = f"{array.dtype} of shape {tuple(array.shape)}"
+            raise fail("path", "pictures of numbers, (pictures, rows, columns)", got)
+        self._array = array
+        self._chosen = np.arange(len(array)) if chosen is None else np.asarray(chosen)
+        self.shape = (len(self._chosen), int(array.shape[1]), int(array.shape[2]))
+        self.dtype = np.dtype(array.dtype)
+
+    def read(self, index: int, rows: slice, columns: slice) -> np.ndarray:
+        """Part of one picture."""
+        return np.asarray(self._array[int(self._chosen[index]), rows, columns])
+
+
+class TiffFrames:
+    """Pictures of TIFF files: one in each of several files, or all in one.
+
+    Raises
+    ------
+    ValueError
+        For files that are no TIFFs of one channel, and pictures of different sizes.
+    """
+
+    def __init__(self, files: Iterable[Path]) -> None:
+        self._files = [existing_file(file) for file in files]
+        if not self._files:
+            raise fail("path", "TIFF files", "none")
+        first = self._files[0]
+        with _page(first, 0) as page:
+            pages = len(page.parent.pages)
+            self.dtype = np.dtype(page.dtype)
+            rows, columns = page.shape
+        if len(self._files) > 1 and pages > 1:
+            raise fail("path", "one picture in each of several TIFF files", f"{pages} pictures in {first}")
+        self.shape = (max(pages, len(self._files)), rows, columns)
+
+    def read(self, index: int, rows: slice, columns: slice) -> np.ndarray:
+        """Part of one picture."""
+        file, number = (self._files[0], index) if len(self._files) == 1 else (self._files[index], 0)
+        with _page(file, number) as page:
+            if page.shape != self.shape[1:] or np.dtype(page.dtype) != self.dtype:
+                got = f"{page.dtype} of {page.shape} in {file}"
+                raise fail("path", f"{self.dtype} of {self.shape[1:]} as in {self._files[0].name}", got)
+            try:
+                return page.asarray()[rows, columns]
+            except Exception as error:  # its decoders raise whatever they meet
+                raise _unreadable(file, error) from error
+
+
+@contextmanager
+def _page(file: Path, number: int) -> Iterator[Any]:
+    """One picture of a TIFF file, which is open meanwhile."""
+    import tifffile
+
+    try:
+        tiff = tifffile.TiffFile(file)
+    except Exception as error:  # its parser raises whatever it meets
+        raise _unreadable(file, error) from error
+    with tiff:
+        try:
+            page = tiff.pages[number]
+        except Exception as error:
+            raise _unreadable(file, error) from error
+        _require_picture(file, page)
+        yield page
+
+
+def _unreadable(file: Path, error: Exception) -> Exception:
+    remedy = "install imagecodecs" if "imagecodecs" in str(error) else "copy or write the file again"
+    return fail("path", "a readable TIFF file", f"{file} ({str(error)[:120]})", remedy)
+
+
+def _require_picture(file: Path, page: Any) -> None:
+    """Refuse colours, and a header that promises more than the file can hold."""
+    if len(page.shape) != 2 or 0 in page.shape or page.dtype is None or page.dtype.kind not in "fiu":
+        got = f"{page.dtype} of shape {page.shape} in {file}"
+        raise fail("path", "TIFF pictures of one channel, (rows, columns)", got, "save them as grey values")
+    require_plausible_size(file.name, page.nbytes, file.stat().st_size)

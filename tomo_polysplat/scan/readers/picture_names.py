@@ -1,0 +1,55 @@
+"""Which pictures of a folder are which, by their names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from tomo_polysplat.checks import fail
+
+__all__ = ["TIFF_SUFFIXES", "has_word", "in_order", "named_files", "tiffs_in"]
+
+TIFF_SUFFIXES = (".tif", ".tiff")
+# Words in a name that make a picture, or a folder of them, a flat or a dark one, or one with the object.
+_WORDS = {
+    "flats": ("flat", "flats", "white", "whites", "open", "bright", "ref", "gain", "ff", "i0"),
+    "darks": ("dark", "darks", "dk", "df", "background"),
+    "projections": ("projections", "projection", "proj", "projs", "data", "tomo", "images", "raw"),
+}
+
+
+def in_order(files: Iterable[Path]) -> list[Path]:
+    """By name, and by number where names differ in one: picture 10 comes after picture 9."""
+    return sorted(files, key=lambda file: [_part(text) for text in re.split(r"(\d+)", file.name.lower())])
+
+
+def _part(text: str) -> tuple[int, str]:
+    return (int(text), "") if text.isdecimal() else (-1, text)
+
+
+def tiffs_in(folder: Path) -> list[Path]:
+    """The TIFF files of a folder, in order."""
+    files = folder.iterdir()
+    return in_order(file for file in files if file.suffix.lower() in TIFF_SUFFIXES and file.is_file())
+
+
+def has_word(name: str, kind: str) -> bool:
+    """Whether a word of a name tells of flats, darks or projections."""
+    words = re.split(r"[^a-z0-9]+|(?<=[a-z])(?=[0-9])", name.lower())
+    return bool(set(words) & set(_WORDS[kind]))
+
+
+def named_files(folder: Path, names: Any, argument: str) -> list[Path]:
+    """Files of a folder, a file or a pattern, or of several, as seen from the scan's folder, else from where we are."""
+    files: list[Path] = []
+    for text in [names] if isinstance(names, (str, Path)) else list(names):
+        here = next((place for place in (folder / text, Path(text)) if place.exists()), None)
+        if here is not None:
+            files += tiffs_in(here) if here.is_dir() else [here]
+        elif not Path(text).is_absolute():
+            files += in_order(folder.glob(str(text)))
+    if not files:
+        raise fail(argument, "TIFF files", f"{names}, of which there is none in {folder}")
+    return files

@@ -1,0 +1,39 @@
+"""Which reader a folder or a file is for, by what is there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from tomo_polysplat.checks import fail
+from tomo_polysplat.scan.readers import skyscan, tiff_stack
+from tomo_polysplat.scan.readers.acquisition import Acquisition
+
+__all__ = ["acquisition_of"]
+
+# The first one that recognises what it is shown reads it: what any folder of pictures is comes last.
+READERS = (skyscan, tiff_stack)
+
+
+def acquisition_of(path: Path, stated: Mapping[str, Any]) -> Acquisition:
+    """What a scanner's folder or file tells.
+
+    Parameters
+    ----------
+    path : Path
+    stated : mapping
+        What the user states, by the names of `tomo_polysplat.scan.readers.stated.KEYS`.
+
+    Raises
+    ------
+    ValueError
+        If no reader recognises it.
+    """
+    for reader in READERS:
+        if reader.recognises(path):
+            return reader.read(path, stated)
+    kinds = ", ".join(reader.KIND for reader in READERS)
+    raise fail(
+        "path", f"a Data Exchange HDF5 file, an .npz scan, or one of: {kinds}", f"{path}, which is neither"
+    )

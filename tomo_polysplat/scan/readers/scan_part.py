@@ -1,0 +1,45 @@
+"""Part of a scan that has been read already."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from tomo_polysplat.scan.circular import volume_seen
+from tomo_polysplat.scan.geometry import VolumeGrid, geometry_from_astra, to_astra
+from tomo_polysplat.scan.readers.part import Part
+from tomo_polysplat.scan.scan import Scan
+
+__all__ = ["scan_part"]
+
+
+def scan_part(scan: Scan, part: Part) -> Scan:
+    """The chosen rows, columns and views, averaged; rows and columns are counted as the scan's arrays are.
+
+    What rays are averaged are light, not its logarithm. A truth goes with another volume, and is dropped unless views
+    are all that is left out.
+    """
+    rows, columns = part.row_span(scan.rows), part.column_span(scan.columns)
+    views = part.chosen_views(scan.views)
+    inside = (slice(*rows), views, slice(*columns))
+    projections = scan.projections[slice(*rows)][:, views][:, :, slice(*columns)].transpose(1, 0, 2)
+    valid = None if scan.valid is None else scan.valid[inside].transpose(1, 0, 2)
+    if part.binning > 1:
+        light = np.exp(-projections)
+        light[np.isposinf(projections)] = 0.0
+        with np.errstate(divide="ignore"):
+            projections = -np.log(part.averaged(light))
+        valid = None if valid is None else part.averaged(valid.astype(np.float32)) == 1
+    seen = part.of(geometry_from_astra(scan.proj_geom), (rows, columns))
+    proj_geom, _ = to_astra(seen, VolumeGrid((1, 1, 1), np.zeros(3), np.ones(3)))
+    same = (part.rows, part.columns, part.binning) == (None, None, 1)
+    kept: dict[str, Any] = {} if same else {"vol_geom": volume_seen(seen), "truth": None, "metal_mask": None}
+    return replace(
+        scan,
+        projections=projections.transpose(1, 0, 2),
+        valid=None if valid is None else valid.transpose(1, 0, 2),
+        proj_geom=proj_geom,
+        **kept,
+    )

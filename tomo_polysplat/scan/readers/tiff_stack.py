@@ -1,0 +1,116 @@
+"""A plain stack of TIFFs, with flats and darks beside them, about which somebody has to say the distances."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tomo_polysplat.checks import fail
+from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup
+from tomo_polysplat.scan.readers.frames import TiffFrames
+from tomo_polysplat.scan.readers.picture_names import TIFF_SUFFIXES, has_word, named_files, tiffs_in
+from tomo_polysplat.scan.readers.stated import read_toml, require_known, stated_over
+
+__all__ = ["read", "recognises"]
+
+KIND = "stack of TIFFs"
+_REMEDY = (
+    "pass scanner={'source_object': ..., 'source_detector': ..., 'pixel': ...} in mm (--sod, --sdd, --pixel), write "
+    "them into a file scan.toml in the folder, or say that beam = 'parallel'"
+)
+
+
+def recognises(path: Path) -> bool:
+    """Whether it is a TIFF, a TOML file, or a folder with TIFFs in it or in folders of it."""
+    if path.is_file():
+        return path.suffix.lower() in (*TIFF_SUFFIXES, ".toml")
+    return bool(tiffs_in(path)) or any(tiffs_in(folder) for folder in path.iterdir() if folder.is_dir())
+
+
+def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
+    """See `tomo_polysplat.load_scan`; `stated` has its ``scanner``."""
+    folder = path if path.is_dir() else path.parent
+    written, other = _written(path)
+    known = written | require_known(stated, "scanner")
+    if path.suffix.lower() in TIFF_SUFFIXES and path.is_file():
+        known.setdefault("projections", path)
+    files = _sorted_out(folder, known)
+    frames = TiffFrames(files["projections"])
+    views = frames.shape[0]
+    known |= {name: files[name] for name in ("flats", "darks") if files[name]}
+    setup = Setup(np.arange(views) * (360.0 / views), np.nan)
+    told = Acquisition(KIND, frames, setup, folder.name, other=other)
+    return _guessed(stated_over(told, known, folder), known)
+
+
+def _written(path: Path) -> tuple[dict[str, Any], dict[str, str]]:
+    """Known and other keys of the TOML file that is meant, or the only one in the folder."""
+    beside = sorted(path.glob("*.toml")) if path.is_dir() else []
+    if len(beside) > 1:
+        raise fail("path", "one TOML file in the folder", ", ".join(file.name for file in beside), "name one")
+    file = beside[0] if beside else path
+    if file.suffix.lower() != ".toml":
+        return {}, {}
+    table = read_toml(file)
+    aliased = {key: value for key, value in table.items() if _is_known(key)}
+    other = {key: str(value) for key, value in table.items() if not _is_known(key)}
+    return require_known(aliased, file.name), other
+
+
+def _is_known(key: str) -> bool:
+    try:
+        require_known({key: ""}, "")
+    except ValueError:
+        return False
+    return True
+
+
+def _sorted_out(folder: Path, known: Mapping[str, Any]) -> dict[str, list[Path]]:
+    """Files of the projections, flats and darks: as stated, else by the words in their names."""
+    kinds = ("projections", "flats", "darks")
+    files = {name: named_files(folder, known[name], name) for name in kinds if name in known}
+    taken = {file for some in files.values() for file in some}
+    inside = [inner for inner in sorted(folder.iterdir()) if inner.is_dir()]
+    for name in ("flats", "darks"):
+        if name not in files:
+            matching = [file for file in tiffs_in(folder) if has_word(file.stem, name) and file not in taken]
+            for inner in inside:
+                matching += tiffs_in(inner) if has_word(inner.name, name) else []
+            files[name] = matching
+            taken |= set(matching)
+    if "projections" not in files:
+        left = [file for file in tiffs_in(folder) if file not in taken]
+        folders = [inner for inner in inside if has_word(inner.name, "projections")]
+        if not left and len(folders) == 1:
+            left = tiffs_in(folders[0])
+        if not left:
+            remedy = "pass scanner={'projections': 'FOLDER or PATTERN'}"
+            raise fail("path", "TIFF pictures of an object", f"none in {folder}", remedy)
+        files["projections"] = left
+    return files
+
+
+def _guessed(told: Acquisition, known: Mapping[str, Any]) -> Acquisition:
+    """Refuse what cannot be guessed, and say what is."""
+    setup = told.setup
+    assert isinstance(setup, Setup)
+    parallel = known.get("beam") == "parallel"
+    if "pixel" not in known:
+        if not parallel:
+            raise fail("path", "the distances and the pixel of the scanner", f"{told.kind} alone", _REMEDY)
+        told = replace(told, unit="pixel", setup=replace(setup, pixel=1.0))
+        told = told.saying("the pixel is not known: lengths are in pixels; give pixel=")
+    elif not parallel and (setup.source_object is None or setup.source_detector is None):
+        raise fail("source_object, source_detector", "both distances of a cone beam", "not both", _REMEDY)
+    if not {"degrees", "arc"} & known.keys():
+        views = told.frames.shape[0]
+        told = told.saying(f"no angles: {views} views are taken to make one full turn; give arc= or degrees=")
+    if told.input == "counts" and told.flats is not None and told.darks is None:
+        told = told.saying("no dark pictures: without light a pixel is taken to count 0; give darks=")
+    if "offset" not in known:
+        told = told.saying("the axis is taken to fall on the detector's middle; give offset= if it does not")
+    return told

@@ -1,0 +1,171 @@
+"""From what a scanner's folder tells to a scan."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tomo_polysplat.checks import fail, visible
+from tomo_polysplat.scan.circular import volume_seen
+from tomo_polysplat.scan.defects import flat_and_dark
+from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, to_astra
+from tomo_polysplat.scan.in_blocks import line_integrals
+from tomo_polysplat.scan.layout import spatial_geometry
+from tomo_polysplat.scan.readers.acquisition import Acquisition
+from tomo_polysplat.scan.readers.part import Part
+from tomo_polysplat.scan.readers.upright import Upright
+from tomo_polysplat.scan.reading import ReadOptions
+from tomo_polysplat.scan.scan import Scan
+
+if TYPE_CHECKING:
+    from tomo_polysplat.physics.spectrum import Spectrum
+
+__all__ = ["scan_from_acquisition"]
+
+logger = logging.getLogger(__name__)
+
+# Percent of the pixels of pictures without flats that are darker than what is taken for the open beam.
+_BRIGHT = 99.0
+# Scintillator and thickness in cm of a usual flat panel, where nothing tells of the detector.
+_PANEL = ("CsI", 0.06)
+
+
+def scan_from_acquisition(told: Acquisition, options: ReadOptions, part: Part) -> Scan:
+    """Read the pictures and make a scan of them.
+
+    Parameters
+    ----------
+    told : Acquisition
+    options : ReadOptions
+        What the caller of `tomo_polysplat.load_scan` says, which comes first.
+    part : Part
+        What to read.
+
+    Returns
+    -------
+    Scan
+        Its ``notes["scanner"]`` has, as texts, what the folder told and what had to be guessed.
+    """
+    kind = options.input or told.input
+    limit = _limit(told, kind, options.saturation)
+    pictures = Upright(told, part, limit)
+    geometry = _geometry(told)
+    told, flat, dark = _open_beam(told, kind, pictures)
+    projections, valid, rays = line_integrals(pictures.views, pictures.shape, kind, flat, dark, limit)
+    told, spectrum = _spectrum(told, options)
+    seen = part.of(geometry, (pictures.rows, pictures.columns))
+    _tell(told, rays, valid)
+    return Scan(
+        projections=projections,
+        valid=None if valid.all() else valid,
+        spectrum=spectrum,
+        water_correction=None if options.water_correction is None else tuple(options.water_correction),
+        name=told.name,
+        notes={"input": kind, "rays": rays, "scanner": _texts(told)},
+        **_geometries(seen, told, options),
+    )
+
+
+def _limit(told: Acquisition, kind: str, saturation: float | None) -> float:
+    if kind != "counts" or not (told.saturates or saturation):
+        return np.inf
+    if saturation is not None:
+        return saturation
+    return float(np.iinfo(told.frames.dtype).max) if told.frames.dtype.kind in "iu" else np.inf
+
+
+def _geometry(told: Acquisition) -> Geometry:
+    views, rows, columns = told.frames.shape
+    geometry = told.setup if isinstance(told.setup, Geometry) else told.setup.geometry(rows, columns)
+    if geometry.shape != (views, rows, columns):
+        got = f"{geometry.views} angles for {views} pictures of {rows} x {columns} pixels"
+        if geometry.views == views:
+            got = f"{geometry.rows} x {geometry.columns} for pictures of {rows} x {columns} pixels"
+        raise fail("path", "one angle for each picture, and a detector of their size", got)
+    return geometry
+
+
+def _open_beam(
+    told: Acquisition, kind: str, pictures: Upright
+) -> tuple[Acquisition, np.ndarray | None, np.ndarray | None]:
+    """The pictures without an object and without light, where counts have to be compared with them."""
+    if kind != "counts":
+        return told, None, None
+    size = pictures.shape[1:]
+    dark = None if told.darks is None else pictures.mean(told.darks, "darks")
+    if told.flats is not None:
+        return told, *flat_and_dark(pictures.mean(told.flats, "flats"), dark, size)
+    white = told.white
+    if white is None:
+        white = pictures.bright(_BRIGHT)
+        told = told.saying(
+            f"no flat field: the open beam is taken to be {white:.6g} counts, as in the brightest pixels; give flats= "
+            "or white= if that is wrong"
+        )
+    return told, *flat_and_dark(np.full(size, white), dark, size)
+
+
+def _geometries(seen: Geometry, told: Acquisition, options: ReadOptions) -> dict[str, Any]:
+    """``proj_geom``, ``vol_geom`` and ``unit``: the caller's, else as the folder tells."""
+    unit = options.settled_unit(told.unit, told.unit)
+    if options.proj_geom is not None:
+        proj_geom = spatial_geometry(dict(options.proj_geom))
+    else:
+        # The window stands for any: only the other half of the answer is used.
+        proj_geom, _ = to_astra(seen, VolumeGrid((1, 1, 1), np.zeros(3), np.ones(3)))
+    vol_geom = volume_seen(seen) if options.vol_geom is None else dict(options.vol_geom)
+    return {"proj_geom": proj_geom, "vol_geom": vol_geom, "unit": unit}
+
+
+def _spectrum(told: Acquisition, options: ReadOptions) -> tuple[Acquisition, Spectrum | None]:
+    """The caller's spectrum, else that of the tube and its filters behind a usual detector."""
+    tube = told.tube
+    if options.spectrum is not None or tube.kvp is None or told.unit == "pixel":
+        return told, options.spectrum
+    if tube.filters is None:
+        return told.saying(
+            f"the tube was at {tube.kvp:g} kV, its filter is not known: there is no spectrum; give filter="
+        ), None
+    from tomo_polysplat.physics.detector import Detector
+    from tomo_polysplat.physics.spectrum import Spectrum
+
+    panel = Detector.energy_integrating(*_PANEL)
+    try:
+        spectrum = Spectrum.from_tube(tube.kvp, tube.anode, dict(tube.filters), panel)
+    except ValueError as error:
+        return told.saying(f"there is no spectrum: {error}"), None
+    known = _filter_words(tube.filters)
+    return told.saying(
+        f"the spectrum is that of {tube.anode} at {tube.kvp:g} kV behind {known}, seen by a flat panel of "
+        f"{10 * _PANEL[1]:g} mm {_PANEL[0]}; what else the beam passes and the detector are not known"
+    ), spectrum
+
+
+def _filter_words(filters: Mapping[str, float]) -> str:
+    return " + ".join(f"{10 * size:g} mm {name}" for name, size in filters.items()) or "no filter"
+
+
+def _tell(told: Acquisition, rays: dict[str, int], valid: np.ndarray) -> None:
+    for guess in told.said:
+        logger.warning("%s: %s", told.kind, guess)
+    lost = valid.size - np.count_nonzero(valid)
+    if lost:
+        kinds = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in rays.items() if count)
+        logger.warning("%d of %d rays are left out (%s)", lost, valid.size, kinds)
+
+
+def _texts(told: Acquisition) -> dict[str, Any]:
+    """What was told, as texts that may be shown."""
+    known = {
+        "kind": told.kind,
+        "tube_kv": told.tube.kvp,
+        "filter": None if told.tube.filters is None else _filter_words(told.tube.filters),
+        "exposure_s": told.exposure,
+    }
+    texts: dict[str, Any] = {name: visible(value) for name, value in known.items() if value is not None}
+    texts["guessed"] = [visible(guess) for guess in told.said]
+    texts["keys"] = {visible(key): visible(value) for key, value in told.other.items()}
+    return texts

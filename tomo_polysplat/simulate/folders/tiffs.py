@@ -1,0 +1,40 @@
+"""A plain folder: TIFFs of the projections, flats and darks, and a small TOML file with the distances."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from tomo_polysplat.simulate.folders.scene import SETTINGS, Pictures
+
+__all__ = ["write", "write_pictures"]
+
+
+def write(folder: Path, pictures: Pictures) -> None:
+    """Fill an empty folder."""
+    write_pictures(folder, "proj_", pictures.projections)
+    write_pictures(folder, "flat_", pictures.flats)
+    write_pictures(folder, "dark_", pictures.darks)
+    at = SETTINGS
+    (folder / "scan.toml").write_text(
+        f"""# Lengths are in mm.
+source_object = {at.source_object}
+source_detector = {at.source_detector}
+pixel = {at.pixel}
+offset = [{at.pixel * at.columns_off}, 0.0]
+arc = 360
+kvp = {at.kvp}
+filter = "Al {at.filter_mm}mm"
+operator = "nobody"
+""",
+        encoding="utf-8",
+    )
+
+
+def write_pictures(folder: Path, prefix: str, pictures: np.ndarray, digits: int = 4) -> None:
+    """One TIFF for each of the pictures, numbered from 0."""
+    import tifffile
+
+    for index, picture in enumerate(pictures):
+        tifffile.imwrite(folder / f"{prefix}{index:0{digits}d}.tif", picture)

@@ -1,0 +1,42 @@
+"""Folders as scanners write them, by the scanner's name."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from tomo_polysplat.checks import fail, require_choice
+from tomo_polysplat.scan.scan import Scan
+from tomo_polysplat.simulate.folders import skyscan, tiffs
+from tomo_polysplat.simulate.folders.scene import marked_scan, pictures_of
+
+__all__ = ["KINDS", "write_folder"]
+
+KINDS = {"tiffs": tiffs.write, "skyscan": skyscan.write}
+
+
+def write_folder(kind: str, folder: str | os.PathLike, scan: Scan | None = None) -> Scan:
+    """Make a folder of a kind of scanner; returns the scan that was written.
+
+    Parameters
+    ----------
+    kind : str
+        One of `KINDS`.
+    folder : path
+        A new one.
+    scan : Scan, optional
+        One that `marked_scan` made; a new one by default.
+
+    Raises
+    ------
+    FileExistsError
+        If there is something in the folder.
+    """
+    require_choice("kind", kind, KINDS)
+    target = Path(folder)
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise fail("folder", "a new or empty folder", str(target), "name another", FileExistsError)
+    target.mkdir(parents=True, exist_ok=True)
+    scan = marked_scan() if scan is None else scan
+    KINDS[kind](target, pictures_of(scan))
+    return scan
