@@ -14,8 +14,8 @@ RECON = ["recon", "scan.h5", "-o", "out.h5"]
 @pytest.mark.parametrize(
     ("argv", "says"),
     [
-        (["recn", "scan.h5"], "'recn': did you mean recon? expected one of demo, recon,"),
-        (["teleport"], "'teleport': expected one of demo, recon,"),
+        (["recn", "scan.h5"], "'recn': did you mean recon? expected one of demo, "),
+        (["teleport"], "'teleport': expected one of demo, "),
         ([*RECON, "--qualty", "fast"], "recon: error: unknown: --qualty fast; did you mean --quality?"),
         ([*RECON, "--qual", "fast"], "unknown: --qual fast; did you mean --quality?"),
         ([*RECON, "--time=3"], "unknown: --time=3; did you mean --time-budget?"),

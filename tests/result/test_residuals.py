@@ -2,8 +2,13 @@
 
 import numpy as np
 import pytest
+import torch
 
+from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.plan.answer import Answer
+from tomo_polysplat.render.renderer import detector_views
+from tomo_polysplat.report.held_out import HeldOut
 from tomo_polysplat.report.residuals import residuals_of
 from tomo_polysplat.report.verdict import verdict
 from tomo_polysplat.result.result import Result
@@ -153,3 +158,44 @@ def test_the_page_of_a_scan_has_fdk_and_the_residuals(tmp_path):
     assert page.count("<figure>") == 2 and "FDK (the standard)" in page
     assert "rms residual by view" in page and "<h1>ball</h1>" in page
     assert page.index("The model explains") < page.index("<figure>"), "the verdict comes first"
+
+
+def test_a_page_does_without_a_scan_that_does_not_fit(tmp_path, caplog):
+    result = ball()
+    other = Scan(line_integrals().swapaxes(0, 1), CONE, VOLUME | {"GridColCount": 8})
+    result.report(tmp_path / "page.html", scan=other, overwrite=True)
+    assert "does without what the scan would tell" in caplog.text
+    assert "How well the rays are explained was not recorded" in (tmp_path / "page.html").read_text()
+
+
+def test_the_rays_held_out_are_those_of_the_fit():
+    """Its views are sorted, the scan's are not."""
+    shuffled = np.random.default_rng(5).permutation(VIEWS)
+    turned = CONE | {"ProjectionAngles": CONE["ProjectionAngles"][shuffled] - 1e-12}
+    geometry, grid = from_astra(turned, VOLUME)
+    values = line_integrals()[shuffled].astype(np.float32)
+    problem = Problem.of(values.copy(), geometry, grid, "cm", None, None)
+    measured, views = problem.measured(torch.device("cpu")), detector_views(problem.geometry, problem.planar)
+    rays = Rays(measured, views, np.inf, 0.015, 0.1)
+    aside = (rays.batch(np.arange(VIEWS))[3] > 0).numpy()
+    found = HeldOut(geometry, grid, values, 0.1).of(np.arange(VIEWS))
+    assert found.mean() == pytest.approx(0.1, abs=0.01)
+    # Each view of the fit has the rays of one view of the scan, whichever that is.
+    fitted = rays.projections.numpy()
+    for view in range(VIEWS):
+        (same,) = [k for k in range(VIEWS) if np.array_equal(fitted[k], values[view])]
+        np.testing.assert_array_equal(found[view], aside[same])
+
+
+def test_a_view_tells_of_its_rays_held_out():
+    """Those alone are off, as after a fit that has taken in their neighbours' noise."""
+    values = line_integrals()
+    geometry, grid = from_astra(CONE, VOLUME)
+    aside = HeldOut(geometry, grid, values, 0.05).of(np.arange(VIEWS))
+    values[aside] += 0.1
+    result = ball()
+    result.settings = {"held_out": 0.05}
+    found = residuals_of(result, scan_of(values))
+    assert found.rms_held_out > 4 * found.rms / 2 and (found.held_out > 3).all()
+    assert "(those kept out of the fit to" in verdict(result, found)[0]
+    assert np.isnan(residuals_of(ball(), scan_of(values)).rms_held_out), "no settings, none held out"

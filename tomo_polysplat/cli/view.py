@@ -52,23 +52,18 @@ def run(arguments: argparse.Namespace) -> int:
 
 def shown_by(arguments: argparse.Namespace) -> Shown:
     """What the files hold, as the page shows it."""
-    from tomo_polysplat.report.html import title_of, told
-    from tomo_polysplat.report.residuals import residuals_of
+    from tomo_polysplat.report.html import of_scan, title_of, told
     from tomo_polysplat.scan.io import load_scan
     from tomo_polysplat.viewer.volumes import shown_of
 
-    result = _loaded(arguments.result)
+    result, residuals = _loaded(arguments.result), None
     others: dict[str, Any] = {_name(path): _loaded(path) for path in arguments.others}
     if len(others) < len(arguments.others):
         raise fail("OTHER", "files of different names", "two of one name")
     scan = None if arguments.scan is None else load_scan(arguments.scan, unit=result.unit)
-    residuals = None
     if scan is not None:
-        from tomo_polysplat.report.classical import standard_volume
-
-        residuals = residuals_of(result, scan) if result.gaussians else None
-        others = dict([standard_volume(scan)]) | others
-        others |= {} if scan.truth is None else {"truth": scan.truth}
+        residuals, beside = of_scan(result, scan)
+        others = dict(beside) | others | ({} if scan.truth is None else {"truth": scan.truth})
     return shown_of(result, others, title_of(result, scan), "\n".join(told(result, residuals)))
 
 

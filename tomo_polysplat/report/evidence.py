@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tomo_polysplat.report.style import ACCENT, QUIET
+from tomo_polysplat.report.style import ACCENT, QUIET, SAFE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -26,11 +26,23 @@ def by_view_figure(residuals: Residuals) -> Figure:
     figure = Figure(figsize=(7.4, 2.4), layout="constrained")
     axis = figure.subplots()
     marker = "o" if len(residuals.views) < 80 else ""
-    axis.plot(residuals.views, residuals.by_view, color=ACCENT, marker=marker, markersize=3, linewidth=1)
+    axis.plot(
+        residuals.views,
+        residuals.by_view,
+        color=ACCENT,
+        marker=marker,
+        markersize=3,
+        linewidth=1,
+        label="all rays",
+    )
+    if np.isfinite(residuals.held_out).any():
+        unseen: dict[str, Any] = {"marker": "x", "markersize": 4, "linestyle": "", "label": "rays held out"}
+        axis.plot(residuals.views, residuals.held_out, color=SAFE[1], **unseen)
     if np.isfinite(residuals.photons):
         axis.axhline(1.0, color=QUIET, linestyle="--", linewidth=0.9, label="noise alone")
-        axis.legend(frameon=False, fontsize=8)
-    axis.set_ylim(0, 1.1 * max(1.0, _largest(residuals.by_view)))
+    axis.legend(frameon=False, fontsize=8, ncols=3)
+    shown = np.append(residuals.by_view, residuals.held_out)
+    axis.set_ylim(0, 1.25 * max(1.0, _largest(shown)))
     axis.set(xlabel="view", ylabel=f"rms residual\n({residuals.unit})")
     axis.spines[["top", "right"]].set_visible(False)
     return figure

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from tomo_polysplat.result.result import Result
     from tomo_polysplat.scan.scan import Scan
 
-__all__ = ["image", "page", "title_of", "told", "write_report"]
+__all__ = ["image", "of_scan", "page", "title_of", "told", "write_report"]
 
 logger = logging.getLogger(__name__)
 
@@ -47,9 +47,8 @@ def write_report(
     volume = _spatial(result, result.volume)
     true = None if truth is None else _spatial(result, truth)
     metal = None if metal_mask is None else _spatial(result, metal_mask).astype(bool)
-    residuals = None if scan is None or not result.gaussians else residuals_of(result, scan)
-    shown = [] if scan is None else [_beside(scan)]
-    shown += [(full_name(OURS), volume), *([] if true is None else [("truth", true)])]
+    residuals, beside = (None, []) if scan is None else of_scan(result, scan)
+    shown = beside + [(full_name(OURS), volume), *([] if true is None else [("truth", true)])]
     title = title_of(result, scan)
     body = [
         f"<h1>{text(title)}</h1>",
@@ -108,9 +107,18 @@ def _about(result: Result) -> str:
     )
 
 
-def _beside(scan: Scan) -> tuple[str, np.ndarray]:
-    name, volume = standard_volume(scan)
-    return full_name(name.lower()) if name == "FDK" else name, volume
+def of_scan(result: Result, scan: Scan) -> tuple[Residuals | None, Volumes]:
+    """Residuals, and the volume of the standard method by its name; what fails is left out, which the log says."""
+    residuals, beside = None, []
+    try:
+        name, volume = standard_volume(scan)
+        require_shape("the scan's volume", volume, result.grid.shape, "of the result")
+        beside.append((full_name(name.lower()) if name == "FDK" else name, volume))
+        if result.gaussians:
+            residuals = residuals_of(result, scan)
+    except (ValueError, RuntimeError, MemoryError) as error:
+        logger.warning("The page does without what the scan would tell: %s", error)
+    return residuals, beside
 
 
 def _spatial(result: Result, volume: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ from tomo_polysplat.physics.pixel_light import averaged_light
 from tomo_polysplat.physics.scatter import light_around
 from tomo_polysplat.render.renderer import detector_views
 from tomo_polysplat.report.decided import RayPhysics, ray_physics
+from tomo_polysplat.report.held_out import HeldOut
 from tomo_polysplat.report.where import MisfitMap
 from tomo_polysplat.scan.geometry import from_astra, is_planar_geometry
 from tomo_polysplat.scan.noise import photons_per_ray
@@ -32,8 +33,10 @@ __all__ = ["MOST_VIEWS", "Residuals", "residuals_of"]
 
 # Views that are looked at, evenly spread over the scan, and together; and pixels of the map along an edge.
 MOST_VIEWS, _AT_ONCE, _MAP = 180, 4, 192
-# Where a Gaussian's projection ends, in deviations; as in the fit.
+# Where a Gaussian's projection ends, in deviations, unless the settings say.
 _CUTOFF = 3.0
+# Rays times energies that are held at once.
+_NUMBERS = 1 << 26
 # A ray this many deviations off is not explained.
 _FAR = 3.0
 
@@ -52,8 +55,12 @@ class Residuals:
         The same of each pixel over the views; blocks of pixels where there are many, NaN where none is usable.
     bias : (rows, columns) array
         Mean residual, model less measurement, in units of noise: what noise alone would average out.
+    held_out : (n,) array
+        As `by_view`, of the rays alone that the fit has not seen; NaN where there are none.
     rms, within : float
         Root mean square over all rays, and the share of them that is off by less than three deviations.
+    rms_held_out : float
+        That over the rays the fit has not seen; NaN where there are none.
     rays : int
         Usable rays looked at.
     photons : float
@@ -71,8 +78,10 @@ class Residuals:
     by_view: np.ndarray
     by_pixel: np.ndarray
     bias: np.ndarray
+    held_out: np.ndarray
     rms: float
     within: float
+    rms_held_out: float
     rays: int
     photons: float
     worst: np.ndarray
@@ -123,7 +132,8 @@ def residuals_of(
     some = geometry.select(chosen)
     planar = is_planar_geometry(scan.proj_geom) or geometry.planar
     model = _Model(result, detector_views(some, planar), pick_fast_device(device))
-    return _collected(model, values[chosen], chosen, photons_per_ray(values), MisfitMap(some, grid))
+    unseen = HeldOut(geometry, grid, values, float(result.settings.get("held_out", 0.0)))
+    return _collected(model, values, chosen, photons_per_ray(values), MisfitMap(some, grid), unseen)
 
 
 class _Model:
@@ -132,6 +142,7 @@ class _Model:
     def __init__(self, result: Result, views: DetectorViews, device: torch.device) -> None:
         self.views, self.device = views, device
         self.kernel, _ = choose(device)
+        self.cutoff = float(result.settings.get("cutoff", _CUTOFF))
         self.physics: RayPhysics = ray_physics(result.plan)
         parts = {name: np.asarray(part, np.float32) for name, part in result.gaussians.items()}
         density, u = parts["density"], parts["u"]
@@ -156,13 +167,16 @@ class _Model:
         views, parts = self.views.select(some), self.physics.pixel_rays
         fine = views if parts == 1 else views.finer(parts)
         position, scale, rotation, weight = self.gaussians
-        areal, _ = project(position, scale, rotation, weight, fine, kernel=self.kernel, cutoff=_CUTOFF)
+        areal, _ = project(position, scale, rotation, weight, fine, kernel=self.kernel, cutoff=self.cutoff)
         if self.lines is None:
             values = areal[0]
         else:
             logs, curves = self.lines
-            exponents = logs[:, None] - curves @ areal.reshape(areal.shape[0], -1)
-            values = -torch.logsumexp(exponents, dim=0).reshape(areal.shape[1:])
+            flat = areal.reshape(areal.shape[0], -1)
+            # A few rays at a time, for each has a number for every energy.
+            parted = flat.split(max(1, _NUMBERS // len(logs)), dim=1)
+            lights = [torch.logsumexp(logs[:, None] - curves @ part, dim=0) for part in parted]
+            values = -torch.cat(lights).reshape(areal.shape[1:])
         if parts > 1:
             values = averaged_light(values, views.rows, views.columns)
         if self.physics.scatter or self.physics.of_light:
@@ -175,25 +189,38 @@ class _Model:
 
 
 def _collected(
-    model: _Model, values: np.ndarray, chosen: np.ndarray, photons: float, where: MisfitMap
+    model: _Model,
+    values: np.ndarray,
+    chosen: np.ndarray,
+    photons: float,
+    where: MisfitMap,
+    unseen: HeldOut,
 ) -> Residuals:
     pixels = np.zeros((3, *values.shape[1:]))  # how many, their sum, the sum of their squares
-    by_view, near = np.full(len(chosen), np.nan), 0
+    sums, near = (
+        np.zeros((4, len(chosen))),
+        0,
+    )  # squares and number of all rays of a view, and of those held out
     for first in range(0, len(chosen), _AT_ONCE):
         some = np.arange(first, min(first + _AT_ONCE, len(chosen)))
-        scaled, good = _scaled(model, some, values[some], photons)
+        scaled, good = _scaled(model, some, values[chosen[some]], photons)
         squares = scaled**2
         pixels += np.stack([part.sum(axis=0) for part in (good, scaled, squares)])
         where.add(some, squares, good)
-        by_view[some] = _root_mean(squares.sum(axis=(1, 2)), good.sum(axis=(1, 2)))
+        aside = good & unseen.of(chosen[some])
+        parts = (squares, good, np.where(aside, squares, 0.0), aside)
+        sums[:, some] = [part.sum(axis=(1, 2)) for part in parts]
         near += int((np.abs(scaled[good]) < _FAR).sum())
     rays = int(pixels[0].sum())
     block = max(1, -(-max(values.shape[1:]) // _MAP))
     number, total, squares = (_blocks(part, block) for part in pixels)
     bias = np.divide(total, number, out=np.full(number.shape, np.nan), where=number > 0)
-    rms, within = float(np.sqrt(pixels[2].sum() / max(rays, 1))), near / max(rays, 1)
-    maps = by_view, _root_mean(squares, number), bias
-    return Residuals(chosen, *maps, rms, within, rays, photons, *where.worst(), block)
+    by_view, held_out = _root_mean(*sums[:2]), _root_mean(*sums[2:])
+    totals = sums.sum(axis=1)
+    rms, rms_held_out = (float(_root_mean(totals[k], totals[k + 1])) for k in (0, 2))
+    maps = by_view, _root_mean(squares, number), bias, held_out
+    within = near / max(rays, 1)
+    return Residuals(chosen, *maps, rms, within, rms_held_out, rays, photons, *where.worst(), block)
 
 
 def _scaled(
@@ -209,7 +236,7 @@ def _scaled(
 
 
 def _root_mean(squares: np.ndarray, number: np.ndarray) -> np.ndarray:
-    return np.sqrt(np.divide(squares, number, out=np.full(number.shape, np.nan), where=number > 0))
+    return np.sqrt(np.divide(squares, number, out=np.full(np.shape(number), np.nan), where=number > 0))
 
 
 def _blocks(image: np.ndarray, block: int) -> np.ndarray:

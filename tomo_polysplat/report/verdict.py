@@ -34,8 +34,10 @@ def explained(result: Result, residuals: Residuals | None) -> str:
     if residuals is not None:
         if not np.isfinite(residuals.photons):
             return f"The data shows no noise; the model misses the rays by {residuals.rms:.2g} of -log(I/I0)."
+        unseen = residuals.rms_held_out
+        apart = f" (those kept out of the fit to {unseen:.2g})" if np.isfinite(unseen) else ""
         return (
-            f"The model explains the rays to {residuals.rms:.2g} times their noise: {residuals.within:.1%} of "
+            f"The model explains the rays to {residuals.rms:.2g} times their noise{apart}: {residuals.within:.1%} of "
             f"{residuals.rays:,} rays lie within three deviations, where noise alone would leave {_NORMAL:.1%}."
         )
     known = [entry for entry in result.history if entry.get("held_out") is not None]

@@ -1,0 +1,96 @@
+"""The time left is that of the run as it goes, and bars neither hide in notebooks nor break lines of the log."""
+
+import logging
+import sys
+
+import pytest
+import tqdm.auto
+import tqdm.notebook
+
+from tomo_polysplat.progress import TimeLeft, progress_reports
+
+
+def seconds(told):
+    number, unit = told.removeprefix("at most ").split()[:2]
+    return float(number) * {"s": 1, "min": 60, "h": 3600}[unit]
+
+
+def estimates(steps):
+    """(seconds that are left in truth, seconds told) of reports at (share, time)."""
+    left, end = TimeLeft(), steps[-1][1]
+    told = [(end - now, left.told(share, now)) for share, now in steps]
+    return [(true, seconds(words)) for true, words in told if words]
+
+
+def test_a_slow_beginning_is_no_part_of_the_estimate():
+    """Sixty seconds of start and compiling, then a per cent a second: no six minutes that jump to one."""
+    steps = [(0.0, 0.0), (0.0, 20.0), *((0.01 * k, 60.0 + k) for k in range(1, 101))]
+    found = estimates(steps)
+    assert len(found) > 90
+    for true, told in found:
+        assert told == pytest.approx(true, rel=0.15, abs=3), "as told as the truth rounds"
+
+
+def test_a_run_that_slows_down_is_followed():
+    quick = [(0.01 * k, 1.0 * k) for k in range(1, 51)]
+    slow = [(0.5 + 0.01 * k, 50.0 + 4.0 * k) for k in range(1, 51)]
+    late = [pair for pair in estimates(quick + slow) if 4 < pair[0] < 150]
+    for true, told in late:
+        assert told == pytest.approx(true, rel=0.25, abs=20)
+
+
+def test_a_fit_that_begins_anew_is_estimated_anew():
+    left = TimeLeft()
+    for k in range(1, 20):
+        before = left.told(0.02 * k, float(k))
+    assert before == "at most 30 s left"
+    assert left.told(0.0, 25.0) == "" and left.told(0.02, 40.0) == "", "nothing is known yet"
+    left.told(0.04, 50.0)
+    assert left.told(0.06, 60.0) == "at most 8 min left"
+    assert left.told(1.0, 70.0) == ""
+
+
+def test_a_bar_is_drawn_where_it_is_wanted(capsys):
+    with progress_reports(None) as report:
+        report(0.5, "half")
+    assert capsys.readouterr().err == "", "no terminal here"
+    with progress_reports(True) as report:
+        report(0.0, "calibration")
+        report(0.5, "half")
+    said = capsys.readouterr().err
+    assert "calibration" in said and "50%" in said and "half" in said
+
+
+def test_a_notebook_shows_it_unasked(monkeypatch):
+    """Its streams are no terminals, which would leave the bar out."""
+    drawn = []
+
+    class Bar(tqdm.notebook.tqdm_notebook):
+        def __init__(self, **options):
+            drawn.append(options)
+
+        disable = True
+        n, __enter__, __exit__ = 0.0, lambda self: self, lambda *_: None
+        set_postfix_str = update = refresh = lambda *_, **__: None
+
+    monkeypatch.setattr(tqdm.auto, "tqdm", Bar)
+    with progress_reports(None) as report:
+        report(0.5, "half")
+    with progress_reports(False):
+        pass
+    assert [options["disable"] for options in drawn] == [False, True]
+
+
+def test_lines_of_the_log_stay_whole(capsys):
+    handler, root = logging.StreamHandler(sys.stderr), logging.getLogger()
+    handler.setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
+    root.addHandler(handler)
+    try:
+        with progress_reports(True) as report:
+            report(0.5, "half")
+            logging.warning("a view is dark")
+            report(0.6, "more")
+    finally:
+        root.removeHandler(handler)
+    lines = capsys.readouterr().err.replace("\r", "\n").split("\n")
+    assert [line for line in lines if "dark" in line] == ["WARNING: a view is dark"]

@@ -1,0 +1,42 @@
+"""Which rays a fit has not seen: they judge it, and a report tells of them apart."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.render.renderer import detector_views
+from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.scan.snapped import snapped_geometry
+from tomo_polysplat.scan.view_order import view_order
+
+__all__ = ["HeldOut"]
+
+
+class HeldOut:
+    """The rays held out of a fit, which chooses them by the number of their pixel and of their view in its own order.
+
+    Parameters
+    ----------
+    geometry, grid : Geometry, VolumeGrid
+        Of the scan, in its own order of the views.
+    values : (views, rows, columns) array
+        Its rays, which tell views of the same geometry apart.
+    share : float
+        Of the rays that is held out.
+    """
+
+    def __init__(self, geometry: Geometry, grid: VolumeGrid, values: np.ndarray, share: float) -> None:
+        length = 0.5 * float(grid.extent.max())
+        order = view_order(snapped_geometry(geometry.normalised(grid.centre, length)), values)
+        self._rank = np.argsort(order)
+        # The choice does not depend on what was measured; one number stands for all.
+        blank = torch.zeros(1, 1, 1).expand(geometry.shape)
+        self._rays = Rays(blank, detector_views(geometry.select(order), False), math.inf, 1.0, share)
+
+    def of(self, views: np.ndarray) -> np.ndarray:
+        """(n, rows, columns) whether each ray of these views was held out."""
+        return np.stack([self._rays.batch(self._rank[[view]])[3][0].numpy() > 0 for view in views])
