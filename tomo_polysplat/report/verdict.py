@@ -20,6 +20,8 @@ _ODD_VIEW, _ODD_PIXEL, _ODD_PLACE = 1.5, 2.0, 2.0
 _LIGHTLESS, _LEFT_OUT, _PIXELS = 1e-4, 0.02, 0.002
 # Pixels of a row that a pixel is compared with.
 _BESIDE = 9
+# Times its noise that a scan is explained to at best, for its pixels to be told.
+_FAR_OFF = 5.0
 # Share of rays within three deviations that normal noise alone would leave.
 _NORMAL = 0.9973
 
@@ -35,10 +37,11 @@ def explained(result: Result, residuals: Residuals | None) -> str:
         if not np.isfinite(residuals.photons):
             return f"The data shows no noise; the model misses the rays by {residuals.rms:.2g} of -log(I/I0)."
         unseen = residuals.rms_held_out
-        apart = f" (those kept out of the fit to {unseen:.2g})" if np.isfinite(unseen) else ""
+        apart = f" (those kept out of the fit to {_short(unseen)})" if np.isfinite(unseen) else ""
         return (
-            f"The model explains the rays to {residuals.rms:.2g} times their noise{apart}: {residuals.within:.1%} of "
-            f"{residuals.rays:,} rays lie within three deviations, where noise alone would leave {_NORMAL:.1%}."
+            f"The model explains the rays to {_short(residuals.rms)} times their noise{apart}: "
+            f"{residuals.within:.1%} of {residuals.rays:,} rays lie within three deviations, where noise alone would "
+            f"leave {_NORMAL:.1%}."
         )
     known = [entry for entry in result.history if entry.get("held_out") is not None]
     if not known:
@@ -72,7 +75,7 @@ def _doubts_of_residuals(result: Result, residuals: Residuals) -> list[str]:
         x, y, z = residuals.worst
         doubts.append(
             f"what lies around x, y, z = {x:.3g}, {y:.3g}, {z:.3g} {result.unit}, where rays meet that miss by "
-            f"{residuals.worst_value:.2g} {residuals.unit} ({usual:.2g} elsewhere)"
+            f"{_short(residuals.worst_value)} {residuals.unit} ({_short(usual)} elsewhere)"
         )
     middle = np.nanmedian(residuals.by_view) if np.isfinite(residuals.by_view).any() else 0.0
     odd = residuals.views[residuals.by_view > _ODD_VIEW * middle] if middle else residuals.views[:0]
@@ -80,7 +83,8 @@ def _doubts_of_residuals(result: Result, residuals: Residuals) -> list[str]:
         times = float(np.nanmax(residuals.by_view) / middle)
         doubts.append(f"{_views(odd)}, explained up to {times:.2g} times worse than the others")
     share, where = _odd_pixels(residuals)
-    if share > _PIXELS:
+    # Where the model itself is far off, what it lacks looks like that, too.
+    if share > _PIXELS and residuals.rms < _FAR_OFF:
         doubts.append(
             f"{share:.1%} of the detector, mostly {where}, whose pixels are off by the same amount in every view"
         )
@@ -132,3 +136,8 @@ def _doubts_of_counts(result: Result) -> list[str]:
     if (lost := sum(counts.get(name, 0) for name in names) / rays) > _LEFT_OUT:
         doubts.append(f"the shadow of the rays left out ({lost:.1%}; the counts below say why)")
     return doubts
+
+
+def _short(number: float) -> str:
+    """Two digits, and no powers of ten."""
+    return f"{number:.2g}" if number < 99.5 else f"{number:.0f}"

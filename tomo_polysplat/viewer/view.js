@@ -119,8 +119,8 @@ function bar(context, { across }, wide, tall, dark) {
   const power = 10 ** Math.floor(Math.log10(most));
   const length = [5, 2, 1].map((times) => times * power).find((one) => one <= most);
   context.fillStyle = dark ? "#000" : "#fff";
-  context.fillRect(0.04 * wide, 0.96 * tall, (length / whole) * wide, Math.max(2, 0.008 * tall));
-  context.font = `${Math.max(11, 0.03 * wide)}px system-ui, sans-serif`;
+  context.fillRect(0.04 * wide, 0.96 * tall, (length / whole) * wide, 3 * devicePixelRatio);
+  context.font = `${Math.round(12 * devicePixelRatio)}px system-ui, sans-serif`;
   context.fillText(`${Number(length.toPrecision(2))} ${about.unit}`, 0.04 * wide, 0.945 * tall);
 }
 
