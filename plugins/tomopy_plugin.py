@@ -128,12 +128,16 @@ def _parallel_beam(
     tomo: np.ndarray, recon: np.ndarray, theta: np.ndarray, centre: float, pixel_size: float | None
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     from tomo_polysplat.scan.angles import require_radians
-    from tomo_polysplat.scan.layout import parallel_geometry, volume_geometry
+    from tomo_polysplat.scan.circular import parallel_geometry
+    from tomo_polysplat.scan.layout import volume_geometry
 
     # A geometry of vectors, which this becomes, has no angles to tell by.
     theta = require_radians("theta", theta)
     size = 1.0 if pixel_size is None else pixel_size
-    proj_geom, _ = parallel_geometry(theta, len(tomo), tomo.shape[2], centre, size)
+    columns = tomo.shape[2]
+    proj_geom, _ = parallel_geometry(
+        pixel=size, radians=theta, detector=(len(tomo), columns), offset=((columns / 2 - centre) * size, 0.0)
+    )
     window = np.repeat(0.5 * size * np.array(recon.shape[::-1]), 2) * np.tile([-1, 1], 3)
     return proj_geom, volume_geometry(np.array(recon.shape), window)
 

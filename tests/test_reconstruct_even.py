@@ -5,7 +5,7 @@ import pytest
 
 import tomo_polysplat as tps
 from tomo_polysplat.physics.materials import density, mass_attenuation
-from tomo_polysplat.scan.layout import parallel_geometry
+from tomo_polysplat.scan.circular import parallel_geometry
 
 COLUMNS, VIEWS, PIXEL, RADIUS, PHOTONS = 45, 90, 0.05, 0.9, 2e4
 
@@ -14,7 +14,7 @@ def disc_scan(material):
     """Noisy projections of a disc (radius in cm), its geometries, spectrum and true attenuation."""
     spectrum = tps.Spectrum.from_tube(120, filters={"Cu": 0.05})
     theta = np.linspace(0, np.pi, VIEWS, endpoint=False)
-    proj_geom, vol_geom = parallel_geometry(theta, 1, COLUMNS, COLUMNS / 2, PIXEL)
+    proj_geom, vol_geom = parallel_geometry(pixel=PIXEL, radians=theta, detector=(1, COLUMNS))
     across = PIXEL * (np.arange(COLUMNS) + 0.5 - COLUMNS / 2)
     areal = density(material) * 2 * np.sqrt(np.maximum(RADIUS**2 - across**2, 0))
     light = np.exp(-np.outer(areal, mass_attenuation(material, spectrum.energies))) @ spectrum.weights

@@ -1,5 +1,6 @@
 """Files made to deceive: each trick by itself, and what it would cost."""
 
+import json
 import os
 import resource
 import subprocess
@@ -153,7 +154,9 @@ def test_a_header_of_gigabytes_takes_no_memory(tmp_path):
 def test_what_files_say_is_no_html(tmp_path):
     evil = "<script>alert(1)</script>"
     parts = RESULT | {
-        "polysplat/plan": f'{{"{evil}": "{evil}", "list": ["{evil}"], "deep": {{"{evil}": 1}}}}',
+        "polysplat/plan": json.dumps(
+            {evil: {"value": {evil: [evil]}, "why": evil, "status": "found", "evidence": {evil: 1}}}
+        ),
         "polysplat/counts": f'{{"{evil}": 5}}',
         "polysplat/settings": f'{{"name": "{evil}"}}',
     }

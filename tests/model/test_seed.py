@@ -183,7 +183,7 @@ def test_metal_may_reach_down_to_its_rim_where_it_is_connected():
     start[0, 8:16, 8:16], start[0, 10:14, 10:14] = 3.0, 4.0
     start[0, 28:32, 28:32] = 3.0
     grid = grid_of(start.shape)
-    for rim, first, last in ((0.0, 10, 14), (2.5, 8, 16)):
+    for rim, first, last in ((None, 10, 14), (2.5, 8, 16)):
         settings = Settings(metal_level=3.5, metal_u=1.0, metal_rim=rim)
         cloud = seeds(start, grid, 1.0, polychromatic=True, settings=settings)
         place = cloud.position[:, :2] / 0.1 + 20

@@ -13,8 +13,8 @@ import tomo_polysplat
 from tomo_polysplat import polysplat
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.plugins import tomopy_plugin
+from tomo_polysplat.scan.circular import parallel_geometry
 from tomo_polysplat.scan.geometry import from_astra, projections_from_astra
-from tomo_polysplat.scan.layout import parallel_geometry
 from tomo_polysplat.simulate.scanner import Scanner
 from tomo_polysplat.simulate.scenes import SCENES, scan_phantom, scene_phantom
 from tomo_polysplat.start.fdk import fdk
@@ -265,7 +265,7 @@ def test_a_polychromatic_scan_gains_6_db(tomopy):
     size, rows = 44, 6
     pixel = 2.9 * SCENES["teeth"].half_width / size
     theta = np.linspace(0, np.pi, 90, endpoint=False)
-    geometries = parallel_geometry(theta, rows, size, size / 2, pixel)
+    geometries = parallel_geometry(pixel=pixel, radians=theta, detector=(rows, size))
     spectrum = Spectrum.from_tube(90, filters={"Al": 0.1})
     scan = scan_phantom(scene_phantom("teeth"), *geometries, spectrum, Scanner())
     tomo = scan.projections.swapaxes(0, 1)
