@@ -7,12 +7,18 @@ from pathlib import Path
 
 from tomo_polysplat.checks import fail, require_choice
 from tomo_polysplat.scan.scan import Scan
-from tomo_polysplat.simulate.folders import nikon, nxtomo, skyscan, tiffs
+from tomo_polysplat.simulate.folders import nikon, nxtomo, rtk, skyscan, tiffs
 from tomo_polysplat.simulate.folders.scene import marked_scan, pictures_of
 
 __all__ = ["KINDS", "write_folder"]
 
-KINDS = {"tiffs": tiffs.write, "skyscan": skyscan.write, "nikon": nikon.write, "nxtomo": nxtomo.write}
+KINDS = {
+    "tiffs": tiffs.write,
+    "skyscan": skyscan.write,
+    "nikon": nikon.write,
+    "nxtomo": nxtomo.write,
+    "rtk": rtk.write,
+}
 # Scans of a geometry that a kind has of its own.
 _SCANS = {"nikon": nikon.make}
 
