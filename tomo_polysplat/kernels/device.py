@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.quiet_imports import leaving_no_trace
 
 __all__ = ["one_torch_thread", "pick_device", "usual_modes"]
 
@@ -27,11 +26,6 @@ def pick_device(name: str | torch.device) -> torch.device:
         For another name, or a GPU that torch does not find.
     """
     known = "auto, cpu, cuda or cuda:N"
-    with leaving_no_trace():  # CUDA, once asked for
-        return _device(name, known)
-
-
-def _device(name: str | torch.device, known: str) -> torch.device:
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
