@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.scan.gauges import effects, view_gauge, without_gauge
+from tomo_polysplat.scan.gauges import common_offset, effects, view_gauge, without_gauge
 from tomo_polysplat.scan.moves import MOVES, MovedViews, Scanner, moved_geometry
 from tomo_polysplat.scan.view_geometry import Geometry
 
@@ -182,9 +182,9 @@ class Alignment:
         """
         if "views" not in self.values:
             return
-        for k, name in enumerate(("u", "v")):
+        for name, offset in zip(("u", "v"), common_offset(self.values["views"], self.scanner)):
             if name in self.names:
-                self.values[name] = self.values[name] + self.values["views"][:, k].mean()
+                self.values[name] = self.values[name] + offset
         self.values["views"] = without_gauge(self.values["views"], self._gauge)
 
     def put_back(self, *names: str) -> None:
