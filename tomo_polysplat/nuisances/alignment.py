@@ -113,6 +113,11 @@ class Alignment:
         self._steps = dict.fromkeys(self.names, 0)
         self._seen = {name: torch.zeros_like(self.values[name]) for name in self.names}
 
+    def only(self, names: Sequence[str]) -> None:
+        """Step these alone from now on; the values of others stay as they are."""
+        self.names = tuple(name for name in self.names if name in names)
+        self.forget()
+
     def moved(self, chosen: np.ndarray | None = None) -> MovedViews:
         """The views of these indices as they are moved."""
         return self.scanner.moved(self.values, chosen)

@@ -64,7 +64,7 @@ def worth_it(told: float, moved: float) -> bool:
 def search(
     alignment: Alignment, fit_level: Callable[[int, int, tuple[str, ...]], float], factors: Sequence[int]
 ) -> dict[str, Any]:
-    """Find the moves of a scanner; those that no level confirms are put back.
+    """Find the moves of a scanner; those that no level confirms are put back, and not stepped any more.
 
     Moves of the whole scanner come before those of single views. A kind that a level has confirmed moves on in all
     finer ones without being asked again: there it has little left to gain.
@@ -108,4 +108,5 @@ def search(
                 alignment.restore(kept)
         record.append(told)
         logger.info("alignment by pixels joined by %d: %s", factor, alignment.describe())
+    alignment.only(confirmed)
     return {"confirmed": list(confirmed), "levels": record}
