@@ -165,6 +165,15 @@ def test_moves_held_and_views_not_chosen_stay():
     assert abs(float(alignment.values["roll"])) == 10.0
 
 
+def test_an_offset_of_all_views_is_the_detectors():
+    alignment = Alignment(orbit(), 1.0)
+    for hold, u in (((), 0.6), (("u",), 0.6)):
+        alignment.values["views"] = torch.full((21, 2), 0.6 if not hold else 0.1, dtype=torch.float64)
+        alignment.hold_gauge(hold)
+        assert float(alignment.values["u"]) == pytest.approx(u, abs=1e-9)
+        assert alignment.values["views"].abs().max() < 1e-9
+
+
 def test_a_checkpoint_goes_on_with_the_same_values():
     first = Alignment(orbit(), 1.0, start={"u": 1.25})
     first.values["views"] += torch.randn((21, 2)).double()

@@ -180,15 +180,16 @@ class Alignment:
         )
         self.values[name][where] = moved.clamp(-bound, bound)
 
-    def hold_gauge(self) -> None:
+    def hold_gauge(self, hold: Sequence[str] = ()) -> None:
         """Take out of the views' shifts what all have in common and what moves the object; between passes.
 
-        What they have in common goes to the offsets that are fitted, whose steps are other than those of single views.
+        What they have in common goes to the offsets that are fitted, whose steps are other than those of single views,
+        but for those named in ``hold``.
         """
         if "views" not in self.values:
             return
         for name, offset in zip(("u", "v"), common_offset(self.values["views"], self.scanner)):
-            if name in self.names:
+            if name in self.names and name not in hold:
                 self.values[name] = self.values[name] + offset
         self.values["views"] = without_gauge(self.values["views"], self._gauge)
 
