@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tomo_polysplat.kernels.project.autograd import project
-from tomo_polysplat.nuisances.alignment import Alignment, levels, schedule, worth_it
+from tomo_polysplat.nuisances.alignment import Alignment
 from tomo_polysplat.render.renderer import detector_views
 from tomo_polysplat.scan.as_told import seen_as_told
 from tomo_polysplat.scan.moves import Scanner, moved_geometry
@@ -165,24 +165,21 @@ def test_moves_held_and_views_not_chosen_stay():
     assert abs(float(alignment.values["roll"])) == 10.0
 
 
+def test_an_offset_of_all_views_is_the_detectors():
+    alignment = Alignment(orbit(), 1.0)
+    for hold, u in (((), 0.6), (("u",), 0.6)):
+        alignment.values["views"] = torch.full((21, 2), 0.6 if not hold else 0.1, dtype=torch.float64)
+        alignment.hold_gauge(hold)
+        assert float(alignment.values["u"]) == pytest.approx(u, abs=1e-9)
+        assert alignment.values["views"].abs().max() < 1e-9
+
+
 def test_a_checkpoint_goes_on_with_the_same_values():
     first = Alignment(orbit(), 1.0, start={"u": 1.25})
     first.values["views"] += torch.randn((21, 2)).double()
     second = Alignment(orbit(), 1.0)
     second.restore(first.state())
     assert second.report() == first.report() and second.largest_shift() == first.largest_shift() > 1.0
-
-
-def test_levels_go_from_coarse_to_fine():
-    assert levels(60) == [4, 2, 1] and levels(192) == [8, 4, 2] and levels(2000) == [128, 64, 32, 16]
-    assert levels(20) == [1]
-    rates = [schedule(0, 4).rate(share, 4) for share in (0.0, 0.5, 1.0)]
-    assert rates[0] == 1.0 and rates[2] == pytest.approx(0.1) and rates[1] == pytest.approx(np.sqrt(0.1))
-    assert schedule(2, 1).rate(0.0, 1) < schedule(1, 2).rate(0.0, 2)
-
-
-def test_rays_must_say_so_clearly():
-    assert worth_it(1.0, 0.97) and not worth_it(1.0, 0.99) and not worth_it(1.0, float("nan"))
 
 
 @pytest.mark.parametrize("beam", ["cone", "parallel"])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from tomo_polysplat.scan.gauges import effects, view_gauge, without_gauge
+from tomo_polysplat.scan.gauges import common_offset, effects, view_gauge, without_gauge
 from tomo_polysplat.scan.moves import MOVES, Scanner, moved_geometry
 from tomo_polysplat.scan.view_geometry import Geometry
 
@@ -152,3 +152,13 @@ def test_shifts_that_the_object_makes_are_gauge(beam):
         assert without_gauge(shifts, gauge).abs().max() < 1e-12
     twice = torch.from_numpy(np.stack([np.cos(2 * angle), np.sin(angle)], axis=1))
     assert torch.allclose(without_gauge(twice, gauge), twice, atol=1e-12)
+
+
+@pytest.mark.parametrize("arc", [180.0, 360.0])
+def test_an_offset_is_told_from_a_move_of_the_object(arc):
+    """In half a turn the sine has a mean, which is none of the detector's."""
+    scanner = Scanner(orbit("parallel", views=40, arc=arc))
+    angle = np.deg2rad(arc) * np.arange(40) / 40
+    u = 0.7 + 0.5 * np.sin(angle) - 0.2 * np.cos(angle)
+    shifts = torch.from_numpy(np.stack([u, 0 * u], axis=1))
+    assert torch.allclose(common_offset(shifts, scanner), torch.tensor([0.7, 0.0]).double(), atol=1e-9)

@@ -7,18 +7,17 @@ place of the told ones, and hands the loss's gradient by them to `Alignment.grad
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.scan.gauges import effects, view_gauge, without_gauge
+from tomo_polysplat.scan.gauges import common_offset, effects, view_gauge, without_gauge
 from tomo_polysplat.scan.moves import MOVES, MovedViews, Scanner, moved_geometry
 from tomo_polysplat.scan.view_geometry import Geometry
 
-__all__ = ["IN_PLANE", "USUAL", "Alignment", "Schedule", "levels", "schedule", "worth_it"]
+__all__ = ["IN_PLANE", "USUAL", "Alignment"]
 
 # What is moved where the rays tell it. Offsets along v and distances are left: the object takes their place.
 USUAL = ("u", "roll", "tilt", "skew", "views")
@@ -34,49 +33,6 @@ _MOST_A_PIXEL = 2.0
 # Memories of the mean gradient and of its mean square; single views are seen once a pass only. Steps beyond _STEEPEST
 # deviations of the gradient are cut.
 _MEAN, _SQUARE, _VIEW_MEAN, _STEEPEST = 0.7, 0.95, 0.5, 3.0
-# Moves are kept where the misfit of held-out rays falls below this share of that without. 90 views of bone of 40^3
-# voxels by pixels of which four by four are joined: 1.005 with nothing to find, 0.93 and 0.85 with the axis off by 0.25
-# and 0.5 pixels of the detector; by views that are shifted 1.045, and 0.94 and 0.83 where they are by as much.
-_MARGIN = 0.98
-# Columns of the coarsest and of the finest joined detector.
-_COARSEST, _FINEST = 15, 64
-
-
-@dataclass(frozen=True)
-class Schedule:
-    """Steps of a level, in pixels of its detector, at its start and at its end; in between in equal ratios."""
-
-    first: float
-    last: float
-
-    def rate(self, share: float, factor: int) -> float:
-        """Of one step when so much of the level is done, in pixels of the detector, of which ``factor`` are joined."""
-        return factor * self.first * (self.last / self.first) ** share
-
-
-def schedule(level: int, factor: int) -> Schedule:
-    """The steps of a level: large in the first (0), small where pixels are not joined (``factor`` 1)."""
-    if factor == 1:
-        return Schedule(0.03, 0.003)
-    return Schedule(0.25, 0.025) if level == 0 else Schedule(0.1, 0.005)
-
-
-def levels(columns: int) -> list[int]:
-    """How many columns, and rows, are joined to one, from coarse to fine, in powers of two.
-
-    The coarsest detector has 15 to 29 columns, on which an offset by a sixth of the width is found, the finest 64 at
-    least, if there are as many.
-    """
-    factors = [1]
-    while columns // (2 * factors[-1]) >= _COARSEST:
-        factors.append(2 * factors[-1])
-    finest = max([1, *(f for f in factors if columns // f >= _FINEST)])
-    return [f for f in reversed(factors) if f >= finest]
-
-
-def worth_it(told: float, moved: float) -> bool:
-    """Whether the misfit of held-out rays says that the moves are there: as told, and moved, by fits alike."""
-    return moved < _MARGIN * told
 
 
 class Alignment:
@@ -157,6 +113,11 @@ class Alignment:
         self._steps = dict.fromkeys(self.names, 0)
         self._seen = {name: torch.zeros_like(self.values[name]) for name in self.names}
 
+    def only(self, names: Sequence[str]) -> None:
+        """Step these alone from now on; the values of others stay as they are."""
+        self.names = tuple(name for name in self.names if name in names)
+        self.forget()
+
     def moved(self, chosen: np.ndarray | None = None) -> MovedViews:
         """The views of these indices as they are moved."""
         return self.scanner.moved(self.values, chosen)
@@ -219,16 +180,17 @@ class Alignment:
         )
         self.values[name][where] = moved.clamp(-bound, bound)
 
-    def hold_gauge(self) -> None:
+    def hold_gauge(self, hold: Sequence[str] = ()) -> None:
         """Take out of the views' shifts what all have in common and what moves the object; between passes.
 
-        What they have in common goes to the offsets that are fitted, whose steps are other than those of single views.
+        What they have in common goes to the offsets that are fitted, whose steps are other than those of single views,
+        but for those named in ``hold``.
         """
         if "views" not in self.values:
             return
-        for k, name in enumerate(("u", "v")):
-            if name in self.names:
-                self.values[name] = self.values[name] + self.values["views"][:, k].mean()
+        for name, offset in zip(("u", "v"), common_offset(self.values["views"], self.scanner)):
+            if name in self.names and name not in hold:
+                self.values[name] = self.values[name] + offset
         self.values["views"] = without_gauge(self.values["views"], self._gauge)
 
     def put_back(self, *names: str) -> None:

@@ -10,7 +10,7 @@ import torch
 
 from tomo_polysplat.scan.moves import Scanner
 
-__all__ = ["Effect", "effects", "without_gauge", "view_gauge"]
+__all__ = ["Effect", "common_offset", "effects", "view_gauge", "without_gauge"]
 
 # Views, spread over the scan, that tell what a move does.
 _VIEWS = 48
@@ -65,16 +65,26 @@ def view_gauge(scanner: Scanner) -> torch.Tensor:
     Those by which all move alike, which are moves of the detector, and those that a move of the object in space makes:
     in an orbit about z the cosine and the sine of the angle along ``u``, and one along ``v``.
     """
-    views = scanner.geometry.views
-    alike = torch.eye(2, dtype=torch.float64).repeat(views, 1)
-    of_object = _of_object(scanner, torch.zeros((1, 3), dtype=torch.float64))[:, :3]
-    return _orthonormal(torch.cat([alike, of_object], dim=1))
+    return _orthonormal(_no_single_views(scanner))
+
+
+def common_offset(shifts: torch.Tensor, scanner: Scanner) -> torch.Tensor:
+    """(2,) offset along ``u`` and ``v`` that is in shifts (views, 2), beside what a move of the object explains."""
+    columns = _no_single_views(scanner)
+    return torch.linalg.lstsq(columns, shifts.reshape(-1, 1), driver="gelsd").solution[:2, 0]
 
 
 def without_gauge(shifts: torch.Tensor, gauge: torch.Tensor) -> torch.Tensor:
     """Shifts (views, 2) without what lies in a gauge."""
     flat = shifts.reshape(-1)
     return (flat - gauge @ (gauge.T @ flat)).reshape(shifts.shape)
+
+
+def _no_single_views(scanner: Scanner) -> torch.Tensor:
+    """(2 views, 5) shifts of all views alike along ``u`` and ``v``, and those by moves of the object."""
+    alike = torch.eye(2, dtype=torch.float64).repeat(scanner.geometry.views, 1)
+    of_object = _of_object(scanner, torch.zeros((1, 3), dtype=torch.float64))[:, :3]
+    return torch.cat([alike, of_object], dim=1)
 
 
 def _falls(scanner: Scanner, name: str, points: torch.Tensor) -> Callable[[torch.Tensor], torch.Tensor]:
