@@ -9,6 +9,7 @@ import numpy as np
 from tomo_polysplat.scan.dropouts import dropped_rays
 from tomo_polysplat.scan.probes.finding import DEFECT, OK, Finding
 from tomo_polysplat.scan.probes.measured import Measured
+from tomo_polysplat.scan.stuck import stuck_pixels
 
 __all__ = ["DEAD", "RAYS", "bad_rays", "probe_rays"]
 
@@ -37,7 +38,9 @@ def bad_rays(measured: Measured) -> dict[str, np.ndarray]:
     valid, projections = measured.valid[:, views], measured.scan.projections[:, views]
     starved = _starved(projections, valid, measured.level)
     zero = dropped_rays(np.where(valid, projections, np.nan))
-    pixels = _dead_pixels(projections, valid, measured.level) | ((~valid & ~starved).mean(axis=1) > _MOSTLY)
+    pixels = stuck_pixels(np.where(valid, projections, np.nan).transpose(1, 0, 2))
+    pixels |= _dead_pixels(projections, valid & ~pixels[:, None], measured.level)
+    pixels |= (~valid & ~starved).mean(axis=1) > _MOSTLY
     dead = np.broadcast_to(pixels[:, None], valid.shape)
     return {
         DEAD: dead,
