@@ -101,8 +101,11 @@ def _line_integrals(
                 "none",
                 "or pass input='transmission' or 'attenuation'",
             )
-        no_light = None if dark is None else read_block(dark)
-        flat, background = flat_and_dark(read_block(white), no_light, (rows, columns))
+        no_light, open_beam = None if dark is None else read_block(dark), read_block(white)
+        flat, background = flat_and_dark(open_beam, no_light, (rows, columns))
+        frames = {"white_frames": _frame_means(open_beam), "dark_frames": _frame_means(no_light)}
+    else:
+        frames = {}
     projections = np.empty((rows, views, columns), np.float32)
     valid = np.empty((rows, views, columns), bool)
     rays: dict[str, int] = {}
@@ -114,7 +117,15 @@ def _line_integrals(
         )
         projections[:, part], valid[:, part] = values.transpose(1, 0, 2), usable.transpose(1, 0, 2)
         rays = {name: rays.get(name, 0) + count for name, count in counts.items()}
-    return projections, valid, {"input": kind, "rays": rays}
+    return projections, valid, {"input": kind, "rays": rays} | frames
+
+
+def _frame_means(frames: np.ndarray | None) -> list[float]:
+    """Mean counts of each open-beam or dark image, by which `check` questions them."""
+    if frames is None:
+        return []
+    frames = frames[None] if frames.ndim == 2 else frames
+    return [float(np.nanmean(frame, dtype=np.float64)) for frame in frames]
 
 
 def _input_kind(data: h5py.Dataset, has_white: bool, stated: str | None) -> str:
