@@ -52,8 +52,9 @@ def check_scan(scan: Scan) -> list[Finding]:
     Returns
     -------
     list of Finding
-        On bad rays, the logarithm, the open beam, the order of the axes and of the views, truncation, voxels that no
-        ray sees, the centre and the direction of the angles. A probe without evidence says "unknown" and what it would take, and the others answer all the same.
+        On bad rays, the logarithm, the order of the axes and of the views, the open beam, truncation, voxels that no
+        ray sees, the centre and the direction of the angles. A probe without evidence says "unknown" and what it would
+        take, and the others answer all the same.
     """
     measured = Measured(scan)
     kinds = bad_rays(measured)

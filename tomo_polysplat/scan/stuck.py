@@ -72,7 +72,7 @@ def _among_working(values: np.ndarray, told: np.ndarray, same: np.ndarray, large
                 continue
             if (~same[wider] & around).sum() < _WORKING * around.sum():
                 continue
-            beside = values[(slice(None), *wider)][:, around & ~same[wider]]
+            beside = values[:, wider[0], wider[1]][:, around & ~same[wider]]
             beside = np.where(np.isfinite(beside), beside, np.nan)
             changes = np.fmax.reduce(beside, axis=0) - np.fmin.reduce(beside, axis=0)
             usual = float(np.nanmedian(beside))

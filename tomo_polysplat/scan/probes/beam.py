@@ -42,7 +42,7 @@ def probe_beam(measured: Measured) -> Finding:
     drift, error = _common_change(air)
     numbers["change"] = drift
     if drift > _FLICKER + _SURE * error:
-        text = f"the light beside the object changes by {100 * drift:.2g} % from view to view or in the course of the scan"
+        text = f"the light beside the object changes by {100 * drift:.2g} % in the course of the scan"
         remedy = "normalise each view by the rays beside the object"
         return Finding(BEAM, DEFECT, text, remedy, numbers, error)
     if _SURE * max(error, air.error) > max(_TOLERATED, _FLICKER):

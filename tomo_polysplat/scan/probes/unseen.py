@@ -15,14 +15,14 @@ COVERAGE = "coverage"
 # Voxels along an axis that are looked at; share of the volume that may go unseen; matter in the outermost rows, as a
 # share of the scan's large values.
 _MOST_VOXELS, _TOLERATED, _MATTER = 40, 0.005, 0.1
-_SURE = 4.0
 
 
 def probe_coverage(measured: Measured) -> Finding:
     """Count voxels that no view sees, and ask whether the object goes on where they are."""
     grid = measured.grid
-    coarse = VolumeGrid(tuple(min(n, _MOST_VOXELS) for n in grid.shape), grid.lower, grid.upper)
-    seen = coverage(measured.geometry, coarse, measured.valid.any(axis=1))
+    slices, rows, columns = (min(n, _MOST_VOXELS) for n in grid.shape)
+    coarse = VolumeGrid((slices, rows, columns), grid.lower, grid.upper)
+    seen = coverage(measured.geometry, coarse, np.asarray(measured.valid.any(axis=1)))
     unseen = float(np.mean(seen == 0))
     numbers = {"unseen": unseen, "largest share of views": float(seen.max())}
     if unseen <= _TOLERATED:
