@@ -45,8 +45,8 @@ def test_a_right_open_beam_is_ok(exchange):
         ({"data_white": lambda white: np.concatenate([white[:3], 0.85 * white[3:]])}, "falls"),
         (
             {
-                "data": lambda data: np.minimum(data, 4095).astype(float),
-                "data_white": lambda white: np.minimum(white, 4095).astype(float),
+                "data": lambda data: np.minimum(data, 800).astype(float),
+                "data_white": lambda white: np.minimum(white, 800).astype(float),
             },
             "very same value",
         ),
@@ -54,7 +54,7 @@ def test_a_right_open_beam_is_ok(exchange):
     ids=["exposure", "shutter", "darks", "tube", "saturated"],
 )
 def test_a_wrong_open_beam_is_named(exchange, changes, word):
-    light = 6000 if word == "very same value" else LIGHT
+    light = 1000 if word == "very same value" else LIGHT
     found = beam(written(exchange, light, **changes))
     assert found.verdict == DEFECT and word in found.text and found.remedy
 
