@@ -35,7 +35,7 @@ def test_a_plane_of_air_does_not_tell_the_axis(seed):
     """Half a cone: the object lies below the plane of the orbit."""
     vectors = orbit(whole_turn(VIEWS), down=1.5)
     below = [(0.25, (0, 0, -1.5), (1.6, 1.3, 0.9)), (0.5, (0.7, 0.3, -1.5), (0.3, 0.3, 0.5))]
-    scan = cone_scan(noisy(chords(vectors, ROWS, COLUMNS, below), 1e4, seed), vectors, low=-2.8, high=0.2)
+    scan = cone_scan(noisy(chords(vectors, 37, COLUMNS, below), 1e4, seed), vectors, low=-2.4, high=-0.4)
     found = verdicts(scan)
     assert found["centre"] == UNKNOWN and DEFECT not in found.values()
 

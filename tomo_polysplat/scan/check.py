@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from tomo_polysplat.scan.probes.axes import AXES, probe_axes
+from tomo_polysplat.scan.probes.beam import BEAM, probe_beam
 from tomo_polysplat.scan.probes.finding import DEFECT, OK, UNKNOWN, Finding, Verdict
 from tomo_polysplat.scan.probes.logarithm import LOGARITHM, probe_logarithm
 from tomo_polysplat.scan.probes.measured import Measured
@@ -15,6 +16,7 @@ from tomo_polysplat.scan.probes.opposite import CENTRE, DIRECTION, probe_centre_
 from tomo_polysplat.scan.probes.order import ORDER, probe_order
 from tomo_polysplat.scan.probes.rays import DEAD, bad_rays, probe_rays
 from tomo_polysplat.scan.probes.truncation import TRUNCATION, probe_truncation
+from tomo_polysplat.scan.probes.unseen import COVERAGE, probe_coverage
 from tomo_polysplat.scan.scan import Scan
 
 __all__ = ["DEFECT", "OK", "UNKNOWN", "Finding", "Verdict", "check_scan"]
@@ -28,9 +30,13 @@ FIRST: tuple[tuple[tuple[str, ...], Probe], ...] = (
 )
 LATER: tuple[tuple[tuple[str, ...], Probe], ...] = (
     ((ORDER,), probe_order),
+    ((BEAM,), probe_beam),
     ((TRUNCATION,), probe_truncation),
+    ((COVERAGE,), probe_coverage),
     ((CENTRE, DIRECTION), probe_centre_and_direction),
 )
+# Whose defects say nothing of the rest but that it is to be looked at again; those of the others hide nothing.
+_MISLEADING = (LOGARITHM, AXES, ORDER)
 # An object and air on both sides of it.
 _FEWEST_COLUMNS = 3
 
@@ -46,8 +52,9 @@ def check_scan(scan: Scan) -> list[Finding]:
     Returns
     -------
     list of Finding
-        On bad rays, the logarithm, the order of the axes and of the views, truncation, the centre and the direction of
-        the angles. A probe without evidence says "unknown" and what it would take, and the others answer all the same.
+        On bad rays, the logarithm, the order of the axes and of the views, the open beam, truncation, voxels that no
+        ray sees, the centre and the direction of the angles. A probe without evidence says "unknown" and what it would
+        take, and the others answer all the same.
     """
     measured = Measured(scan)
     kinds = bad_rays(measured)
@@ -56,7 +63,9 @@ def check_scan(scan: Scan) -> list[Finding]:
     measured = replace(measured, dead_pixels=np.asarray(kinds[DEAD].any(axis=1)))
     nothing = _nothing_to_see(measured)
     for names, probe in FIRST + LATER:
-        misleading = [finding.probe for finding in findings[1:] if finding.misleading]
+        misleading = [
+            finding.probe for finding in findings if finding.probe in _MISLEADING and finding.misleading
+        ]
         if nothing:
             findings += [Finding(name, UNKNOWN, nothing, "a scan of an object") for name in names]
         elif misleading and (names, probe) in LATER:

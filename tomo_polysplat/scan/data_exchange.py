@@ -113,12 +113,23 @@ def _line_integrals(
             )
         for frames in filter(None, (white, dark)):
             _require_few(frames, data)
-        no_light = None if dark is None else read_block(dark)
-        flat, background = flat_and_dark(read_block(white), no_light, (rows, columns))
+        no_light, open_beam = None if dark is None else read_block(dark), read_block(white)
+        flat, background = flat_and_dark(open_beam, no_light, (rows, columns))
+        means = {"white_frames": _frame_means(open_beam), "dark_frames": _frame_means(no_light)}
+    else:
+        means = {}
     projections, valid, rays = line_integrals(
         lambda part: read_block(data, part), data.shape, kind, flat, background, options.saturation
     )
-    return projections, valid, {"input": kind, "rays": rays}
+    return projections, valid, {"input": kind, "rays": rays} | means
+
+
+def _frame_means(frames: np.ndarray | None) -> list[float]:
+    """Mean counts of each open-beam or dark image, by which `check` questions them."""
+    if frames is None:
+        return []
+    frames = frames[None] if frames.ndim == 2 else frames
+    return [float(np.nanmean(frame, dtype=np.float64)) for frame in frames]
 
 
 def _require_few(frames: StoredArray, data: StoredArray) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.files import available_memory
+from tomo_polysplat.free_memory import available_memory
 from tomo_polysplat.scan.defects import attenuation
 
 __all__ = ["line_integrals"]

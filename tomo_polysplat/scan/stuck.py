@@ -1,4 +1,4 @@
-"""Pixels that show the same value in every view, which no measurement does."""
+"""Pixels that show the same value in every view, which no measurement does: single ones, lines, gaps between tiles."""
 
 from __future__ import annotations
 
@@ -6,21 +6,24 @@ import numpy as np
 
 __all__ = ["stuck_pixels"]
 
-# In fewer views a value may repeat by chance. More constant pixels side by side may be real: without noise, matter on
-# the axis looks the same from all sides.
-_FEWEST_VIEWS, _SIDE_BY_SIDE = 8, 4
-# A value above this share of the largest one is that of a ray without light.
-_OPAQUE = 0.98
-# On both sides of a stuck pixel values change by the first share of the largest, and on one side by the second share.
-# Real values with few different counts may be constant where hardly anything changes.
-_CHANGES, _CHANGES_MUCH = 0.02, 0.1
+# In fewer views a value may come again by chance.
+_FEWEST_VIEWS = 8
+# A value that so many rays of working pixels show, or so many of all pixels, is what the scan holds for air without
+# noise, or for no light.
+_COMMON, _MANY = 1e-3, 0.4
+# Beside a stuck pixel values change by so much of the largest where it changes most, or are as far from its own; real
+# ones of few different counts may be constant where hardly anything changes. So many of the pixels around must work:
+# what lies on the axis looks the same from all around, and so does all that is round about it, where there is no noise.
+_CHANGES, _WORKING = 0.1, 0.6
+# A value as large, as a share of the largest, is that of rays without light, unless it is as far above what is around.
+_OPAQUE, _DARK_AROUND = 0.98, 0.6
+_AROUND = np.ones((3, 3), bool)
 
 
 def stuck_pixels(values: np.ndarray) -> np.ndarray:
-    """Which pixels are stuck, (rows, columns): constant, between pixels of their row that change.
+    """Which pixels are stuck, (rows, columns): constant beside pixels that change, at a value that these never have.
 
-    Pixels at 0 or near the largest value are not reported: air without noise is constant, too, and so are rays
-    without light.
+    The zeros of air without noise, which pixels at its border have as well in some views, are not told of.
 
     Parameters
     ----------
@@ -32,32 +35,51 @@ def stuck_pixels(values: np.ndarray) -> np.ndarray:
     if views < _FEWEST_VIEWS or columns < 3:
         return stuck
     # Three views leave few pixels to look at in all of them.
-    first = values[0]
-    same = (first == values[views // 2]) & (first == values[-1])
-    told = same & (first != 0) & np.isfinite(first)
+    some = values[[0, views // 2, -1]]
+    first = some[0]
+    same = np.isfinite(first) & (some == first).all(axis=0)
+    told = same & ~_common(first, some[:, ~same], same)
+    place = np.nonzero(told)
+    told[place] = (values[:, place[0], place[1]] == first[place]).all(axis=0)
     if not told.any():
         return stuck
     largest = float(np.max(values, where=np.isfinite(values), initial=0.0))
-    told &= first < _OPAQUE * largest
-    for row in np.flatnonzero(told.any(axis=1)):
-        some = np.flatnonzero(same[row])
-        constant = np.zeros(columns, bool)
-        constant[some] = (values[:, row, some] == first[row, some]).all(axis=0)
-        for begin, end in _runs(constant):
-            if begin == 0 or end == columns or end - begin > _SIDE_BY_SIDE or not told[row, begin:end].all():
+    return _among_working(values, told, same, largest)
+
+
+def _common(first: np.ndarray, working: np.ndarray, same: np.ndarray) -> np.ndarray:
+    """Where the value is one that working pixels have as well, (rows, columns)."""
+    shown, counts = np.unique(working, return_counts=True)
+    constant, pixels = np.unique(first[same], return_counts=True)
+    often = np.concatenate(
+        [shown[counts > max(2, _COMMON * working.size)], constant[pixels > _MANY * first.size]]
+    )
+    return np.isin(first, often) | ~same
+
+
+def _among_working(values: np.ndarray, told: np.ndarray, same: np.ndarray, largest: float) -> np.ndarray:
+    """The areas of pixels told of that have the same value, and around which pixels work."""
+    from scipy import ndimage
+
+    stuck = np.zeros(told.shape, bool)
+    for value in np.unique(values[0][told]):
+        areas, count = ndimage.label(told & (values[0] == value), _AROUND)
+        for number, box in enumerate(ndimage.find_objects(areas), 1):
+            wider = tuple(slice(max(part.start - 1, 0), part.stop + 1) for part in box)
+            area = areas[wider] == number
+            around = ndimage.binary_dilation(area, _AROUND) & ~area
+            if not around.any():
                 continue
-            beside = values[:, row, [begin - 1, end]]
-            changes = _range(np.where(np.isfinite(beside), beside, np.nan)) / largest
-            stuck[row, begin:end] = (changes > _CHANGES).all() and (changes > _CHANGES_MUCH).any()
+            if (~same[wider] & around).sum() < _WORKING * around.sum():
+                continue
+            beside = values[:, wider[0], wider[1]][:, around & ~same[wider]]
+            beside = np.where(np.isfinite(beside), beside, np.nan)
+            changes = np.fmax.reduce(beside, axis=0) - np.fmin.reduce(beside, axis=0)
+            usual = float(np.nanmedian(beside))
+            apart = float(np.nanmax(changes, initial=0.0))
+            if value < _OPAQUE * largest:
+                apart = max(apart, abs(float(value) - usual))
+            elif usual > _DARK_AROUND * value:
+                continue
+            stuck[wider] |= area & (apart > _CHANGES * largest)
     return stuck
-
-
-def _runs(line: np.ndarray) -> list[tuple[int, int]]:
-    """Begin and end of every run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(np.int8), [0]])))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist()))
-
-
-def _range(values: np.ndarray) -> np.ndarray:
-    """Largest minus smallest value of each column, without NaN."""
-    return np.fmax.reduce(values, axis=0) - np.fmin.reduce(values, axis=0)

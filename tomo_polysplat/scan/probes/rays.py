@@ -9,6 +9,7 @@ import numpy as np
 from tomo_polysplat.scan.dropouts import dropped_rays
 from tomo_polysplat.scan.probes.finding import DEFECT, OK, Finding
 from tomo_polysplat.scan.probes.measured import Measured
+from tomo_polysplat.scan.stuck import stuck_pixels
 
 __all__ = ["DEAD", "RAYS", "bad_rays", "probe_rays"]
 
@@ -22,6 +23,8 @@ _STANDS_OUT = 0.1
 _OPAQUE = 0.6
 # Share of the scan's large values that a ray through the object has.
 _THROUGH = 0.1
+# A value is no measurement that comes so many times as often as any other.
+_OFTEN = 3
 
 
 RAYS = "bad rays"
@@ -37,7 +40,11 @@ def bad_rays(measured: Measured) -> dict[str, np.ndarray]:
     valid, projections = measured.valid[:, views], measured.scan.projections[:, views]
     starved = _starved(projections, valid, measured.level)
     zero = dropped_rays(np.where(valid, projections, np.nan))
-    pixels = _dead_pixels(projections, valid, measured.level) | ((~valid & ~starved).mean(axis=1) > _MOSTLY)
+    # Few photons make few values, and that of air is one of them.
+    zero &= _stands_out_as_value(projections[valid], 0.0)
+    pixels = stuck_pixels(np.where(valid, projections, np.nan).transpose(1, 0, 2))
+    pixels |= _dead_pixels(projections, valid & ~pixels[:, None], measured.level)
+    pixels |= (~valid & ~starved).mean(axis=1) > _MOSTLY
     dead = np.broadcast_to(pixels[:, None], valid.shape)
     return {
         DEAD: dead,
@@ -118,5 +125,17 @@ def _at_a_limit(projections: np.ndarray, valid: np.ndarray) -> np.ndarray:
     values = projections[valid]
     limits = [] if not values.size else [values.max(), values.min()]
     masks = [valid & (projections == limit) for limit in limits if limit != 0]
-    many = [mask for mask in masks if np.count_nonzero(mask) > max(10, _TOLERATED * values.size)]
+    many = [
+        mask
+        for mask in masks
+        if np.count_nonzero(mask) > max(10, _TOLERATED * values.size)
+        and _stands_out_as_value(values, float(projections[mask][0]))
+    ]
     return np.logical_or.reduce(many) if many else np.zeros(valid.shape, bool)
+
+
+def _stands_out_as_value(values: np.ndarray, value: float) -> bool:
+    """Whether rays hold a value much more often than any other, which counts of few photons do not."""
+    shown, counts = np.unique(values, return_counts=True)
+    others = counts[shown != value]
+    return int(counts.sum() - others.sum()) > _OFTEN * int(others.max(initial=0))

@@ -1,0 +1,59 @@
+"""How many views see each voxel: what no ray sees is not measured, which is something else than air."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tomo_polysplat.scan.view_geometry import Geometry
+from tomo_polysplat.scan.volume_grid import VolumeGrid
+
+__all__ = ["coverage"]
+
+# Voxels that are looked at together, so that their coordinates stay in cache.
+_AT_ONCE = 1 << 16
+
+
+def coverage(
+    geometry: Geometry, grid: VolumeGrid, pixels: np.ndarray | None = None, most_views: int = 90
+) -> np.ndarray:
+    """Share of the views that see the centre of each voxel.
+
+    Parameters
+    ----------
+    geometry, grid
+        Where the rays run, and the voxels.
+    pixels : bool array, shape (rows, columns), optional
+        Pixels that measure; None means all.
+    most_views : int
+        So many views, evenly spread, are looked at.
+
+    Returns
+    -------
+    float32 array, shape (z, y, x)
+        From 0, not measured, to 1.
+    """
+    views = np.unique(np.linspace(0, geometry.views - 1, min(geometry.views, most_views)).round().astype(int))
+    some = geometry.select(views)
+    x, y, z = grid.axes()
+    if geometry.planar:
+        # A fan sees its plane, whatever height its pixels are told to have.
+        z = np.full_like(z, float(geometry.centre[0, 2]))
+    layers = max(1, _AT_ONCE // (len(x) * len(y)))
+    seen = np.zeros(grid.shape, np.float32)
+    for first in range(0, len(z), layers):
+        part = np.stack(np.meshgrid(z[first : first + layers], y, x, indexing="ij")[::-1], axis=-1)
+        seen[first : first + layers] = _share(some, part.reshape(-1, 3), pixels).reshape(part.shape[:3])
+    return seen
+
+
+def _share(geometry: Geometry, points: np.ndarray, pixels: np.ndarray | None) -> np.ndarray:
+    """Share of the views that see each point, (n,)."""
+    seen = np.zeros(len(points), np.float32)
+    for view in range(geometry.views):
+        place = geometry.select(slice(view, view + 1)).project_points(points)[0]
+        column, row = (np.floor(np.nan_to_num(place[:, k], nan=-1.0) + 0.5).astype(int) for k in (0, 1))
+        inside = (column >= 0) & (column < geometry.columns) & (row >= 0) & (row < geometry.rows)
+        if pixels is not None:
+            inside[inside] = pixels[row[inside], column[inside]]
+        seen += inside
+    return seen / geometry.views
