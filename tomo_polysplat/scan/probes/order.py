@@ -23,6 +23,8 @@ _SURE = 4.0
 # A view in a wrong place differs from its neighbours by so many times as much as these do, squared, and by such a share
 # of what any two views differ by; where it belongs it differs by less than half.
 _FURTHER, _FAR, _ELSEWHERE = 2.5, 0.3, 0.5
+# The share is less where neighbours hardly differ: so many times their median, but not less than the second.
+_TIMES, _LEAST = 10.0, 0.05
 
 
 def probe_order(measured: Measured) -> Finding:
@@ -93,7 +95,7 @@ def _misplaced(views: Alike, squared: np.ndarray, near: np.ndarray, usual: float
     between = squared[near[:, 0], near[:, 1]]
     error = views.error(nearer)
     apart = nearer - _FURTHER * np.maximum(between, 0) > _SURE * error
-    apart &= nearer > _FAR * usual
+    apart &= nearer > np.clip(_TIMES * float(np.median(nearer)), _LEAST * usual, _FAR * usual)
     elsewhere = squared.copy()
     elsewhere[own[:, None], near] = elsewhere[own, own] = np.inf
     # The best of many: chance finds one more easily.

@@ -28,6 +28,7 @@ _OFTEN = 3
 
 
 RAYS = "bad rays"
+MARKED = "marked as bad"
 DEAD, ZERO = "of dead pixels", "zero in the middle of the object"
 STARVED = "without light behind dense matter"
 # How many rays to look at, and the least number of views.
@@ -49,7 +50,7 @@ def bad_rays(measured: Measured) -> dict[str, np.ndarray]:
     return {
         DEAD: dead,
         ZERO: zero & ~dead,
-        "marked as bad": ~valid & ~starved & ~dead,
+        MARKED: ~valid & ~starved & ~dead,
         "at the limit of the scale": _at_a_limit(projections, valid) & ~dead,
         STARVED: starved,
     }
@@ -70,7 +71,7 @@ def probe_rays(measured: Measured, kinds: dict[str, np.ndarray]) -> Finding:
     # Zeros are recognised within the object only, so they are compared with the rays through it.
     shares[ZERO] /= max(float(np.mean(measured.filled > _THROUGH * measured.level)), shares[ZERO], 1e-9)
     listed = ", ".join(f"{100 * share:.3g} % {name}" for name, share in shares.items() if share)
-    if sum(share for name, share in shares.items() if name != STARVED) > _TOLERATED:
+    if sum(share for name, share in shares.items() if name not in (STARVED, MARKED)) > _TOLERATED:
         remedy = (
             "mark them in valid= (False is not used); correct flat fields, or saturation=, mend many of them"
         )
