@@ -13,7 +13,7 @@ TUBE_OPTIONS = ("kvp", "anode", "filters", "detector")
 PASSED_ON = (
     *("spectrum", "materials", "unit", "quality", "time_budget", "seed", "device"),
     *("callbacks", "progress", "settings", "water_correction", "checkpoint", "resume"),
-    *("calibrate", "soft_density"),
+    *("calibrate", "soft_density", "align"),
 )
 SOLVER_OPTIONS = (*PASSED_ON, *TUBE_OPTIONS)
 

@@ -50,7 +50,7 @@ def polysplat(
         - ``pixel_size`` in ``unit`` (default cm), which a spectrum needs; then values are in 1/unit;
         - ``proj_geom`` and ``vol_geom``, ASTRA's in `unit`, with one slice per detector row;
         - ``quality``, ``time_budget`` (seconds), ``seed``, ``device``, ``settings``, ``calibrate``, ``soft_density``,
-          ``water_correction``, ``callbacks``, ``progress``, ``checkpoint`` and ``resume`` as for
+          ``align``, ``water_correction``, ``callbacks``, ``progress``, ``checkpoint`` and ``resume`` as for
           :func:`tomo_polysplat.reconstruct`;
         - ``input="transmission"`` when no logarithm was taken; ``energy_kev`` of the slices;
         - ``on_result``: called with the :class:`~tomo_polysplat.Result` of each group of slices.

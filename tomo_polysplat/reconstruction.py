@@ -26,6 +26,7 @@ from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.detector_blur import describe_blur
 from tomo_polysplat.physics.spectrum import Spectrum, require_spectrum
 from tomo_polysplat.physics.water_correction import describe_polynomial
+from tomo_polysplat.plan.alignment import moves_of
 from tomo_polysplat.plan.answer import Answer
 from tomo_polysplat.plan.calibration import Calibration
 from tomo_polysplat.plan.checkpoint import Checkpoint
@@ -36,7 +37,7 @@ from tomo_polysplat.plan.unit_check import tell_impossible
 from tomo_polysplat.progress import progress_reports
 from tomo_polysplat.result.provenance import provenance
 from tomo_polysplat.result.result import Result
-from tomo_polysplat.scan.geometry import VolumeGrid, from_astra, is_planar_geometry
+from tomo_polysplat.scan.geometry import VolumeGrid, from_astra, is_planar_geometry, to_astra
 from tomo_polysplat.scan.usable import usable_rays
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.transfer import to_host
@@ -63,6 +64,7 @@ def reconstruct(
     water_correction: Sequence[float] | None = None,
     calibrate: bool | str | Sequence[str] | None = None,
     soft_density: float | None = None,
+    align: bool | str | Sequence[str] | None = None,
     callbacks: Sequence[Callable[[FitState], Any]] = (),
     progress: bool | Callable[[float, str], Any] | None = None,
     settings: Settings | Mapping[str, Any] | None = None,
@@ -110,6 +112,12 @@ def reconstruct(
         is left as it is.
     soft_density : float, optional
         Known density in g/cm3, at most 25, of what most of the object is made of, the first of ``materials``.
+    align : bool, "auto" or names among "u", "v", "roll", "tilt", "slant", "distance", "skew", "views", optional
+        Move the scanner's geometry to where the rays have it, before the fit: the detector along its columns and rows
+        (pixels), its turns and the skew of the axis (degrees), its distance (per cent), and each view by itself.
+        True or "auto": what of these the rays tell. Moves that held-out rays do not confirm are not made.
+        `Result.geometry` is the geometry found, ``result.plan["alignment"]`` the moves. None or False: the geometry
+        is as told. Not beside a ``time_budget``.
     callbacks : sequence of callables
         Each gets a :class:`~tomo_polysplat.fit.optimise.FitState` once a pass over the views; returning True
         ends the fit.
@@ -160,14 +168,16 @@ def reconstruct(
     del values
     wanted = Calibration.of(calibrate, soft_density, problem.spectrum)
     flipped = is_planar_geometry(proj_geom)
+    moved = moves_of(align, time_budget)
     asked = None if wanted is None else {"names": wanted.names, "soft_density": wanted.soft_density}
     options = run_options.to_dict() | {
-        "calibration": asked or ("as the rays ask" if calibrate is None else None)
+        "calibration": asked or ("as the rays ask" if calibrate is None else None),
+        "align": moved,
     }
     saved = _checkpoint(checkpoint, resume, problem, options)
     started -= 0.0 if saved is None else saved.seconds
     with one_torch_thread(run_options.device), kept_threads(), progress_reports(progress) as report:
-        solver = Solver(run_options, saved, started, flipped, report)
+        solver = Solver(run_options, saved, started, flipped, report, moved)
         problem, prepared, outcome = solver.solve(problem, wanted, ask_scatter=calibrate is None)
         if water_correction is not None:
             prepared.plan.note("water_correction", "undone", describe_polynomial(water_correction))
@@ -184,6 +194,7 @@ def reconstruct(
                 counts=counts | outcome.counts(),
                 settings=run_options.settings.to_dict() | {"seed": run_options.seed, "quality": quality},
                 provenance=provenance(geometry, grid, unit, spectrum, run_options.device),
+                geometry=to_astra(problem.told_geometry(), grid)[0],
             )
     result.plan["stop"] = _stopped(outcome, interruption.asked)
     result.seconds = time.perf_counter() - started

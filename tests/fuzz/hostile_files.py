@@ -117,7 +117,7 @@ RESULT = {
     "polysplat/gaussians/u": np.zeros(4, np.float32),
     "polysplat/materials": '["water", "aluminium", "iron"]',
     "polysplat/history": '[{"seconds": 1.0, "loss": 2.0, "held_out": null, "stage": "fit"}]',
-    "polysplat/plan": '{"stop": "passes"}',
+    "polysplat/plan": '{"stop": {"value": "passes", "why": "made", "status": "found", "evidence": {}}}',
     "polysplat/counts": '{"rays": 5}',
     "polysplat/settings": "{}",
 }

@@ -87,6 +87,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--no-calibrate", action="store_true", help="do not look for scatter in the rays either"
     )
     group.add_argument(
+        "--align",
+        nargs="*",
+        metavar="MOVE",
+        help="first move the geometry to where the rays have it: u, v, roll, tilt, slant, distance, skew, views;"
+        " alone: what of these the rays tell",
+    )
+    group.add_argument(
         "--soft-density", type=float, metavar="G/CM3", help="known density of what most of the object is"
     )
     group.add_argument(
@@ -124,6 +131,7 @@ def run(arguments: argparse.Namespace) -> int:
             device=arguments.device,
             valid=scan.usable,
             calibrate=_calibrated(arguments),
+            align=None if arguments.align is None else arguments.align or True,
             soft_density=arguments.soft_density,
             water_correction=None if spectrum is None else scan.water_correction,
             progress=progress,

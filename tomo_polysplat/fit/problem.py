@@ -79,6 +79,8 @@ class Problem:
         Voxels that the grid has more on either side than the volume that is asked for; see `fit.surroundings`.
     surroundings : str
         Why, if so.
+    order : (views,) int array or None
+        Which of the caller's views each one is; None where they are as the caller has them.
     """
 
     projections: np.ndarray
@@ -94,6 +96,7 @@ class Problem:
     beam: float = 1.0
     margin: tuple[int, int] = (0, 0)
     surroundings: str = ""
+    order: np.ndarray | None = None
     _known: _Known = field(default_factory=_Known, init=False, repr=False)
 
     @classmethod
@@ -125,11 +128,12 @@ class Problem:
         inside = snapped_grid(grid.normalised(grid.centre, length))
         outside = snapped_geometry(geometry.normalised(grid.centre, length))
         order = view_order(outside, projections)
-        if (np.diff(order) != 1).any():
+        mixed = bool((np.diff(order) != 1).any())
+        if mixed:
             projections, outside = projections[order], outside.select(order)
         return cls(
             projections, outside, inside, grid.centre, length, depth, planar, spectrum, curves,
-            margin=margin, surroundings=why,
+            margin=margin, surroundings=why, order=order if mixed else None,
         )  # fmt: skip
 
     @property
@@ -155,6 +159,15 @@ class Problem:
     def voxel(self) -> float:
         """Shortest edge of a voxel, in the solver's coordinates."""
         return float(self.grid.voxel_size[: self.dimensions].min())
+
+    def seen_by(self, geometry: Geometry) -> Problem:
+        """The same measurements by a scanner that stood elsewhere, in the solver's coordinates."""
+        return replace(self, geometry=geometry)
+
+    def told_geometry(self) -> Geometry:
+        """The scanner in the caller's unit, its views in the caller's order."""
+        geometry = self.geometry.scaled(self.length).shifted(self.centre)
+        return geometry if self.order is None else geometry.select(np.argsort(self.order))
 
     def under(self, spectrum: Spectrum, scatter: Scatter, beam: float) -> Problem:
         """The same measurements under other physics; copies of them on devices serve both."""

@@ -89,10 +89,16 @@ class FitScene:
         """The rays whose light the pixels of these views average."""
         return views if self.pixel_rays == 1 else views.finer(self.pixel_rays)
 
-    def projections(self, gaussians: Gaussians, views: DetectorViews) -> tuple[torch.Tensor, int]:
-        """(views, rows, columns) predicted -log(I/I0), and the pairs skipped at the source plane."""
+    def projections(
+        self, gaussians: Gaussians, views: DetectorViews, vectors: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, int]:
+        """(views, rows, columns) predicted -log(I/I0), and the pairs skipped at the source plane.
+
+        ``vectors`` of these views, as `render.renderer.project_gaussians` takes them, go with one ray a pixel only.
+        """
         weights = gaussians.weights(self.reference_curve)
-        areal, skipped = project_gaussians(gaussians, weights, self.fine(views), self.kernel, self.cutoff)
+        rays = self.fine(views)
+        areal, skipped = project_gaussians(gaussians, weights, rays, self.kernel, self.cutoff, vectors)
         areal = areal * self.areal_scale
         sharp = areal[0] if self.quadrature is None else polychromatic_projection(areal, self.quadrature)
         if self.pixel_rays > 1:

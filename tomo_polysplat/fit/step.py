@@ -13,6 +13,7 @@ from tomo_polysplat.fit.loss import misfit, roughness
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.similarity import dissimilarity
+from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.detector_blur import LARGEST_BLUR
 from tomo_polysplat.quiet_imports import leaving_no_trace
@@ -162,7 +163,7 @@ class EagerStep:
             group["lr"] = group["rate"] * self.settings.final_rate**share
         self._turns["lr"] *= turning(self._done)
         chosen, measured, weight, aside = self.rays.batch(views)
-        predicted, skipped = self.scene.projections(self.gaussians, chosen)
+        predicted, skipped = self._predict(views, chosen)
         fitted = misfit(predicted, measured, weight, self.settings)
         loss = fitted + self._regularisation(predicted, measured, weight)
         self.optimiser.zero_grad(set_to_none=True)
@@ -179,6 +180,10 @@ class EagerStep:
             weight = aside.sum()
             held_out = misfit(predicted, measured, aside, self.settings) * weight
             self._sums.append((fitted.detach(), held_out, weight, skipped))
+
+    def _predict(self, views: np.ndarray, chosen: DetectorViews) -> tuple[torch.Tensor, int]:
+        """What the ``views`` of these numbers, which are ``chosen``, would measure, and the pairs skipped."""
+        return self.scene.projections(self.gaussians, chosen)
 
     @torch.no_grad()
     def _bound(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,6 +17,7 @@ from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.stopping import Stop, StopReason
 from tomo_polysplat.fit.surroundings import cut_out
 from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.plan.alignment import align, aligned
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.calibration import Calibration
 from tomo_polysplat.plan.checkpoint import Checkpoint
@@ -47,6 +48,8 @@ class Solver:
         When the reconstruction began, in seconds of ``time.perf_counter``.
     flipped : bool
         Whether callbacks get slices with row 0 at the largest y.
+    moved : "auto", names of moves, or None
+        Which moves of the scanner the rays are asked about (`plan.alignment`).
     report : callable
         Gets the share done, and words.
     """
@@ -56,6 +59,7 @@ class Solver:
     started: float
     flipped: bool
     report: Callable[[float, str], Any]
+    moved: str | Sequence[str] | None = None
 
     def solve(
         self, problem: Problem, wanted: Calibration | None, *, ask_scatter: bool
@@ -75,12 +79,25 @@ class Solver:
         KeyboardInterrupt
             After Ctrl-C before the fit has begun.
         """
+        problem, alignment = self._aligned(problem)
         problem, plan = physics(problem, wanted, self.run_options, self.saved, self.report)
+        plan.facts |= alignment
         prepared = prepare(problem, plan, self.run_options, self.saved, self.report)
         outcome = self._fit(prepared, problem, ask_scatter)
         if outcome.restart is None:
             return problem, prepared, outcome
         return self._anew(problem, prepared, outcome)
+
+    def _aligned(self, problem: Problem) -> tuple[Problem, dict[str, Answer]]:
+        """The problem by the scanner as it stood, and what the plan tells of that; a checkpoint's plan knows it."""
+        if self.moved is None:
+            return problem, {}
+        options = self.run_options
+        if self.saved is not None and self.saved.plan is not None:
+            found = self.saved.plan.facts["alignment"]
+        else:
+            found = align(problem, self.moved, options.settings, options.device, options.seed, self.report)
+        return aligned(problem, found.value), {"alignment": found}
 
     def _anew(
         self, problem: Problem, prepared: PreparedFit, so_far: FitOutcome
@@ -88,6 +105,8 @@ class Solver:
         """What `solve` gives, under other physics than those that a fit had begun with."""
         found = so_far.restart
         other, plan = under(problem, found)
+        if "alignment" in prepared.plan.facts:
+            plan.facts["alignment"] = prepared.plan.facts["alignment"]
         try:
             anew = prepare(other, plan, self.run_options, self.saved, self.report)
             outcome = self._fit(anew, other, ask_scatter=False)

@@ -54,9 +54,17 @@ def voxel_box(grid: VolumeGrid) -> VoxelBox:
 
 
 def project_gaussians(
-    gaussians: Gaussians, weights: torch.Tensor, views: DetectorViews, kernel: str, cutoff: float
+    gaussians: Gaussians,
+    weights: torch.Tensor,
+    views: DetectorViews,
+    kernel: str,
+    cutoff: float,
+    vectors: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, int]:
-    """(channels, views, rows, columns) line integrals, and the pairs skipped at the source plane."""
+    """(channels, views, rows, columns) line integrals, and the pairs skipped at the source plane.
+
+    ``vectors``, (views, 4, 3) float64 on the CPU, take the place of ``views.vectors`` and get a gradient.
+    """
     return project(
         gaussians.position,
         gaussians.scale(),
@@ -65,6 +73,7 @@ def project_gaussians(
         views,
         kernel=kernel,
         cutoff=cutoff,
+        vectors=vectors,
     )
 
 

@@ -47,6 +47,7 @@ _TOLD = {
     "model": "The rays",
     "spectrum": "The spectrum",
     "water_correction": "The scanner's water correction",
+    "alignment": "The scanner's geometry",
     "scatter": "Scatter",
     "detector_blur": "The detector's blur",
     "fitted_blur": "The blur that was found",
@@ -84,6 +85,8 @@ def found_about_the_scanner(plan: Mapping[str, Answer]) -> str:
     """One sentence on what the fit took from the rays about how they were measured."""
     rays = ray_physics(plan)
     found = []
+    if "alignment" in plan and plan["alignment"].value:
+        found.append(f"a geometry that has moved ({plan['alignment'].why})")
     if "water_correction" in plan:
         found.append(f"a water correction, undone ({plan['water_correction'].why})")
     if rays.scatter or rays.of_light:

@@ -129,7 +129,9 @@ def residuals_of(
     geometry, grid = from_astra(scan.proj_geom, scan.vol_geom)
     count = min(most_views, geometry.views)
     chosen = np.unique(np.linspace(0, geometry.views - 1, count).round().astype(int))
-    some = geometry.select(chosen)
+    # Where the scanner stood, if the fit has moved it.
+    seen = geometry if result.geometry is None else from_astra(result.geometry, scan.vol_geom)[0]
+    some = seen.select(chosen)
     planar = is_planar_geometry(scan.proj_geom) or geometry.planar
     model = _Model(result, detector_views(some, planar), pick_fast_device(device))
     unseen = HeldOut(geometry, grid, values, float(result.settings.get("held_out", 0.0)))

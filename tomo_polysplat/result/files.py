@@ -56,7 +56,7 @@ _RANGES = {
 }
 # Numbers in a part of a Gaussian: its rotation has them.
 _MOST_PARTS = 4
-JSON_PARTS = ("history", "plan", "counts", "settings", "provenance")
+JSON_PARTS = ("history", "plan", "counts", "settings", "provenance", "geometry")
 
 
 def plain(value: Any) -> Any:
@@ -118,7 +118,7 @@ def _write_model(group: Any, result: Result) -> None:
         part = getattr(result, name)
         if name == "plan":
             part = {key: answer.to_dict() for key, answer in part.items()}
-        group[name] = json.dumps(plain(part))
+        group[name] = json.dumps(plain({} if part is None else part))
 
 
 def load_hdf5(path: str | os.PathLike) -> Result:
@@ -197,7 +197,23 @@ def _read_parts(group: Any) -> dict[str, Any]:
         if not good:
             raise fail(f"/polysplat/{name}", "what Result.save writes", f"{content!r}"[:100])
     parts["plan"] = _answers(parts["plan"])
+    parts["geometry"] = _geometry(parts["geometry"])
     return parts
+
+
+def _geometry(stored: dict[str, Any]) -> dict[str, Any] | None:
+    """ASTRA's geometry of vectors; None where there is none."""
+    if not stored:
+        return None
+    try:
+        vectors = np.array(stored["Vectors"], np.float64)
+        kind, rows, columns = stored["type"], int(stored["DetectorRowCount"]), int(stored["DetectorColCount"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise fail("/polysplat/geometry", "what Result.save writes", f"{error}"[:100]) from error
+    known = kind in ("cone_vec", "parallel3d_vec") and min(rows, columns) > 0
+    if not known or vectors.ndim != 2 or vectors.shape[1:] != (12,) or not np.isfinite(vectors).all():
+        raise fail("/polysplat/geometry", "what Result.save writes", f"{stored!r}"[:100])
+    return {"type": kind, "DetectorRowCount": rows, "DetectorColCount": columns, "Vectors": vectors}
 
 
 def _answers(plan: dict[str, Any]) -> dict[str, Answer]:

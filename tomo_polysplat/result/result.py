@@ -57,6 +57,8 @@ class Result:
         How many rays or Gaussians were masked, skipped or clamped; every tunable.
     provenance : dict
         Words on what it was made from and with: scanner, volume, spectrum, device and software.
+    geometry : dict, optional
+        ASTRA's vector geometry of the projections, in `unit`: as told, or as ``align`` has found it.
     seconds : float
         Time that the reconstruction took.
     flipped_2d : bool
@@ -75,6 +77,7 @@ class Result:
     counts: dict[str, Any] = field(default_factory=dict)
     settings: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
+    geometry: dict[str, Any] | None = None
     seconds: float = 0.0
     flipped_2d: bool = False
 
