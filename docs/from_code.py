@@ -1,4 +1,4 @@
-"""Parts of the docs that are made from the code at each build: the table of decisions and the way of a scan."""
+"""Parts of the docs that are made from the code at each build: decisions, settings, and the way of a scan."""
 
 from __future__ import annotations
 
@@ -94,8 +94,27 @@ def _box(top: float, size: float):
     )
 
 
+def settings_tables() -> str:
+    """The settings by group, as the source has them: name, default, and its sentence."""
+    source = (PACKAGE / "settings.py").read_text(encoding="utf-8")
+    lines, parts = source.splitlines(), []
+    found = next(n for n in ast.parse(source).body if isinstance(n, ast.ClassDef) and n.name == "Settings")
+    group = ""
+    for field, words in zip(found.body, found.body[1:]):
+        if not (isinstance(field, ast.AnnAssign) and isinstance(words, ast.Expr)):
+            continue
+        above = [line.strip() for line in lines[field.lineno - 2 : field.lineno - 1]]
+        if above and above[0].startswith("# "):
+            group = above[0][2:].rstrip(".")
+            parts.append(f"\n## {group}\n\n| Setting | Default | What it is |\n|---|---|---|")
+        told = " ".join(ast.literal_eval(words.value).split()).replace("|", "\\|")
+        parts.append(f"| `{ast.unparse(field.target)}` | {ast.unparse(field.value)} | {told} |")
+    return "\n".join(parts) + "\n"
+
+
 def make(folder: Path) -> None:
     """Write all of it into a folder."""
     folder.mkdir(exist_ok=True)
     (folder / "decisions_table.md").write_text(decisions_table(), encoding="utf-8")
+    (folder / "settings_tables.md").write_text(settings_tables(), encoding="utf-8")
     draw_way(folder / "way.svg")

@@ -58,7 +58,7 @@ def weights_by_depth(depth: float, rays: Rays) -> tuple[float, float]:
     -------
     (float, float)
         ``c``; and ``c`` times the deviation of both errors over that at the usual depth, which is near the best of six
-        weights wherever a ray of a volume tells more than noise (docs/limits.md).
+        weights wherever a ray of a volume tells more than noise (docs/decisions/optical_depth.md).
     """
     share = depth / _USUAL
     if not 0 < share < _THIN:

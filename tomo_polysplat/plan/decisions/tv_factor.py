@@ -48,7 +48,7 @@ logger = logging.getLogger(__name__)
 _CLEARLY = 0.97
 # In slices so many times the usual weight is tried, and taken where it leaves less of the held-out misfit. Eight slices
 # that gain 0.4 to 3.9 dB by it came to 0.79 to 0.92, one that loses 0.6 to 0.88, a laminate that loses 2.4 to 1.09
-# (docs/limits.md). Of 24 to 36 views 18 slices gain, by 0.1 to 4.7 dB, and come to 0.67 to 0.98.
+# (docs/decisions/tv_factor.md). Of 24 to 36 views 18 slices gain, by 0.1 to 4.7 dB, and come to 0.67 to 0.98.
 _TIMES = 3.0
 # A cloud that grows takes this share of the weight of smoothing: broccoli of 30^3, 34^3, 36^3 and 44^3 voxels, grown
 # fourfold, gains -0.5, -0.3, 0.7 and 1.7 dB with all of it, 0.6, 0.4, 1.3 and 2.2 with 0.3 of it; in twice the room it

@@ -1,0 +1,87 @@
+"""A scanner that stood elsewhere than told: the moves are found, made, and kept for others to use."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+import tomo_polysplat as tps
+from tomo_polysplat.plan.alignment import _joined, moves_of
+from tomo_polysplat.scan.layout import vector_form
+
+QUICK = {"passes": 5.0, "pixel_rays": 1}
+
+
+@cache
+def fan(metal=True):
+    return tps.simulate_scan("pins", size=32, views=61, geometry="fan", metal=metal)
+
+
+def off(scan, columns):
+    """The told geometry of a scanner whose detector stood so many columns to the right."""
+    told = dict(vector_form(scan.proj_geom))
+    vectors = np.array(told["Vectors"])
+    steps = vectors[:, 4:6] if told["type"] == "fanflat_vec" else vectors[:, 6:9]
+    place = slice(2, 4) if told["type"] == "fanflat_vec" else slice(3, 6)
+    vectors[:, place] -= columns * steps
+    return told | {"Vectors": vectors}
+
+
+def reconstruct(scan, geometry, **options):
+    options = {"unit": scan.unit, "spectrum": scan.spectrum, "settings": QUICK, "progress": False} | options
+    return tps.reconstruct(scan.projections, geometry, scan.vol_geom, **options)
+
+
+def error(result, scan):
+    return float(np.sqrt(np.mean((result.volume - scan.truth) ** 2)))
+
+
+def test_an_axis_that_is_off_is_found_and_used():
+    scan, told = fan(), off(fan(), 1.5)
+    found, as_told, right = (
+        reconstruct(scan, told, align="u"),
+        reconstruct(scan, told),
+        reconstruct(scan, scan.proj_geom),
+    )
+    assert found.plan["alignment"].value["u"] == pytest.approx(1.5, abs=0.05)
+    assert error(found, scan) < 1.1 * error(right, scan) < 0.5 * error(as_told, scan)
+
+
+def test_what_no_ray_confirms_is_not_moved():
+    scan = fan(metal=False)
+    asked, plain = (reconstruct(scan, scan.proj_geom, align=align) for align in (("u",), None))
+    assert asked.plan["alignment"].value == {} and "no move" in asked.plan["alignment"].why
+    assert np.array_equal(asked.volume, plain.volume)
+    np.testing.assert_allclose(asked.geometry["Vectors"], plain.geometry["Vectors"])
+
+
+def test_the_geometry_that_was_found_is_in_the_file(tmp_path):
+    result = reconstruct(fan(), fan().proj_geom, settings=QUICK | {"passes": 1.0})
+    result.save(tmp_path / "a.h5")
+    stored = tps.Result.load(tmp_path / "a.h5").geometry
+    np.testing.assert_array_equal(stored["Vectors"], result.geometry["Vectors"])
+    assert stored["type"] == result.geometry["type"]
+
+
+@pytest.mark.parametrize(
+    "wanted, budget, word",
+    [
+        ("auto", 3.0, "time_budget"),
+        ("sideways", None, "one of"),
+        (3, None, "names"),
+        (["u", "w"], None, "one of"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(wanted, budget, word):
+    with pytest.raises((ValueError, TypeError), match=f"align: .*{word}"):
+        moves_of(wanted, budget)
+
+
+def test_joined_pixels_are_means_of_those_that_count():
+    values = np.arange(2 * 3 * 5, dtype=np.float32).reshape(2, 3, 5)
+    values[0, 0, 0] = np.nan
+    found = torch.from_numpy(_joined(values, 1, 2))
+    assert found.shape == (2, 3, 2) and found[0, 0, 0] == 1.0
+    torch.testing.assert_close(found[1], torch.tensor([[15.5, 17.5], [20.5, 22.5], [25.5, 27.5]]))
+    assert _joined(values, 1, 1) is values
