@@ -18,7 +18,7 @@ logger = logging.getLogger(__name__)
 
 # Moves are kept where the misfit of held-out rays falls below this share of that without. 12 perfect scans (40^3 to
 # 56^3 voxels, cone and parallel beam, 1e4 to 1e5 photons) came to 0.970 and more for the whole scanner and 0.967 and
-# more for the views; an axis off by 0.25 pixels to 0.93 to 0.95, views shifted by 0.25 pixels to 0.94 (docs/alignment.md).
+# more for the views; an axis off by 0.25 pixels to 0.93 to 0.95, views shifted by as much to 0.94 (docs/alignment.md).
 _MARGIN = 0.96
 # Columns of the coarsest and of the finest joined detector.
 _COARSEST, _FINEST = 15, 64
