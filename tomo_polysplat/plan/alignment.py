@@ -58,13 +58,13 @@ def moves_of(wanted: Any, time_budget: float | None) -> str | list[str] | None:
         return None
     if time_budget is not None:
         raise fail("align", "none beside a time_budget, which its fits would not keep", repr(wanted))
-    if wanted is True or (isinstance(wanted, str) and wanted == "auto"):
-        return "auto"
     names = [wanted] if isinstance(wanted, str) else wanted
+    if wanted is True or names == ["auto"]:
+        return "auto"
     if not isinstance(names, Sequence):
         raise fail("align", "True, False, 'auto' or names of moves", repr(wanted), error=TypeError)
     for name in names:
-        require_choice("align", name, ("auto", *MOVES))
+        require_choice("align", name, tuple(MOVES))
     return list(names)
 
 
