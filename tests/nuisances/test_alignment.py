@@ -112,7 +112,7 @@ def test_what_rays_cannot_tell_is_not_fitted_and_said():
     short = Alignment(orbit(views=21, arc=20.0), 1.0)
     assert "u" in short.left and "u not fitted: the object can take its place" in short.describe()
     parallel = Alignment(orbit("parallel"), 1.0)
-    assert "tilt" not in parallel.names and "tilt" in parallel.left
+    assert "tilt" not in parallel.names and "distance" not in parallel.names
     assert Alignment(orbit(), 1.0, names=("v",)).names == ("v",)
 
 

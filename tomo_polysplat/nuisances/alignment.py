@@ -19,8 +19,9 @@ from tomo_polysplat.scan.view_geometry import Geometry
 
 __all__ = ["IN_PLANE", "USUAL", "Alignment"]
 
-# What is moved where the rays tell it. Offsets along v and distances are left: the object takes their place.
-USUAL = ("u", "roll", "tilt", "skew", "views")
+# What is moved where the rays tell it. Offsets along v and distances are left: the object takes their place. So is
+# tilt: bone of 128^3 that was off by 2 pixels or rolled by 2 degrees, without any, was given 7 to 10 degrees of it.
+USUAL = ("u", "roll", "skew", "views")
 # In a scan of one plane, out of which nothing may move.
 IN_PLANE = ("u", "views")
 # Angles beyond these, and per cent, are no misalignments: a fit that goes there follows something else.
