@@ -234,3 +234,15 @@ def test_the_blur_that_was_used_is_told(expected):
     thin = reconstruct(fan(), settings=QUICK | {"blur": 0.0, "learning_rate_blur": 0.0})
     assert "infinitely thin" in thin.plan["detector_blur"].why
     assert relative(held.volume, thin.volume) > 1e-3
+
+
+def test_a_scan_brings_all_that_it_knows():
+    scan = fan()
+    whole = tps.reconstruct(scan, settings=QUICK, progress=False)
+    parts = tps.reconstruct(
+        scan.projections, scan.proj_geom, scan.vol_geom, spectrum=scan.spectrum, unit=scan.unit, valid=scan.usable,
+        settings=QUICK, progress=False,
+    )  # fmt: skip
+    assert np.array_equal(whole.volume, parts.volume) and whole.spectrum == scan.spectrum
+    with pytest.raises(ValueError, match="proj_geom: .*pass a Scan"):
+        tps.reconstruct(scan.projections)

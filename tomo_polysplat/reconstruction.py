@@ -38,6 +38,7 @@ from tomo_polysplat.progress import progress_reports
 from tomo_polysplat.result.provenance import provenance
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import VolumeGrid, from_astra, is_planar_geometry, to_astra
+from tomo_polysplat.scan.scan import Scan
 from tomo_polysplat.scan.usable import usable_rays
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.transfer import to_host
@@ -50,12 +51,12 @@ logger = logging.getLogger(__name__)
 @usual_modes()
 def reconstruct(
     projections: Any,
-    proj_geom: Mapping[str, Any],
-    vol_geom: Mapping[str, Any],
+    proj_geom: Mapping[str, Any] | None = None,
+    vol_geom: Mapping[str, Any] | None = None,
     *,
     spectrum: Spectrum | None = None,
     materials: Materials | Sequence[Any] | None = None,
-    unit: str = "cm",
+    unit: str | None = None,
     quality: str = "balanced",
     time_budget: float | None = None,
     seed: int = 0,
@@ -75,7 +76,9 @@ def reconstruct(
 
     Parameters
     ----------
-    projections : array, shape (rows, views, columns), or (views, columns) for 2D geometries
+    projections : Scan, or array, shape (rows, views, columns), or (views, columns) for 2D geometries
+        A :class:`~tomo_polysplat.Scan` brings its geometries, unit, spectrum, usable rays and water correction; what is
+        named beside it takes the place of its own. Of an array:
         -log(I/I0) in ASTRA's order; in which order the views come changes nothing. Infinite ones, of rays without
         light, are opaque where dark rays surround them. What else is not finite, what no logarithm takes, pixels
         that never change, and the masked ones of a masked array are not used, and counted. The log says when that
@@ -153,6 +156,10 @@ def reconstruct(
     """
     started = time.perf_counter()
     run_options = RunOptions.of(quality, settings, time_budget, seed, device, callbacks)
+    projections, proj_geom, vol_geom, rest = _of_scan(
+        projections, proj_geom, vol_geom, (unit, spectrum, valid, water_correction)
+    )
+    unit, spectrum, valid, water_correction = rest
     spectrum = require_spectrum("spectrum", spectrum)
     geometry, grid = from_astra(proj_geom, vol_geom)
     widest, on = run_options.settings.surroundings, run_options.device
@@ -200,6 +207,33 @@ def reconstruct(
     result.seconds = time.perf_counter() - started
     logger.info("Reconstructed in %.1f s: %s; %s", result.seconds, result.plan["stop"].why, result.counts)
     return result
+
+
+def _of_scan(
+    projections: Any,
+    proj_geom: Mapping[str, Any] | None,
+    vol_geom: Mapping[str, Any] | None,
+    rest: tuple[str | None, Spectrum | None, Any, Sequence[float] | None],
+) -> tuple[
+    Any, Mapping[str, Any], Mapping[str, Any], tuple[str, Spectrum | None, Any, Sequence[float] | None]
+]:
+    """Projections, geometries, and unit, spectrum, valid rays and water correction: as given, else a scan's."""
+    unit, spectrum, valid, correction = rest
+    if isinstance(projections, Scan):
+        scan = projections
+        projections, proj_geom, vol_geom = (
+            scan.projections,
+            proj_geom or scan.proj_geom,
+            vol_geom or scan.vol_geom,
+        )
+        unit, spectrum = unit or scan.unit, scan.spectrum if spectrum is None else spectrum
+        valid = scan.usable if valid is None else valid
+        correction = scan.water_correction if correction is None and spectrum is not None else correction
+    for name, given in (("proj_geom", proj_geom), ("vol_geom", vol_geom)):
+        if given is None:
+            raise fail(name, "ASTRA's geometry beside an array of projections", "none", "or pass a Scan")
+    assert proj_geom is not None and vol_geom is not None
+    return projections, proj_geom, vol_geom, (unit or "cm", spectrum, valid, correction)
 
 
 def _stopped(outcome: FitOutcome, interrupted: bool) -> Answer:
