@@ -83,7 +83,7 @@ class Options:
 
 Outcome = tuple[np.ndarray, dict[str, Any]]
 
-# In runs of fewer passes it is not asked whether pixels average light; see `fit.pixel_averaging`.
+# In runs of fewer passes it is not asked whether pixels average light; see `plan.decisions.pixel_rays`.
 WHOLE = {"passes": FEWEST_PASSES}
 
 

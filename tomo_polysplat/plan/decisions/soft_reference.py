@@ -102,7 +102,7 @@ class Reference(NamedTuple):
 def soft_reference(
     start: np.ndarray | torch.Tensor, problem: Problem, settings: Settings, solid: bool = False
 ) -> Reference:
-    """The soft reference of a start volume in the solver's units (``fit.first_volume``).
+    """The soft reference of a start volume in the solver's units (`plan.first_volume`).
 
     ``settings.bone_level`` is where dense matter begins, in references of the first material, whose number is
     ``settings.soft_u``. ``solid`` says that the start was made as that of an object of one solid, which it then is
