@@ -1,5 +1,6 @@
 """A scanner that stood elsewhere than told: the moves are found, made, and kept for others to use."""
 
+import json
 from functools import cache
 
 import numpy as np
@@ -62,6 +63,35 @@ def test_the_geometry_that_was_found_is_in_the_file(tmp_path):
     stored = tps.Result.load(tmp_path / "a.h5").geometry
     np.testing.assert_array_equal(stored["Vectors"], result.geometry["Vectors"])
     assert stored["type"] == result.geometry["type"]
+
+
+class Stopped(Exception):
+    pass
+
+
+def test_an_interrupted_run_goes_on_by_the_scanner_that_was_found(tmp_path):
+    scan, path, seen = fan(), tmp_path / "fit.npz", []
+
+    def stop(state):
+        seen.append(state)
+        if len(seen) > 2:
+            raise Stopped
+
+    told = off(scan, 1.5)
+    with pytest.raises(Stopped):
+        reconstruct(scan, told, align="u", checkpoint=path, callbacks=[stop])
+    with np.load(path) as file:
+        arrays = dict(file)
+    rest = reconstruct(scan, told, align="u", checkpoint=path, resume=True)
+    assert rest.plan["alignment"].value["u"] == pytest.approx(1.5, abs=0.05)
+    assert error(rest, scan) < 0.5 * error(reconstruct(scan, told), scan)
+    about = json.loads(arrays["about"].tobytes())
+    for wrong in ({"sideways": 1.0}, {"u": "much"}, {"u": float("nan")}, None):
+        about["plan"]["facts"]["alignment"]["value"] = wrong
+        text = np.frombuffer(json.dumps(about).encode(), np.uint8)
+        np.savez(path, **(arrays | {"about": text}))
+        with pytest.raises(ValueError, match="checkpoint: expected a complete checkpoint"):
+            reconstruct(scan, told, align="u", checkpoint=path, resume=True)
 
 
 @pytest.mark.parametrize(

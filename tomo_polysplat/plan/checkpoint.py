@@ -31,6 +31,7 @@ from tomo_polysplat.plan.decision import When
 from tomo_polysplat.plan.order import ORDER
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.scan.archive import read_archive
+from tomo_polysplat.scan.moves import MOVES
 
 __all__ = ["Checkpoint"]
 
@@ -128,6 +129,7 @@ class Checkpoint:
             self._require_same(about)
             self.plan = _plan(about["plan"])
             _require_calibration(self.plan, self.options.get("calibration"))
+            _require_moves(self.plan, self.options.get("align"))
             self.snapshot = _snapshot(arrays, dict(about["numbers"]), self._views)
         except _DAMAGES as error:
             raise self._damaged(f"{type(error).__name__} {error}") from error
@@ -196,6 +198,24 @@ def _require_calibration(plan: Plan, asked: Any) -> None:
     numbers = all(isinstance(value, float) and math.isfinite(value) for value in fitted.values())
     if not (numbers and isinstance(accepted, dict)):
         raise TypeError(f"what the calibration found, got {found}")
+
+
+def _require_moves(plan: Plan, asked: Any) -> None:
+    """See to it that a plan tells the moves of the scanner where they were asked about."""
+    if asked is None:
+        return
+    moves = plan.facts["alignment"].value
+    for name, value in moves.items():
+        numbers = value if isinstance(value, list) else [value]
+        if name not in MOVES or not _finite(numbers):
+            raise TypeError(f"moves of the scanner, got {name} = {value!r}"[:200])
+
+
+def _finite(values: list[Any]) -> bool:
+    """Whether a list, of lists perhaps, holds finite numbers alone."""
+    return all(
+        _finite(v) if isinstance(v, list) else type(v) in (int, float) and math.isfinite(v) for v in values
+    )
 
 
 def _snapshot(arrays: dict[str, np.ndarray], numbers: dict[str, Any], views: int) -> Snapshot:
