@@ -122,3 +122,15 @@ def assert_close(got, expected, image=1e-5, gradient=1e-4):
         assert norm > 0, f"{name}: the reference is zero, so the comparison would say nothing"
         error = float((one - truth).norm() / norm)
         assert error < (image if name == "image" else gradient), f"{name}: relative error {error:.2e}"
+
+
+# Cones, parallel beams and single planes, of odd sizes too.
+VIEWS = {
+    "cone": cone_views(),
+    "cone_odd": cone_views(2, 63, 5, pixel=(0.5, 0.05)),
+    "cone_one_row": cone_views(2, 1, 123, pixel=(0.03, 0.5)),
+    "parallel": parallel_views(),
+    "parallel_odd": parallel_views(1, 7, 123, pixel=(0.02, 0.3)),
+    "fan": planar_views(cone=True),
+    "parallel_2d": planar_views(cone=False),
+}

@@ -6,27 +6,17 @@ import numpy as np
 import pytest
 import torch
 from splat_scenes import (
+    VIEWS,
     as_float32,
     assert_close,
     cone_views,
     gaussians,
     parallel_views,
-    planar_views,
     random_like,
     run_project,
 )
 
 from tomo_polysplat.kernels.project.autograd import project
-
-VIEWS = {
-    "cone": cone_views(),
-    "cone_odd": cone_views(2, 63, 5, pixel=(0.5, 0.05)),
-    "cone_one_row": cone_views(2, 1, 123, pixel=(0.03, 0.5)),
-    "parallel": parallel_views(),
-    "parallel_odd": parallel_views(1, 7, 123, pixel=(0.02, 0.3)),
-    "fan": planar_views(cone=True),
-    "parallel_2d": planar_views(cone=False),
-}
 
 
 @pytest.mark.parametrize("name", VIEWS)

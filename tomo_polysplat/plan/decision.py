@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from enum import Enum
 from typing import Any, ClassVar
 
@@ -54,7 +55,7 @@ class Known:
         return self.answer(needed).value
 
 
-class Decision:
+class Decision(ABC):
     """A question; one a file, called like its file, its key in the plan and its field in the settings.
 
     Attributes
@@ -85,9 +86,10 @@ class Decision:
         return ""
 
     def usual(self, known: Known, lab: Lab) -> Any:
-        """The value where it is not asked."""
-        raise NotImplementedError
+        """The value where it is not asked, or not told; None for one that is always asked and always told."""
+        return None
 
+    @abstractmethod
     def ask(self, known: Known, lab: Lab) -> Answer:
         """The answer of the data.
 
@@ -96,7 +98,6 @@ class Decision:
         Untold
             If they do not tell.
         """
-        raise NotImplementedError
 
     def alternative(self, lab: Lab) -> str:
         """What another choice would cost; nothing where there is no other, or it was given."""

@@ -132,11 +132,6 @@ class Lab:
             raise Untold(TOO_SHORT)
         return outcome
 
-    def forget_trials(self) -> None:
-        """Let go of what short fits hold in memory."""
-        self._trials.clear()
-        self._seeds.clear()
-
     def doubt_lengths(self, words: str) -> None:
         """Say that the unit of length looks wrong."""
         doubt_lengths(self.plan.facts, words)
