@@ -28,7 +28,7 @@ from tomo_polysplat.model.density_control import grow, relocate, splittable
 from tomo_polysplat.model.gaussians import OF_ALL, Gaussians
 from tomo_polysplat.settings import Settings
 
-__all__ = ["Fitter", "views_of_a_pass"]
+__all__ = ["Fitter", "next_views", "views_of_a_pass"]
 
 # A pass over fewer views than this makes the steps of one over as many.
 _FEWEST_VIEWS = 10
@@ -205,11 +205,17 @@ class Fitter:
         self.step.done, self.step.largest = old.done, old.largest
 
     def _next_views(self, batch: int) -> np.ndarray:
-        """The next views of an order that uses each once before any again."""
-        while len(self.order) < batch:
-            self.order = np.concatenate([self.order, self.rng.permutation(len(self.rays.views))])
-        chosen, self.order = self.order[:batch], self.order[batch:]
+        chosen, self.order = next_views(self.order, batch, len(self.rays.views), self.rng)
         return chosen
+
+
+def next_views(
+    order: np.ndarray, batch: int, views: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """The next views of an order that uses each once before any again, and the order left."""
+    while len(order) < batch:
+        order = np.concatenate([order, rng.permutation(views)])
+    return order[:batch], order[batch:]
 
 
 def views_of_a_pass(rays: Rays) -> int:

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.checks import fail, require_choice
+from tomo_polysplat.fit.fitter import next_views
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
@@ -32,7 +33,7 @@ from tomo_polysplat.plan.model import rays_of, scene_of
 from tomo_polysplat.plan.order import plan_from_start
 from tomo_polysplat.scan.as_told import seen_as_told
 from tomo_polysplat.scan.geometry import VolumeGrid
-from tomo_polysplat.scan.moves import MOVES
+from tomo_polysplat.scan.moves import MOVES, Scanner, moved_geometry
 from tomo_polysplat.settings import Settings
 
 __all__ = ["align", "aligned", "moves_of"]
@@ -95,7 +96,7 @@ def align(
     Answer
         Its value is a dict of moves by name, empty where none was confirmed, as `aligned` takes it.
     """
-    alignment = Alignment(problem.geometry, 1.0, names=names, pivot=-problem.centre / problem.length)
+    alignment = Alignment(problem.geometry, 1.0, names=names, pivot=_axis(problem))
     trials = _Levels(problem, alignment, settings, device, seed, report)
     factors = levels(problem.geometry.columns)
     record = search(alignment, trials.fit, factors)
@@ -115,9 +116,13 @@ def aligned(problem: Problem, moves: dict[str, Any]) -> Problem:
     """The problem by the scanner as it stood."""
     if not moves:
         return problem
-    alignment = Alignment(problem.geometry, 1.0, names=tuple(moves), pivot=-problem.centre / problem.length)
-    alignment.restore({name: np.array(value) for name, value in moves.items()})
-    return problem.seen_by(alignment.geometry())
+    values = {name: torch.tensor(value, dtype=torch.float64) for name, value in moves.items()}
+    return problem.seen_by(moved_geometry(Scanner(problem.geometry, _axis(problem)), values))
+
+
+def _axis(problem: Problem) -> np.ndarray:
+    """A point on the axis of rotation, in the solver's coordinates."""
+    return -problem.centre / problem.length
 
 
 @dataclass(frozen=True)
@@ -145,9 +150,7 @@ class _Levels:
         steps, pace, errors = _PASSES * steps_of_a_pass, schedule(level, factor), []
         order = np.empty(0, int)
         for number in range(steps):
-            if len(order) < batch:
-                order = np.concatenate([order, rng.permutation(views)])
-            chosen, order = order[:batch], order[batch:]
+            chosen, order = next_views(order, batch, views, rng)
             step(chosen, number / steps)
             if names:
                 step.move(chosen, pace.rate(number / steps, factor), held)
