@@ -1,9 +1,12 @@
 """Steps of the optimiser by the Triton kernels against those by autograd."""
 
+from unittest import mock
+
 import numpy as np
 from step_scenes import BATCH, compare_steps, fit_problem
 from triton_case import case
 
+from tomo_polysplat.fit import memory
 from tomo_polysplat.fit.step import EagerStep
 
 
@@ -19,6 +22,14 @@ def a_step_of_our_kernels_is_that_of_autograd(device):
     # Every kind of parameter moved, but for the held number of the soft matter.
     assert all(bool(t.any()) for t in moved.values()), moved
     assert float(moved["shared_material"][0]) == 0 != float(moved["shared_material"][1])
+
+
+@case
+def a_step_whose_views_are_held_one_after_the_other(device):
+    """As of a large cloud, with sharp rays and with what the detector makes of them."""
+    with mock.patch.object(memory, "_MANY", 1), mock.patch.object(memory, "_FEW_VIEWS", 1):
+        compare_steps(_fused, device, ("cpu", "numba"))
+        compare_steps(_fused, device, ("cpu", "numba"), blurring=False)
 
 
 @case

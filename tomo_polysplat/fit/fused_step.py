@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.fit.feed import feed
+from tomo_polysplat.fit.memory import views_at_once
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.step import (
@@ -33,6 +34,7 @@ from tomo_polysplat.kernels.step.triton_detector import detected_misfit_gradient
 from tomo_polysplat.kernels.step.triton_misfit import Measurement, Splat, misfit_gradient
 from tomo_polysplat.kernels.step.triton_update import FIRST_DECAY, SECOND_DECAY, Bounds, update
 from tomo_polysplat.kernels.step.triton_variation import variation_gradient
+from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.kernels.voxelise import triton_backward as box_backward
 from tomo_polysplat.kernels.voxelise import triton_forward as box_forward
 from tomo_polysplat.kernels.voxelise.triton_setup import box_table, ellipsoids
@@ -47,6 +49,9 @@ __all__ = ["FusedStep"]
 # Numbers of the control tensor, in its order: of the update, and of each view its number and slot, and its geometry.
 # Every part begins at 16 bytes whatever the batch: elsewhere the kernels would be compiled once more.
 _HEAD, _CHOSEN, _VIEW = 4, 2, 21
+
+# Position, deviation, rotation and weights.
+_Drawn = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 class FusedStep:
@@ -84,7 +89,9 @@ class FusedStep:
         bounds = log_scale_bounds(scene, spacing, gaussians.planar, settings)
         self._bounds = Bounds(bounds, (scene.least_u, 1.0), LARGEST_BLUR, EPSILON)
         fine = scene.fine(rays.views)
-        self._views, self._table = fine.select(np.arange(batch)), fine.host_table()
+        self._table, most = fine.host_table(), views_at_once(batch, len(gaussians))
+        # Only the shape of these views counts.
+        self._portions = [fine.select(np.arange(batch)[k : k + most]) for k in range(0, batch, most)]
         self._parts = (fine.rows // rays.views.rows, fine.columns // rays.views.columns)
         self._sums = torch.zeros(3, dtype=torch.float64, device=device)
         self._skipped = torch.zeros((), dtype=torch.int64, device=device)
@@ -164,7 +171,7 @@ class FusedStep:
 
     def _enqueue(self, smooth: float) -> None:
         """All kernels of a step that smooths with this weight; what else they read of it is in the control tensor."""
-        gaussians, batch = self.gaussians, len(self._views)
+        gaussians, batch = self.gaussians, sum(len(views) for views in self._portions)
         head, chosen, table = self._control.split([_HEAD, batch * _CHOSEN, batch * _VIEW])
         scale, weight, output = activate(
             gaussians.log_scale,
@@ -176,7 +183,7 @@ class FusedStep:
         )
         drawn = (gaussians.position, scale, gaussians.rotation)
         of_volume = self._volume_gradients(*drawn, output, smooth) if smooth else self._not_smoothed
-        of_rays = self._ray_gradients(*drawn, weight, table, chosen)
+        of_rays = self._of_rays((*drawn, weight), table.view(batch, _VIEW), chosen.view(_CHOSEN, batch))
         if smooth:
             self._join()
         update(
@@ -191,14 +198,26 @@ class FusedStep:
             self.scene.blurring,
         )
 
-    def _ray_gradients(self, position, scale, rotation, weight, table, chosen) -> tuple[torch.Tensor, ...]:
-        """Gradients of the misfit by position, deviation, rotation and weights."""
-        views, cutoff, channels = self._views, self.scene.cutoff, len(weight)
-        drawn = (position, scale, rotation, weight)
+    def _of_rays(self, drawn: _Drawn, table, chosen) -> tuple[torch.Tensor, ...]:
+        """Gradients of the misfit by position, deviation, rotation and weights, a portion of the views at a time."""
+        totals: tuple[torch.Tensor, ...] = ()
+        first = 0
+        for views in self._portions:
+            of_portion = self._of_portion(drawn, table, chosen, views, first)
+            for total, gradient in zip(totals, of_portion):
+                total += gradient
+            totals, first = totals or of_portion, first + len(views)
+        return totals
+
+    def _of_portion(
+        self, drawn: _Drawn, table, chosen, views: DetectorViews, first: int
+    ) -> tuple[torch.Tensor, ...]:
+        """The same of the views from the ``first`` of the step on."""
+        cutoff, channels, largest = self.scene.cutoff, len(drawn[-1]), self._largest[0]
+        table = table[first : first + len(views)]
         record = footprints(*drawn, views, table, cutoff, self._skipped)
-        largest = self._largest[0]
         image = rays_forward.splat(record, channels, views, cutoff, largest)
-        seen = Splat(image, table, chosen, views, self._parts, self._measurement, self._sums, largest)
+        seen = Splat(image, table, chosen, views, self._parts, self._measurement, self._sums, largest, first)
         if self.scene.blurring or max(self._parts) > 1:
             blur = self.gaussians.blur if self.scene.blurring else self._no_blur
             pixels = detected_misfit_gradient(seen, blur, self._grad_blur)

@@ -23,10 +23,17 @@ _AHEAD = 4
 _recording = threading.Lock()
 
 
-def _make_room(device: torch.device) -> None:
-    """Give back what torch keeps unused where that is most of the rest: while a graph is recorded nothing can be."""
+# Of the device's memory, what torch may keep unused while a step is recorded.
+_UNUSED = 0.02
+
+
+def _give_back(device: torch.device) -> None:
+    """Give back what torch keeps unused, if it is much.
+
+    While a graph is recorded nothing can be given back, and no other graph can use what was kept for one.
+    """
     unused = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    if unused > torch.cuda.mem_get_info(device)[0]:
+    if unused > _UNUSED * torch.cuda.mem_get_info(device)[1]:
         torch.cuda.empty_cache()
 
 
@@ -71,12 +78,14 @@ class GraphStep(FusedStep):
         before, device = self.gaussians.copy(), self.gaussians.position.device
         weights = {smoothing(self.settings, self.scene, step) for step in range(self.scene.tv_every)}
         with torch.no_grad(), torch.cuda.device(device):
+            # The memory of graphs of earlier steps, and below that of the trial run.
+            _give_back(device)
             try:
                 super().__call__(np.arange(batch), 0.0)
                 torch.cuda.synchronize()
             finally:
                 self._forget(before)
-            _make_room(device)
+            _give_back(device)
             # As only one of the graphs runs at a time, they share what memory they need.
             stream, pool = torch.cuda.Stream(device), torch.cuda.graph_pool_handle()
             return {smooth: self._recorded(smooth, stream, pool) for smooth in weights}

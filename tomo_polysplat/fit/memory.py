@@ -17,6 +17,7 @@ __all__ = [
     "require_machine",
     "require_room",
     "room_for_gaussians",
+    "views_at_once",
 ]
 
 logger = logging.getLogger(__name__)
@@ -24,9 +25,10 @@ logger = logging.getLogger(__name__)
 # Bytes a Gaussian takes: parameters, both moments, the best copy and gradients; and its footprint and sums in
 # each view of a step.
 _GAUSSIAN, _FOOTPRINT = 640, 144
-# Bytes a Gaussian of a large cloud was seen to take in all, at the peak of a run that is made both ways (H100, bone of
-# 96^3 and 192^3 voxels, 7.4e5 to 1.2e7 Gaussians: 4300 to 13500).
-_AT_THE_PEAK = 12_000
+# So many Gaussians fill a GPU with the footprints of so few views: more views at once would only take memory.
+_MANY, _FEW_VIEWS = 1_000_000, 2
+# Runs of a large cloud at once, while the rays are asked which of two models explains them.
+_RUNS = 2
 # Bytes a pixel of a step takes: image and gradient of four channels, projections and their slopes.
 _PIXEL = 48
 # Bytes a voxel takes, the most at once: while seeds are chosen and when the volumes are made; and the samples
@@ -106,7 +108,8 @@ def require_room(
     MemoryError
         If the host has too little memory left for the Gaussians of a fit on a CPU.
     """
-    parts = {"Gaussians": gaussians * _of_a_gaussian(views)} | _of_all(views, pixels, voxels)
+    of_a_gaussian = _of_a_gaussian(views_at_once(views, gaussians))
+    parts = {"Gaussians": gaussians * of_a_gaussian} | _of_all(views, pixels, voxels)
     need = sum(parts.values())
     words = ", ".join(f"{name} {in_gigabytes(size)}" for name, size in parts.items())
     words = f"about {in_gigabytes(need)} ({words})"
@@ -140,15 +143,21 @@ def room_for_gaussians(device: torch.device, *, views: int, pixels: int, voxels:
     free = available_memory() if device.type == "cpu" else free_bytes(device)
     if free is None:
         return math.inf
-    left = _SHARE * free - sum(_of_all(views, pixels, voxels).values())
-    return max(left, 0.0) / _of_a_gaussian(views)
+    left = max(_SHARE * free - sum(_of_all(views, pixels, voxels).values()), 0.0)
+    few = left / _of_a_gaussian(views)
+    return few if few < _MANY else max(left / _of_a_gaussian(views_at_once(views, _MANY)), float(_MANY - 1))
 
 
 def most_gaussians(device: torch.device) -> float:
-    """How many Gaussians a CUDA device has been seen to hold in so much free memory; infinity without one."""
+    """How many Gaussians of a large cloud a CUDA device holds in its free memory; infinity without one."""
     if device.type == "cpu" or not torch.cuda.is_available():
         return math.inf
-    return _SHARE * free_bytes(device) / _AT_THE_PEAK
+    return _SHARE * free_bytes(device) / (_RUNS * _of_a_gaussian(_FEW_VIEWS))
+
+
+def views_at_once(views: int, gaussians: int) -> int:
+    """Views of a step whose footprints are held together, of so many."""
+    return min(views, _FEW_VIEWS) if gaussians >= _MANY else views
 
 
 def _of_a_gaussian(views: int) -> int:

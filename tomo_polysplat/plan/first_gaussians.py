@@ -14,7 +14,7 @@ from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.model.seed import seed_gaussians
 from tomo_polysplat.plan.costs import work
 from tomo_polysplat.plan.plan import Plan
-from tomo_polysplat.plan.resolution import finest_spacing
+from tomo_polysplat.plan.resolution import finest_spacing, most_seeds
 from tomo_polysplat.settings import Settings
 
 __all__ = ["AVERAGED_RAYS", "first_gaussians", "room_to_grow"]
@@ -22,6 +22,8 @@ __all__ = ["AVERAGED_RAYS", "first_gaussians", "room_to_grow"]
 # Rays a pixel and axis where the light is averaged: with three pins of 36^3 are no better than with two (45.4 and 48.4
 # dB everywhere).
 AVERAGED_RAYS = 2
+# So many times as many Gaussians as seeds are worth their time, with those of metal.
+_OF_SEEDS = 2
 
 
 def first_gaussians(
@@ -79,7 +81,7 @@ def first_gaussians(
 
 
 def room_to_grow(gaussians: int, plan: Plan, problem: Problem, device: torch.device) -> float:
-    """How many times as many Gaussians there would be memory for.
+    """How many times as many Gaussians there would be memory for, and on a GPU be worth their time.
 
     Parameters
     ----------
@@ -89,7 +91,9 @@ def room_to_grow(gaussians: int, plan: Plan, problem: Problem, device: torch.dev
     device : torch.device
     """
     room = room_for_gaussians(device, **_all_else(plan, problem)) / _runs(plan)
-    return min(room, most_gaussians(device)) / max(gaussians, 1)
+    if device.type != "cpu":
+        room = min(room, most_gaussians(device), _OF_SEEDS * most_seeds(problem))
+    return room / max(gaussians, 1)
 
 
 def _runs(plan: Plan) -> int:

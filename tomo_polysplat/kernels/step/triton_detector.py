@@ -75,7 +75,7 @@ def _sharp_kernel(
 @triton.jit(do_not_specialize=SIZES)
 def _blurred_kernel(
     sharp, slopes, blur, grad_blur, chosen, projections, totals, sums,
-    area, rows, columns, many, noise, held_out, corner,
+    area, rows, columns, first, of_step, noise, held_out, corner,
     HUBER: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     k = tl.program_id(1).to(tl.int64)
@@ -93,8 +93,8 @@ def _blurred_kernel(
             predicted += along_v * along_u * beside
             by_variance += (slope_v * along_u + along_v * slope_u) * beside
     slope = ray_misfit(
-        predicted, projections, totals, chosen, sums, k, pixel, inside, area, many, noise, held_out, corner,
-        HUBER,
+        predicted, projections, totals, chosen, sums, first + k, pixel, inside, area, of_step, noise, held_out,
+        corner, HUBER,
     )  # fmt: skip
     slope = tl.where(inside, slope, 0.0)
     total = tl.sum((slope * by_variance).to(tl.float64), 0)
@@ -160,7 +160,7 @@ def detected_misfit_gradient(splat: Splat, blur: torch.Tensor, grad_blur: torch.
         )  # fmt: skip
         _blurred_kernel[splat.blocks()](
             sharp, slopes, blur, grad_blur, splat.chosen, measurement.projections, measurement.totals,
-            splat.sums, splat.area, rows, columns, len(views),
+            splat.sums, splat.area, rows, columns, splat.first, splat.of_step,
             measurement.noise, measurement.held_out, measurement.corner,
             HUBER=measurement.corner > 0, BLOCK=PIXELS_A_PROGRAM, num_warps=4,
         )  # fmt: skip

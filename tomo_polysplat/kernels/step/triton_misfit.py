@@ -78,10 +78,10 @@ class Splat:
         Image of the splat.
     table : (views, 21) float64 tensor
         Of the rays.
-    chosen : (2, views) float64 tensor
+    chosen : (2, views of the step) float64 tensor
         Number of each view in the scan, and its slot among the measured projections.
     views : DetectorViews
-        As many views of the rays; only their shape is read.
+        As many views of the rays as are splatted; only their shape is read.
     parts : pair of int
         Rays of a pixel along rows' and columns' axis.
     measurement : Measurement
@@ -90,6 +90,8 @@ class Splat:
         added.
     largest : float32 tensor of one number
         Raised to the largest value of ``raw``.
+    first : int
+        Which of the step's views is the first of these.
     """
 
     raw: torch.Tensor
@@ -100,6 +102,12 @@ class Splat:
     measurement: Measurement
     sums: torch.Tensor
     largest: torch.Tensor
+    first: int = 0
+
+    @property
+    def of_step(self) -> int:
+        """Views of the whole step, over whose rays the misfit is a mean."""
+        return self.chosen.shape[1]
 
     @property
     def area(self) -> int:
@@ -195,11 +203,11 @@ def sharp_projection(raw, at, factor, log_weights, attenuation, nodes, CURVES: t
 
 @triton.jit
 def ray_misfit(
-    predicted, projections, totals, chosen, sums, k, pixel, inside, area, many, noise, held_out, corner,
+    predicted, projections, totals, chosen, sums, k, pixel, inside, area, of_step, noise, held_out, corner,
     HUBER: tl.constexpr,
 ):  # fmt: skip
     """Gradient of the misfit by the projection; what there is to read of it is added to ``sums``."""
-    view, slot = tl.load(chosen + k).to(tl.int64), tl.load(chosen + many + k).to(tl.int64)
+    view, slot = tl.load(chosen + k).to(tl.int64), tl.load(chosen + of_step + k).to(tl.int64)
     value = tl.load(projections + slot * area + pixel, mask=inside, other=float("nan"))
     usable = tl.abs(value) < float("inf")
     value = tl.where(usable, value, 0.0)
@@ -215,7 +223,7 @@ def ray_misfit(
         loss = tl.where(near, scaled * scaled / (2 * corner), scaled - 0.5 * corner)
         slope = tl.where(near, weight * scaled / corner, weight)
     total = tl.zeros([], tl.float32)
-    for j in range(many):
+    for j in range(of_step):
         total += tl.load(totals + tl.load(chosen + j).to(tl.int64))
     by_total = 1.0 / tl.maximum(total, 1e-12)
     loss = tl.where(weight > 0, loss, 0.0)
@@ -238,7 +246,7 @@ def store_gradients(pixels, to, slope, d0, d1, d2, live, CURVES: tl.constexpr):
 @triton.jit(do_not_specialize=SIZES)
 def _misfit_kernel(
     raw, pixels, table, chosen, projections, totals, log_weights, attenuation, sums, largest,
-    area, columns, room, beyond, many, nodes, noise, held_out, corner, areal_scale,
+    area, columns, room, beyond, many, first, of_step, nodes, noise, held_out, corner, areal_scale,
     CURVES: tl.constexpr, CONE: tl.constexpr, HUBER: tl.constexpr, FOLD: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     k = tl.program_id(1).to(tl.int64)
@@ -250,8 +258,8 @@ def _misfit_kernel(
     most, predicted, d0, d1, d2 = sharp_projection(raw, at, factor, log_weights, attenuation, nodes, CURVES)
     tl.atomic_max(largest, tl.max(most, 0), sem="relaxed")
     slope = ray_misfit(
-        predicted, projections, totals, chosen, sums, k, pixel, inside, area, many, noise, held_out, corner,
-        HUBER,
+        predicted, projections, totals, chosen, sums, first + k, pixel, inside, area, of_step, noise, held_out,
+        corner, HUBER,
     )  # fmt: skip
     to = k * room + place(pixel, columns, FOLD)
     store_gradients(pixels, to, slope * factor, d0, d1, d2, live, CURVES)
@@ -265,8 +273,8 @@ def misfit_gradient(splat: Splat) -> torch.Tensor:
         _misfit_kernel[splat.gradient_blocks()](
             splat.raw, pixels, splat.table, splat.chosen, measurement.projections, measurement.totals,
             log_weights, attenuation, splat.sums, splat.largest,
-            splat.area, splat.views.columns, *gradient_room(splat.views), len(splat.views), nodes,
-            measurement.noise, measurement.held_out, measurement.corner, measurement.areal_scale,
+            splat.area, splat.views.columns, *gradient_room(splat.views), len(splat.views), splat.first,
+            splat.of_step, nodes, measurement.noise, measurement.held_out, measurement.corner, measurement.areal_scale,
             CURVES=measurement.curves, CONE=splat.views.cone, HUBER=measurement.corner > 0,
             FOLD=folded(splat.views), BLOCK=PIXELS_A_PROGRAM, num_warps=4,
         )  # fmt: skip

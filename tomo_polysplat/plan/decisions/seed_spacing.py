@@ -13,12 +13,12 @@ from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.decision import Decision, Known
 from tomo_polysplat.plan.decisions.support_level import SupportLevel
 from tomo_polysplat.plan.lab import Lab
-from tomo_polysplat.plan.resolution import cells, finest_spacing
+from tomo_polysplat.plan.resolution import cells, finest_spacing, most_seeds
 
 __all__ = ["SeedSpacing"]
 
-# Gaussians that a laptop fits in a time people wait for. A GPU has memory for so many, of which metal, seeded twice
-# as closely and not counted, may take half.
+# Gaussians that a laptop fits in a time people wait for. Of what a GPU has memory for metal, seeded twice as closely
+# and not counted, may take half.
 _MOST_ON_CPU, _SHARE_OF_SEEDS = 60_000, 0.5
 # What a cloud has to show is mostly surfaces. Where they have more than so many Gaussians a voxel, fewer but thin ones
 # are better and quicker (128^3, teeth, pins, pancreas: 43.6, 36.6, 40.0 dB in 2.1 s with 450 000 of them, 44.6, 37.6,
@@ -61,9 +61,9 @@ def _most_gaussians(lab: Lab) -> tuple[int, str]:
         return settings.max_gaussians or _MOST_ON_CPU, ""
     room = _SHARE_OF_SEEDS * most_gaussians(lab.device)
     # Few voxels hold more seeds than one each: rays tell what is inside them.
-    voxels = max(math.prod(start.shape), _NOT_TOO_MANY)
-    most = max(round(min(room, voxels)), 1)
-    told = ", for which there is memory," if room < voxels else ""
+    worth = min(max(math.prod(start.shape), _NOT_TOO_MANY), most_seeds(problem))
+    most = max(round(min(room, worth)), 1)
+    told = ", for which there is memory," if room < worth else ""
     if problem.planar:
         return most, told
     # Averaged, as noise would make holes with surfaces of their own. What is dense has surfaces within other matter.
