@@ -1,5 +1,7 @@
 """Projection and voxelisation by the Triton kernels against the reference: every geometry, size and channel."""
 
+from unittest import mock
+
 import torch
 from splat_scenes import (
     as_float32,
@@ -14,6 +16,9 @@ from splat_scenes import (
     voxel_box,
 )
 from triton_case import case
+
+from tomo_polysplat.kernels import portions
+from tomo_polysplat.kernels.project.autograd import project
 
 
 def _compare(scene, views, device, cutoff=3.0, **tolerance):
@@ -40,6 +45,21 @@ def _compare_volumes(scene, box, device, cutoff=3.0):
 def cone_beam_tilted_detector_three_channels(device):
     """More Gaussians than a group of neighbours holds, and tiles that stick out of the detector."""
     _compare(as_float32(gaussians(37)), cone_views(2, 11, 21, pixel=(0.2, 0.25)), device)
+
+
+@case
+def views_of_a_large_cloud_one_after_the_other(device):
+    """Without gradients; both a cone and a slice."""
+    for scene, views in (
+        (as_float32(gaussians(9)), cone_views(3, 9, 13)),
+        (as_float32(gaussians(5, planar=True)), planar_views(True, 3, 13)),
+    ):
+        whole, _ = project(*(t.to(device, torch.float32) for t in scene), views, kernel="triton", cutoff=3.0)
+        with mock.patch.object(portions, "MANY", 1), mock.patch.object(portions, "FEW_VIEWS", 2):
+            parted, _ = project(
+                *(t.to(device, torch.float32) for t in scene), views, kernel="triton", cutoff=3.0
+            )
+        torch.testing.assert_close(parted, whole, rtol=1e-6, atol=1e-6)
 
 
 @case

@@ -6,8 +6,8 @@ import numpy as np
 from step_scenes import BATCH, compare_steps, fit_problem
 from triton_case import case
 
-from tomo_polysplat.fit import memory
 from tomo_polysplat.fit.step import EagerStep
+from tomo_polysplat.kernels import portions
 
 
 def _fused(*problem):
@@ -27,7 +27,7 @@ def a_step_of_our_kernels_is_that_of_autograd(device):
 @case
 def a_step_whose_views_are_held_one_after_the_other(device):
     """As of a large cloud, with sharp rays and with what the detector makes of them."""
-    with mock.patch.object(memory, "_MANY", 1), mock.patch.object(memory, "_FEW_VIEWS", 1):
+    with mock.patch.object(portions, "MANY", 1), mock.patch.object(portions, "FEW_VIEWS", 1):
         compare_steps(_fused, device, ("cpu", "numba"))
         compare_steps(_fused, device, ("cpu", "numba"), blurring=False)
 

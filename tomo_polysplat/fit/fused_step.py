@@ -13,7 +13,6 @@ import numpy as np
 import torch
 
 from tomo_polysplat.fit.feed import feed
-from tomo_polysplat.fit.memory import views_at_once
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.step import (
@@ -25,6 +24,7 @@ from tomo_polysplat.fit.step import (
     step_rates,
     turning,
 )
+from tomo_polysplat.kernels.portions import portions
 from tomo_polysplat.kernels.project import triton_backward as rays_backward
 from tomo_polysplat.kernels.project import triton_forward as rays_forward
 from tomo_polysplat.kernels.project.triton_pull_back import pull_back as rays_pull_back
@@ -89,9 +89,11 @@ class FusedStep:
         bounds = log_scale_bounds(scene, spacing, gaussians.planar, settings)
         self._bounds = Bounds(bounds, (scene.least_u, 1.0), LARGEST_BLUR, EPSILON)
         fine = scene.fine(rays.views)
-        self._table, most = fine.host_table(), views_at_once(batch, len(gaussians))
-        # Only the shape of these views counts.
-        self._portions = [fine.select(np.arange(batch)[k : k + most]) for k in range(0, batch, most)]
+        # Only the shape of the portions' views counts.
+        self._table, self._portions = (
+            fine.host_table(),
+            portions(fine.select(np.arange(batch)), len(gaussians)),
+        )
         self._parts = (fine.rows // rays.views.rows, fine.columns // rays.views.columns)
         self._sums = torch.zeros(3, dtype=torch.float64, device=device)
         self._skipped = torch.zeros((), dtype=torch.int64, device=device)

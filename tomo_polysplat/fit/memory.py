@@ -9,6 +9,7 @@ import torch
 
 from tomo_polysplat.checks import fail
 from tomo_polysplat.free_memory import available_memory, in_gigabytes, require_memory
+from tomo_polysplat.kernels.portions import FEW_VIEWS, MANY, views_at_once
 
 __all__ = [
     "free_bytes",
@@ -17,7 +18,6 @@ __all__ = [
     "require_machine",
     "require_room",
     "room_for_gaussians",
-    "views_at_once",
 ]
 
 logger = logging.getLogger(__name__)
@@ -25,8 +25,6 @@ logger = logging.getLogger(__name__)
 # Bytes a Gaussian takes: parameters, both moments, the best copy and gradients; and its footprint and sums in
 # each view of a step.
 _GAUSSIAN, _FOOTPRINT = 640, 144
-# So many Gaussians fill a GPU with the footprints of so few views: more views at once would only take memory.
-_MANY, _FEW_VIEWS = 1_000_000, 2
 # Runs of a large cloud at once, while the rays are asked which of two models explains them.
 _RUNS = 2
 # Bytes a pixel of a step takes: image and gradient of four channels, projections and their slopes.
@@ -145,19 +143,14 @@ def room_for_gaussians(device: torch.device, *, views: int, pixels: int, voxels:
         return math.inf
     left = max(_SHARE * free - sum(_of_all(views, pixels, voxels).values()), 0.0)
     few = left / _of_a_gaussian(views)
-    return few if few < _MANY else max(left / _of_a_gaussian(views_at_once(views, _MANY)), float(_MANY - 1))
+    return few if few < MANY else max(left / _of_a_gaussian(views_at_once(views, MANY)), float(MANY - 1))
 
 
 def most_gaussians(device: torch.device) -> float:
     """How many Gaussians of a large cloud a CUDA device holds in its free memory; infinity without one."""
     if device.type == "cpu" or not torch.cuda.is_available():
         return math.inf
-    return _SHARE * free_bytes(device) / (_RUNS * _of_a_gaussian(_FEW_VIEWS))
-
-
-def views_at_once(views: int, gaussians: int) -> int:
-    """Views of a step whose footprints are held together, of so many."""
-    return min(views, _FEW_VIEWS) if gaussians >= _MANY else views
+    return _SHARE * free_bytes(device) / (_RUNS * _of_a_gaussian(FEW_VIEWS))
 
 
 def _of_a_gaussian(views: int) -> int:

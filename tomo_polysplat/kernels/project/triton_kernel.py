@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import torch
 
+from tomo_polysplat.kernels.portions import portions
 from tomo_polysplat.kernels.project.triton_backward import sum_moments
 from tomo_polysplat.kernels.project.triton_forward import splat
 from tomo_polysplat.kernels.project.triton_image import finish_image, lay_out_gradient
@@ -46,6 +47,18 @@ def project(
     return _Project.apply(position, scale, rotation, weight, views, cutoff, vectors)
 
 
+def _image(
+    scene: tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor],
+    views: DetectorViews,
+    cutoff,
+    skipped,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Line integrals of some views, and their footprints."""
+    table, channels = views.table(scene[0].device), len(scene[-1])
+    record = footprints(*scene, views, table, cutoff, skipped)
+    return finish_image(splat(record, channels, views, cutoff), table, channels, views), record
+
+
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx, position, scale, rotation, weight, views, cutoff, vectors):
@@ -54,8 +67,13 @@ class _Project(torch.autograd.Function):
         )
         table = views.table(position.device)
         skipped = torch.zeros((), dtype=torch.int64, device=position.device)
-        record = footprints(position, scale, rotation, weight, views, table, cutoff, skipped)
-        image = finish_image(splat(record, len(weight), views, cutoff), table, len(weight), views)
+        scene = (position, scale, rotation, weight)
+        if not any(ctx.needs_input_grad):
+            images = [_image(scene, part, cutoff, skipped)[0] for part in portions(views, len(position))]
+            image = images[0] if len(images) == 1 else torch.cat(images, dim=1)
+            ctx.mark_non_differentiable(skipped)
+            return image, skipped
+        image, record = _image(scene, views, cutoff, skipped)
         # The image is read again only for what the factor of its pixels adds to the gradient of the vectors.
         kept = image if ctx.needs_input_grad[6] else None
         ctx.save_for_backward(position, scale, rotation, weight, table, record, kept)
