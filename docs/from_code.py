@@ -6,6 +6,7 @@ import ast
 import inspect
 from pathlib import Path
 
+from tomo_polysplat.nuisances.known import NUISANCES
 from tomo_polysplat.plan.order import ORDER
 
 PACKAGE = Path(__file__).parents[1] / "tomo_polysplat"
@@ -29,6 +30,24 @@ def decisions_table() -> str:
         words = " ".join((inspect.getdoc(kind) or "").split("\n\n")[0].split())
         needs = ", ".join(f"`{needed.name}`" for needed in kind.needs)
         rows.append(f"| {name} | {words} | {kind.when.value} | {needs} |")
+    return "\n".join(rows) + "\n"
+
+
+def nuisances_table() -> str:
+    """A row a nuisance, in the order in which a report tells of them."""
+    rows = [
+        "| Nuisance | Acts on | Parameters | Found by | The rays cannot tell it from | Gate | Cost |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for kind in NUISANCES:
+        numbers = ", ".join(
+            f"`{name}` ({one.unit}, from {one.start:g})" for name, one in kind.parameters.items()
+        )
+        gate = " ".join((inspect.getdoc(kind.gate) or "").split()).replace("`", "")
+        place, found = kind.place.value, kind.found_by.value
+        rows.append(
+            f"| `{kind.name}` | {place} | {numbers} | {found} | {kind.gauge} | {gate} | {kind.cost} |"
+        )
     return "\n".join(rows) + "\n"
 
 
@@ -116,5 +135,6 @@ def make(folder: Path) -> None:
     """Write all of it into a folder."""
     folder.mkdir(exist_ok=True)
     (folder / "decisions_table.md").write_text(decisions_table(), encoding="utf-8")
+    (folder / "nuisances_table.md").write_text(nuisances_table(), encoding="utf-8")
     (folder / "settings_tables.md").write_text(settings_tables(), encoding="utf-8")
     draw_way(folder / "way.svg")

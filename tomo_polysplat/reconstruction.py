@@ -21,9 +21,9 @@ from tomo_polysplat.fit.stopping import StopReason
 from tomo_polysplat.fit.surroundings import cut_out
 from tomo_polysplat.interrupts import postponed_interrupts
 from tomo_polysplat.kernels.device import one_torch_thread, usual_modes
+from tomo_polysplat.nuisances.detector_blur import BlurOfDetector
 from tomo_polysplat.parallel import kept_threads
 from tomo_polysplat.physics.base_materials import Materials
-from tomo_polysplat.physics.detector_blur import describe_blur
 from tomo_polysplat.physics.spectrum import Spectrum, require_spectrum
 from tomo_polysplat.physics.water_correction import describe_polynomial
 from tomo_polysplat.plan.alignment import moves_of
@@ -262,7 +262,8 @@ def _result(
     plan, scene, gaussians, length = prepared.plan, prepared.scene, outcome.gaussians, problem.length
     if plan.blurred:
         fitted = about["settings"]["learning_rate_blur"] > 0
-        plan.note("fitted_blur", float(gaussians.blur), describe_blur(float(gaussians.blur), fitted=fitted))
+        blur = float(gaussians.blur)
+        plan.note("fitted_blur", blur, BlurOfDetector.describe(blur, fitted=fitted))
     if plan.curves > 1 and len(gaussians):
         number, tunables = float(gaussians.shared_material[0]), about["settings"]
         plan.note("soft_material", number, describe_soft(number, plan.soft_u, tunables["soft_gain"]))

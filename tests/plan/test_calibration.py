@@ -155,9 +155,7 @@ def test_a_stage_is_taken_where_its_short_fits_had_their_time(seconds, cut, made
 
     monkeypatch.setattr("tomo_polysplat.plan.calibration.short_fit", fit)
     monkeypatch.setattr("tomo_polysplat.plan.calibration.first_volume", lambda *scan: (None, ""))
-    monkeypatch.setattr(
-        "tomo_polysplat.plan.calibrated_physics.estimate_scatter", lambda *rays: Scatter(0.05)
-    )
+    monkeypatch.setattr("tomo_polysplat.nuisances.scatter.estimate_scatter", lambda *rays: Scatter(0.05))
     problem, wanted = problem_of(fan(0.0), SPECTRUM), Calibration(("scatter",), None)
     found = calibrated(problem, wanted, make_settings(), torch.device("cpu"), 0, 0.6)
     taken = made == 2 and not any(cut)

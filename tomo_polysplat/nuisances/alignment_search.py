@@ -16,10 +16,6 @@ __all__ = ["Schedule", "levels", "schedule", "search", "worth_it"]
 
 logger = logging.getLogger(__name__)
 
-# Moves are kept where the misfit of held-out rays falls below this share of that without. 19 perfect scans of six
-# scenes came to 0.970 and more for the whole scanner; an axis off by 0.25 pixels to 0.84 to 0.95, views shifted by as
-# much to 0.94. By pixels that are not joined shifts of views explain thin metal, too: 0.95 (docs/alignment.md).
-_MARGIN = 0.96
 # Columns of the coarsest and of the finest joined detector.
 _COARSEST, _FINEST = 15, 64
 
@@ -58,7 +54,7 @@ def levels(columns: int) -> list[int]:
 
 def worth_it(told: float, moved: float) -> bool:
     """Whether the misfit of held-out rays says that the moves are there: as told, and moved, by fits alike."""
-    return moved < _MARGIN * told
+    return Alignment.gate({"without": told, "moved": moved}).kept
 
 
 def search(

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import torch
 
-__all__ = ["LARGEST_BLUR", "blurred", "describe_blur"]
+__all__ = ["LARGEST_BLUR", "blurred"]
 
 # Three taps make no wider blur without a dip in their middle.
 LARGEST_BLUR = 0.6
@@ -47,10 +47,3 @@ def blurred(projections: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
             before, after = (wide.narrow(axis, k, count) for k in (0, 2))
             projections = same * projections + beside * (before + after)
     return projections
-
-
-def describe_blur(variance: float, *, fitted: bool) -> str:
-    """What a reconstruction took for the blur, in words; the ``variance`` in squared pixels."""
-    if not (fitted or variance):
-        return "none, as asked for: rays are infinitely thin"
-    return f"variance of {variance:.3f} squared pixels, {'fitted' if fitted else 'held as asked for'}"

@@ -19,15 +19,15 @@ import torch
 
 from tomo_polysplat.checks import fail, require_choice, require_number
 from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.nuisances.known import SPECTRAL
+from tomo_polysplat.nuisances.scatter import LEAST_SCATTER
 from tomo_polysplat.physics.spectral_change import tube_voltage
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.plan.calibrated_physics import (
-    CHANGES,
-    LEAST_SCATTER,
-    bounds_of,
+    judge_factor,
     judge_scatter,
+    moved_factor,
     moved_scatter,
-    moved_spectrum,
     with_fitted,
 )
 from tomo_polysplat.plan.first_volume import first_volume
@@ -45,8 +45,6 @@ _ROUNDS = 2
 _SHARE_OF_BUDGET = 0.6
 # Steps of a short fit that tells a density: it is 0.7 to 1.5 % low after 120 (teeth, pins, lung), 0.3 to 0.5 after 240.
 _STEPS_FOR_DENSITY = 240
-# A known density is taken at its word unless the rays contradict it by as much.
-_CONTRADICTION = 0.1
 # Nothing is denser, in g/cm3.
 _DENSEST = 25.0
 
@@ -98,11 +96,11 @@ class Calibration:
                 raise fail("calibrate", "True, False or names", repr(calibrate), error=TypeError)
             names = (calibrate,) if isinstance(calibrate, str) else tuple(calibrate)
         for name in names:
-            require_choice("calibrate", name, ("scatter", *CHANGES))
+            require_choice("calibrate", name, ("scatter", *SPECTRAL))
         return cls(names, soft_density)._checked(spectrum)
 
     def _checked(self, spectrum: Spectrum) -> Calibration:
-        spectral = [name for name in self.names if name in CHANGES]
+        spectral = [name for name in self.names if name in SPECTRAL]
         if len(spectral) > 1:
             raise fail("calibrate", "'kvp' or 'filter'", "both", "one known density tells one of them")
         if spectral and self.soft_density is None:
@@ -227,7 +225,7 @@ def _stage(
             moved = moved_scatter(last, problem)
         else:
             assert wanted.soft_density is not None
-            moved = moved_spectrum(name, last, wanted.soft_density, problem)
+            moved = moved_factor(name, last, wanted.soft_density, problem)
         if not moved:
             break
         made.append(trial({k: v for k, v in last.fitted.items() if not k.startswith(name)} | moved))
@@ -247,12 +245,4 @@ def _judge(
         return None, "nothing to change"
     if name == "scatter":
         return judge_scatter(before, stage, wanted.suspected)
-    after = stage[-1]
-    low, high = bounds_of(name, problem)
-    change = f"{after.fitted[name]:.4g}"
-    if not 1.001 * low < after.fitted[name] < 0.999 * high:
-        return None, f"times {change} is as far as is looked, and the density asks for more: not accepted"
-    fits = after.held_out < (1 + _CONTRADICTION) * before.held_out
-    errors = f"held-out error {before.held_out:.3e} before, {after.held_out:.3e} after"
-    reason = f"times {change} by the known density, {'accepted' if fits else 'not accepted'}: {errors}"
-    return after if fits else None, reason
+    return judge_factor(name, before, stage[-1], problem)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from tomo_polysplat.nuisances.known import NUISANCES
 from tomo_polysplat.plan.answer import Answer, Status
 
 __all__ = [
@@ -83,23 +84,22 @@ def in_words(answer: Answer) -> str:
 
 def found_about_the_scanner(plan: Mapping[str, Answer]) -> str:
     """One sentence on what the fit took from the rays about how they were measured."""
-    rays = ray_physics(plan)
-    found = []
-    if "alignment" in plan and plan["alignment"].value:
-        found.append(f"a geometry that has moved ({plan['alignment'].why})")
+    values = _of_nuisances(plan)
+    found = [words for kind in NUISANCES if (words := kind.told(values))]
     if "water_correction" in plan:
-        found.append(f"a water correction, undone ({plan['water_correction'].why})")
-    if rays.scatter or rays.of_light:
-        found.append(f"scatter of {rays.scatter:.2g} of the open beam")
-    if rays.beam != 1.0:
-        found.append(f"a beam {rays.beam:.4g} times as bright as the open field")
-    if rays.blur and plan["detector_blur"].status is Status.ASKED:
-        found.append(f"a detector that blurs by {rays.blur**0.5:.2g} pixels (standard deviation)")
-    if rays.pixel_rays > 1:
-        found.append("pixels that average the light")
+        found.insert(0, f"a water correction, undone ({plan['water_correction'].why})")
     if not found:
         return "About the scanner nothing was found that the geometry and the spectrum had not said."
     return f"About the scanner was found: {'; '.join(found)}."
+
+
+def _of_nuisances(plan: Mapping[str, Answer]) -> dict[str, Any]:
+    """Parameters of nuisances by name, as far as the rays have told them."""
+    values = dict(plan["alignment"].value) if "alignment" in plan else {}
+    values |= plan["calibration"].value["fitted"] if "calibration" in plan else {}
+    if "fitted_blur" in plan and plan["detector_blur"].status is Status.ASKED:
+        values["blur"] = plan["fitted_blur"].value
+    return values | ({"pixel_rays": plan["pixel_rays"].value} if "pixel_rays" in plan else {})
 
 
 def how_it_ended(plan: Mapping[str, Answer]) -> str:

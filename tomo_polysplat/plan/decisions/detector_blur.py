@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from tomo_polysplat.physics.detector_blur import describe_blur
+from tomo_polysplat.nuisances.detector_blur import BlurOfDetector
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.decision import Decision, Known
 from tomo_polysplat.plan.decisions.soft_reference import SoftReference
@@ -17,7 +17,7 @@ __all__ = ["DetectorBlur"]
 class DetectorBlur(Decision):
     """Are rays seen through a blur of the detector?
 
-    Where the blur is to be fitted, metal must show that edges are sharp; see ``physics.detector_blur``.
+    Where the blur is to be fitted, metal must show that edges are sharp; see `nuisances.detector_blur`.
     """
 
     name = "detector_blur"
@@ -35,11 +35,9 @@ class DetectorBlur(Decision):
         """Where the start has metal."""
         settings = lab.settings
         if not settings.learning_rate_blur:
-            return Answer(settings.blur > 0, describe_blur(settings.blur, fitted=False), Status.GIVEN)
+            words = BlurOfDetector.describe(settings.blur, fitted=False)
+            return Answer(settings.blur > 0, words, Status.GIVEN)
         soft = known[SoftReference]["first"] * lab.problem.depth
-        if bool((lab.start > settings.metal_level * soft).any()):
-            why = f"fitted, from a variance of {settings.blur:g} squared pixels on: metal has edges that hold it"
-            return Answer(True, why, Status.ASKED)
-        return Answer(
-            False, "none: without metal, a smooth object and a detector that blurs look alike", Status.ASKED
-        )
+        metal = bool((lab.start > settings.metal_level * soft).any())
+        verdict = BlurOfDetector.gate({"metal": float(metal), "blur": settings.blur})
+        return Answer(verdict.kept, verdict.why, Status.ASKED)

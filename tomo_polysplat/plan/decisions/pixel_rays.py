@@ -17,6 +17,7 @@ from tomo_polysplat.fit.fork import fork, passes_of_a_fork, why_no_fork
 from tomo_polysplat.fit.loss import misfit
 from tomo_polysplat.fit.rays import batches_around
 from tomo_polysplat.kernels.views import DetectorViews
+from tomo_polysplat.nuisances.pixel_light import PixelLight
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.decision import Decision, Known, When
 from tomo_polysplat.plan.decisions.passes import Passes
@@ -33,11 +34,6 @@ logger = logging.getLogger(__name__)
 _FROM, _STEPS, _MOST = 0.4, 60, 0.2
 # So many times as long a step of averaged light may take, with two rays a pixel and axis.
 _SLOWER = 4.0
-# Light is averaged where that leaves as much of the misfit of the rays at metal: a fit makes up for most of what it
-# does not model. 40 scans of several rays a pixel came to 0.75 to 1.15, six of thin or opaque metal to 1.16 to 1.55;
-# 24 of one ray to 1.32 and more, but for grains smaller than a voxel, 1.06, and for rods in the middle of a disc, which
-# all views see alike: 0.34 to 0.99.
-_AS_WELL = (0.7, 1.2)
 # Rays at metal: they and their neighbours see this share of the most metal that any does.
 _SEEN = 0.05
 
@@ -82,11 +78,9 @@ class PixelRays(Decision):
             raise Untold("the time budget was used before the rays could tell")
         left = _misfits_at_metal([fitter, other])
         share = left[1] / left[0] if left[0] else float("inf")
-        averaged = _AS_WELL[0] <= share <= _AS_WELL[1]
+        verdict = PixelLight.gate({"share": share})
+        averaged, why = verdict.kept, verdict.why
         run.fitter, run.made = (other, ways.other) if averaged else (fitter, ways.was)
-        kind = "the light of each pixel is averaged" if averaged else "rays are infinitely thin"
-        words = f"averaged light leaves {share:.2f} of the misfit of the rays at metal, and is taken from"
-        why = f"{kind}; {words} {_AS_WELL[0]:g} to {_AS_WELL[1]:g}"
         logger.info("Pixels: %s.", why)
         return Answer(AVERAGED_RAYS if averaged else 1, why, Status.ASKED, {"share": share})
 

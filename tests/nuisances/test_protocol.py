@@ -1,0 +1,97 @@
+"""What every nuisance owes: a start that does nothing, a gate that no failed fit passes, its place in the list."""
+
+import importlib
+import inspect
+import math
+import pkgutil
+import re
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+
+from tomo_polysplat import nuisances
+from tomo_polysplat.nuisances.detector_blur import BlurOfDetector
+from tomo_polysplat.nuisances.filters import Filters
+from tomo_polysplat.nuisances.known import NUISANCES
+from tomo_polysplat.nuisances.nuisance import Nuisance
+from tomo_polysplat.nuisances.open_beam import OpenBeam
+from tomo_polysplat.nuisances.pixel_light import PixelLight
+from tomo_polysplat.nuisances.scatter import ScatteredLight
+from tomo_polysplat.nuisances.tube_voltage import TubeVoltage
+from tomo_polysplat.physics.spectrum import Spectrum
+
+PAGE = Path(__file__).parents[2] / "docs" / "nuisances.md"
+
+
+def test_every_nuisance_is_listed_and_no_two_share_a_parameter():
+    found = set()
+    for module in pkgutil.iter_modules(nuisances.__path__):
+        of = importlib.import_module(f"tomo_polysplat.nuisances.{module.name}")
+        found |= {kind for _, kind in inspect.getmembers(of, inspect.isclass) if issubclass(kind, Nuisance)}
+    assert {kind for kind in found if not inspect.isabstract(kind)} == set(NUISANCES)
+    names = [name for kind in NUISANCES for name in kind.parameters]
+    assert len(set(names)) == len(names)
+
+
+@pytest.mark.parametrize("kind", NUISANCES, ids=lambda kind: kind.name)
+def test_at_its_start_nothing_is_told_and_a_failed_fit_confirms_nothing(kind):
+    assert kind.told({}) == kind.told({name: one.start for name, one in kind.parameters.items()}) == ""
+    assert all(one.unit and one.least <= one.start <= one.most for one in kind.parameters.values())
+    assert kind.gauge and kind.cost
+    verdict = kind.gate(defaultdict(lambda: math.nan))
+    assert not verdict.kept and verdict.why
+
+
+ERRORS = {"held_out_before": 1.0, "held_out_after": 0.9}
+DARKEST = {"darkest_before": 1.0, "darkest_after": 0.9}
+
+
+@pytest.mark.parametrize(
+    ("evidence", "scatter", "beam"),
+    [
+        (ERRORS, True, True),
+        (ERRORS | {"held_out_after": 0.98}, False, False),
+        (ERRORS | DARKEST, True, True),
+        # Scatter is what dark rays hold most of; a brighter beam leaves them as they were.
+        (ERRORS | DARKEST | {"darkest_after": 1.01}, False, True),
+        (ERRORS | DARKEST | {"held_out_rival": 0.9, "darkest_rival": 0.92}, False, False),
+        (ERRORS | DARKEST | {"held_out_rival": 0.9, "darkest_rival": 0.99}, True, True),
+        (ERRORS | DARKEST | {"held_out_rival": 1.4, "darkest_rival": 0.92}, True, True),
+    ],
+)
+def test_more_light_has_to_explain_the_rays_better_than_what_looks_alike(evidence, scatter, beam):
+    assert ScatteredLight.gate(evidence).kept is scatter
+    assert OpenBeam.gate(evidence).kept is beam
+
+
+def test_rays_darker_than_scatter_exclude_it():
+    assert ScatteredLight.gate(ERRORS | {"darker": 7, "rays": 1000}).kept
+    assert not ScatteredLight.gate(ERRORS | {"darker": 8, "rays": 1000}).kept
+    assert ScatteredLight.gate(ERRORS | {"darker": 8, "rays": 100_000}).kept
+
+
+def test_a_known_density_is_believed_unless_the_rays_contradict_it():
+    inside = {"factor": 1.1, "least": 0.8, "most": 1.25}
+    assert Filters.gate(inside | ERRORS | {"held_out_after": 1.05}).kept
+    assert not Filters.gate(inside | ERRORS | {"held_out_after": 1.15}).kept
+    assert not Filters.gate(inside | ERRORS | {"factor": 1.2499}).kept
+
+
+def test_a_voltage_ends_where_tables_of_tubes_do():
+    low, high = TubeVoltage.bounds(Spectrum.from_tube(200, filters={"Al": 0.1}))
+    assert low == 0.8 and 1.0 < high < 1.25
+
+
+def test_reports_tell_of_each():
+    assert BlurOfDetector.told({"blur": 0.25}).startswith("a detector that blurs by 0.5 pixels")
+    assert PixelLight.told({"pixel_rays": 2}) and TubeVoltage.told({"kvp": 1.1}).endswith("1.1 times as told")
+
+
+def test_the_example_of_the_docs_runs():
+    names = {}
+    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    assert len(blocks) == 2
+    for block in blocks:
+        exec(block, names)
+    names["test_a_lag_is_kept_where_the_held_out_rays_fit_better"]()
