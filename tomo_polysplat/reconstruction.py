@@ -38,7 +38,7 @@ from tomo_polysplat.progress import progress_reports
 from tomo_polysplat.result.provenance import provenance
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import VolumeGrid, from_astra, is_planar_geometry, to_astra
-from tomo_polysplat.scan.scan import Scan
+from tomo_polysplat.scan.measurement import Measurement
 from tomo_polysplat.scan.usable import usable_rays
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.transfer import to_host
@@ -156,18 +156,19 @@ def reconstruct(
     """
     started = time.perf_counter()
     run_options = RunOptions.of(quality, settings, time_budget, seed, device, callbacks)
-    projections, proj_geom, vol_geom, rest = _of_scan(
-        projections, proj_geom, vol_geom, (unit, spectrum, valid, water_correction)
-    )
-    unit, spectrum, valid, water_correction = rest
-    spectrum = require_spectrum("spectrum", spectrum)
+    measured = Measurement(projections, proj_geom, vol_geom, unit, spectrum, valid, water_correction).filled()
+    proj_geom, vol_geom = measured.geometries()
+    unit, water_correction = measured.unit or "cm", measured.water_correction
+    spectrum = require_spectrum("spectrum", measured.spectrum)
     geometry, grid = from_astra(proj_geom, vol_geom)
     widest, on = run_options.settings.surroundings, run_options.device
     energies = 1 if spectrum is None else len(spectrum.energies)
-    require_machine(math.prod(np.shape(projections)), math.prod(grid.shape), energies, on)
+    require_machine(math.prod(np.shape(measured.projections)), math.prod(grid.shape), energies, on)
     # What torch adds up depends on how many threads it has.
     with one_torch_thread(on):
-        values, counts = usable_rays(projections, proj_geom, valid, water_correction, spectrum)
+        values, counts = usable_rays(
+            measured.projections, proj_geom, measured.valid, water_correction, spectrum
+        )
         problem = Problem.of(values, geometry, grid, unit, spectrum, materials, widest, on)
     # Made wider where the object is, it may have many times the voxels.
     require_machine(0, math.prod(problem.grid.shape), energies, on)
@@ -207,33 +208,6 @@ def reconstruct(
     result.seconds = time.perf_counter() - started
     logger.info("Reconstructed in %.1f s: %s; %s", result.seconds, result.plan["stop"].why, result.counts)
     return result
-
-
-def _of_scan(
-    projections: Any,
-    proj_geom: Mapping[str, Any] | None,
-    vol_geom: Mapping[str, Any] | None,
-    rest: tuple[str | None, Spectrum | None, Any, Sequence[float] | None],
-) -> tuple[
-    Any, Mapping[str, Any], Mapping[str, Any], tuple[str, Spectrum | None, Any, Sequence[float] | None]
-]:
-    """Projections, geometries, and unit, spectrum, valid rays and water correction: as given, else a scan's."""
-    unit, spectrum, valid, correction = rest
-    if isinstance(projections, Scan):
-        scan = projections
-        projections, proj_geom, vol_geom = (
-            scan.projections,
-            proj_geom or scan.proj_geom,
-            vol_geom or scan.vol_geom,
-        )
-        unit, spectrum = unit or scan.unit, scan.spectrum if spectrum is None else spectrum
-        valid = scan.usable if valid is None else valid
-        correction = scan.water_correction if correction is None and spectrum is not None else correction
-    for name, given in (("proj_geom", proj_geom), ("vol_geom", vol_geom)):
-        if given is None:
-            raise fail(name, "ASTRA's geometry beside an array of projections", "none", "or pass a Scan")
-    assert proj_geom is not None and vol_geom is not None
-    return projections, proj_geom, vol_geom, (unit or "cm", spectrum, valid, correction)
 
 
 def _stopped(outcome: FitOutcome, interrupted: bool) -> Answer:
