@@ -7,9 +7,12 @@ import pytest
 from planned import lab_of
 from small_scans import fan, geometries
 
+import tomo_polysplat as tps
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.physics.edges import edge_inside
 from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.plan import solver
+from tomo_polysplat.plan.answer import Answer
 from tomo_polysplat.plan.decisions.agent import Agent, levels_between
 from tomo_polysplat.plan.order import answer_to
 from tomo_polysplat.plan.preparation import fit_start
@@ -81,3 +84,23 @@ def test_metal_that_was_named_starts_as_itself():
     assert answer.value == {"metal_u": 1.0} and "named" in answer.why
     for dense, wanted in (("titanium", {"metal_u": 0.6}), ("Fe", {})):
         assert answer_to(Agent(), lab(dense, **wanted)).value == {}
+
+
+class Begun(Exception):
+    pass
+
+
+def test_the_run_takes_for_metal_what_the_seeds_did(monkeypatch):
+    """Below the usual level of metal an agent is, to the run, soft matter with something dense in it."""
+    scan, used = fan(), []
+
+    def fit(gaussians, spacing, rays, scene, settings, **rest):
+        used.append(settings)
+        raise Begun
+
+    monkeypatch.setattr(solver, "fit", fit)
+    monkeypatch.setattr(Agent, "ask", lambda *asked: Answer.found({"metal_level": 3.5, "metal_u": 1.0}))
+    told = {"passes": 1.0, "edges": "blurred", "growth": 1.0, "tv_factor": 1.0}
+    with pytest.raises(Begun):
+        tps.reconstruct(scan, materials=("water", "bone", "I"), settings=told, progress=False, device="cpu")
+    assert used[0].metal_level == 3.5 and used[0].metal_u == 1.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -97,7 +97,7 @@ class Lab:
     @property
     def seeding(self) -> Settings:
         """The settings of the fit to come, with what the search for an agent has changed."""
-        return replace(self.settings, **self.plan.value("agent", {}))
+        return self.plan.with_agent(self.settings)
 
     def seeds(self, **assumed: Any) -> Gaussians:
         """Seeds of the plan, or of one with other values of some answers; made once, to be copied before a fit."""

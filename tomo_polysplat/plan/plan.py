@@ -161,6 +161,10 @@ class Plan:
         """What the settings' weight of the total variation is multiplied by."""
         return self.value("tv_factor", 1.0)
 
+    def with_agent(self, settings: Settings) -> Settings:
+        """The settings with what the search for a contrast agent has changed: what is dense is the agent."""
+        return replace(settings, **self.value("agent", {}))
+
     def adapted(self, settings: Settings) -> Settings:
         """The settings for this object: levels, material numbers, and how much is smoothed."""
         settings = adapted_to(self.answers["soft_reference"].value, settings)

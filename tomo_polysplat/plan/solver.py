@@ -122,7 +122,7 @@ class Solver:
 
     def _fit(self, prepared: PreparedFit, problem: Problem, ask_scatter: bool) -> FitOutcome:
         plan, scene, run_options = prepared.plan, prepared.scene, self.run_options
-        settings = plan.adapted(run_options.settings)
+        settings = plan.adapted(plan.with_agent(run_options.settings))
         return fit(
             prepared.gaussians,
             plan.spacing * problem.voxel,
