@@ -53,7 +53,7 @@ class Settings:
     held_out: float = 0.01
     """Share of the rays that are not fitted. They tell when the fit stops improving."""
     patience: int | None = None
-    """The run ends after so many passes without improvement of the held-out rays; None: four tenths of the passes, and
+    """Number of passes without improvement of the held-out rays that ends the run. None: four tenths of the passes, and
     at least 4."""
     kernel: str = "auto"
     """"auto", "triton", "numba" or "reference"."""
@@ -66,7 +66,7 @@ class Settings:
     closer_seeds: float | None = None
     """Distance in voxels of seeds that are thin across sharp edges; 0: no closer than the others."""
     growth: float | None = None
-    """The cloud may grow to so many times its number of seeds, by splitting; 1: it does not grow."""
+    """Largest number of Gaussians at the end, as a multiple of the number of seeds. Gaussians split; 1: none does."""
     edges: str | None = None
     """"sharp": all seeds are thin across edges. "blurred": none is thinner than the detector could tell apart."""
     support_level: float = 0.1
@@ -97,12 +97,12 @@ class Settings:
     tv_weight: float = 0.04
     """Weight of the total variation per voxel, in soft references."""
     tv_factor: float | None = None
-    """That weight is multiplied by this."""
+    """Factor of ``tv_weight``."""
     tv_corner: float | None = None
     """Difference of neighbouring voxels, in soft references, up to which it counts in full. Larger ones count by their
     logarithm, so that edges and texture stay; with 1000 all count in full."""
     tv_every: int | None = None
-    """The total variation is taken in one step of so many, and counts as many times."""
+    """Every how many steps the total variation is taken. It is then multiplied by that number."""
     tv_clip: float = 5.0
     """Attenuation above this many soft references does not count as variation: that would erode metal."""
 
@@ -110,13 +110,14 @@ class Settings:
     curves: int | None = None
     """Material curves under a spectrum: 1 for the soft one alone, or 3."""
     bone_level: float = 2.2
-    """Matter of more than so many soft references in the start is bone-like. Material numbers are free near it."""
+    """Level in soft references above which matter of the start is bone-like. Material numbers are free near it."""
     metal_level: float = 6.0
-    """The same for metal, which in an object of one solid is three times as dense as that at least."""
+    """Level in soft references above which matter is metal. In an object of one solid it is at least three times the
+    density of that solid."""
     metal_rim: float | None = None
     """Level down to which what is connected to metal belongs to it; None: ``metal_level`` itself."""
     metal_tail: float = 0.5
-    """A voxel no point of which reaches about this share of the metal around it holds a tail, which that gets back."""
+    """A voxel that nowhere reaches this share of the metal around it holds a tail, which goes back to that metal."""
     agent: dict[str, float] | None = None
     """Settings that the seeds start from where a contrast agent or a metal was named; {}: none are changed."""
     light: str | None = None
@@ -125,7 +126,7 @@ class Settings:
     soft_u: float = 0.0
     """Material number of soft matter that the fit starts from. Near dense matter it is free."""
     soft_gain: float = 1.0
-    """Once a pass the soft matter's number moves by so much times the cupping, where it is one matter; 0 holds it."""
+    """Where the soft matter is one, its number moves by this times the cupping once a pass; 0 holds it."""
     light_u: float = -0.056
     """Material number of fat, less that of soft matter; that of adipose tissue by default."""
     bone_u: float = 0.3

@@ -29,7 +29,7 @@ class Fork:
 
 
 def why_no_fork(passes: float, views: int) -> str:
-    """Why a run of so many passes over so many views is asked nothing, if so."""
+    """Why a run of these passes over these views is asked nothing, if so."""
     if passes < FEWEST_PASSES:
         return "in so few passes more of them would take too long a part"
     if views < FEW_VIEWS:
@@ -38,7 +38,7 @@ def why_no_fork(passes: float, views: int) -> str:
 
 
 def passes_of_a_fork(fitter: Fitter, passes: float, steps: int, most: float) -> int:
-    """Passes of each way that make so many steps, but for no more than a share ``most`` of the run's passes."""
+    """Passes of each way that make ``steps``, but no more than a share ``most`` of the run's passes."""
     return max(_PASSES, min(math.ceil(steps / fitter.steps_of_a_pass), round(most * passes)))
 
 

@@ -59,7 +59,7 @@ class Rays:
 
     @property
     def threshold(self) -> int:
-        """Of 65536 rays, so many are held out."""
+        """How many of 65536 rays are held out."""
         return int(self.held_out * 65536)
 
     def batch(self, chosen: np.ndarray) -> tuple[DetectorViews, torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -22,8 +22,8 @@ from tomo_polysplat.transfer import to_host
 
 __all__ = ["FitScene"]
 
-# One of so many slices is made to tell how long all of them take, and how many times that it may be: the Gaussians of
-# the end are thinner than those of the start, and a host's memory is slower when it is new.
+# One slice in this many is made to tell how long all of them take. That time is multiplied by the second number: the
+# Gaussians of the end are thinner than those of the start, and a host's memory is slower when it is new.
 _SLICES_TIMED, _SLACK = 8, 2.0
 
 
@@ -130,8 +130,8 @@ class FitScene:
     def seconds_of_basis(self, gaussians: Gaussians) -> float:
         """How long `basis`, and attenuation from it, will take on the host at most, told by some slices in the middle.
 
-        So many, and twice as many, for what takes the same time however few there are; so many again where that took
-        longer, as it compiled kernels.
+        Two numbers of slices are timed, one twice the other, as part of the time does not depend on how many there are.
+        Where the fewer took longer, because kernels were compiled, they are timed again.
         """
         nz, ny, nx = self.box.shape
         depth = -(-nz // _SLICES_TIMED)

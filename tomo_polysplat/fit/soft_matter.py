@@ -37,8 +37,8 @@ _OTHER = 0.005
 # Of the points inside, the share that must be this close to their median for the matter to be one, and how many there
 # must be, in how many layers of equal depth.
 _ONE, _CLOSE, _FEWEST, _LAYERS = 0.8, 0.1, 200, 6
-# So many times its standard error the first slope must be for the number to leave where it began: where the deepest
-# layer alone is darker, between screws, that is no cupping. Later slopes bring it back as well.
+# The number leaves where it began only if the first slope is this many standard errors: where the deepest layer alone
+# is darker, between screws, that is no cupping. Later slopes bring it back as well.
 _CERTAIN = 3.0
 # Farthest from its start that the number goes: plastics and oil lie this far below water, and solids farther from what
 # their attenuation says.

@@ -88,12 +88,12 @@ def step_rates(settings: Settings, spacing: float) -> dict[str, float]:
 
 
 def smoothing(settings: Settings, scene: FitScene, done: int) -> float:
-    """Weight of the total variation in the step after so many; 0 where that step does not take it."""
+    """Weight of the total variation in the next step, when ``done`` are made; 0 where that step does not take it."""
     return 0.0 if done % scene.tv_every else scene.tv_every * settings.tv_weight
 
 
 def turning(done: int) -> float:
-    """Whether Gaussians may turn after so many steps, as a factor: not in the first one.
+    """Whether Gaussians may turn in the next step, when ``done`` are made, as a factor: not in the first one.
 
     Seeds are round, so what would turn them there is rounding, and Adam makes large steps of it.
     """

@@ -129,18 +129,18 @@ class Clock:
         return by_time if by_time > by_steps + 1 / self.steps else by_steps
 
     def expected_steps(self, seconds: float) -> int:
-        """How many steps the run comes to where each of those left takes so many seconds."""
+        """How many steps the run comes to where each of those left takes these ``seconds``."""
         if self.deadline is None:
             return self.steps
         left = max(self.deadline - time.perf_counter(), 0.0)
         return min(self.steps, self.done + math.ceil(left / max(seconds, 1e-9)))
 
     def allows(self, slower: float) -> bool:
-        """Whether the steps left, so many times slower than those so far, would end before the deadline."""
+        """Whether the steps left, slower than those so far by this factor, would end before the deadline."""
         return self.room_for(slower * (self.steps - self.done))
 
     def room_for(self, steps: float) -> bool:
-        """Whether so many steps would end before the deadline."""
+        """Whether these steps would end before the deadline."""
         if self.deadline is None:
             return True
         now = time.perf_counter()

@@ -11,7 +11,7 @@ from tomo_polysplat.fit.rays import Rays
 
 __all__ = ["optical_depth", "weights_by_depth"]
 
-# What holds so many times the level of what is empty is matter rather than noise.
+# Matter, rather than noise, is what holds more than this multiple of the level below which voxels are empty.
 _MATTER = 3.0
 # Optical depth of the objects that the usual smoothing was chosen on (teeth, pins, lung, pancreas: 0.9 to 1.1), and the
 # share of it below which an object is thin.

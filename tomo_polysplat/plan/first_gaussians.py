@@ -22,7 +22,7 @@ __all__ = ["AVERAGED_RAYS", "first_gaussians", "room_to_grow"]
 # Rays a pixel and axis where the light is averaged: with three pins of 36^3 are no better than with two (45.4 and 48.4
 # dB everywhere).
 AVERAGED_RAYS = 2
-# So many times as many Gaussians as seeds are worth their time, with those of metal.
+# Largest number of Gaussians that is worth its time, those of metal included, as a multiple of the number of seeds.
 _OF_SEEDS = 2
 
 

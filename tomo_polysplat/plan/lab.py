@@ -46,7 +46,7 @@ class Lab:
     plan : Plan
         What has been decided so far.
     short_fit : callable or None
-        Fits the start under other settings, for so many steps (`plan.short_fit.short_fit`).
+        Fits the start under other settings, for a number of steps (`plan.short_fit.short_fit`).
     calibrate : callable or None
         Makes the short fits that tell scatter, and returns their record.
     gaussians : Gaussians or None

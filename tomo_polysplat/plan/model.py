@@ -79,7 +79,7 @@ def _solid_number(
 def all_curves(problem: Problem, basis: np.ndarray, plan: Plan, dense: float) -> np.ndarray:
     """(3, nz, ny, nx) densities of the material curves from those of the model, which may lack two.
 
-    Matter denser than so many soft references, which the start did not show, is told in the log and the plan.
+    Matter of more than ``dense`` soft references, which the start did not show, is told in the log and the plan.
     """
     if problem.materials is None or len(basis) > 1:
         return basis

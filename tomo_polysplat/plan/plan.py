@@ -12,7 +12,7 @@ from tomo_polysplat.settings import Settings
 
 __all__ = ["Plan", "adapted_to"]
 
-# In dense matter metal is told by so many times its density at least: steel in aluminium, pyrite in quartz.
+# In dense matter, metal is at least this many times as dense: steel in aluminium, pyrite in quartz.
 _METAL = 3.0
 
 
@@ -153,7 +153,7 @@ class Plan:
 
     @property
     def growth(self) -> float:
-        """So many times as many Gaussians as seeds there may be in the end."""
+        """Largest number of Gaussians at the end, as a multiple of the number of seeds."""
         return self.value("growth", 1.0)
 
     @property

@@ -19,7 +19,7 @@ __all__ = ["RaySample", "sample_rays"]
 _RAYS = 60_000
 # Rays that see no more than this share of what the densest one sees pass beside the object.
 _HAZE = 1e-3
-# A ray with so much less light than it should have, and so many deviations less, is darker.
+# A ray is darker where it has less than this share of the light that it should have, and less by this many deviations.
 _LESS, _DEVIATIONS = 0.85, 3.0
 # As few rays beside the object do not tell how bright the beam is.
 _FEWEST_BESIDE = 100

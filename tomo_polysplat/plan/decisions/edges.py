@@ -36,11 +36,12 @@ logger = logging.getLogger(__name__)
 # with sharp edges (24^3 to 256^3 voxels) came to 0.69 to 0.95, those of broccoli, which gains and loses nothing, to
 # 0.95 to 0.99, and 20 of blurred ones, of which many lose by thin seeds, up to 4 dB, to 0.98 and more.
 _SHARP = 0.96
-# A short fit is a pass over the views, which need not have more steps than this, but has so many views: 40 views in
-# steps of one came to 0.75 to 0.97 by the seed, and in 1.8 passes to 0.67 to 0.81.
+# A short fit is one pass over the views. It need not have more steps than the first number, but has at least as many
+# views as the second: 40 views in steps of one came to 0.75 to 0.97 by the seed, and in 1.8 passes to 0.67 to 0.81.
 _STEPS, _FEWEST_VIEWS = 40, 72
-# Seeds so many times as far apart as the detector could tell are thin as it is, and gain less by being thinner than
-# the short fits cost (teeth of 96^3, 128^3 and 256^3, 1.3, 1.4 and 2.1 times as far: 2.0, 1.8 and 0.3 dB).
+# Distance of the seeds, in distances that the detector could tell apart, beyond which nothing is asked. These seeds are
+# thin as it is, and gain less by being thinner than the short fits cost (teeth of 96^3, 128^3 and 256^3, 1.3, 1.4 and
+# 2.1 times as far: 2.0, 1.8 and 0.3 dB).
 _FARTHEST = 1.8
 # Fewer voxels along the longest edge show no edge so sharp that it would pay (24^3 and 28^3: -0.2 to 0.0 dB by thin
 # seeds, though the rays are fitted better).

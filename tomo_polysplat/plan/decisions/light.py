@@ -41,7 +41,7 @@ _LEAST = 0.1
 _FEWEST_VOXELS = 48
 # What lies so far from the number that soft matter began with has shown that it is no water.
 _MOVED = 0.01
-# So many times its standard error, over the views, the misfit must be less as fat.
+# The misfit must be less, as fat, by this many of its standard errors over the views.
 _CERTAIN = 2.0
 
 

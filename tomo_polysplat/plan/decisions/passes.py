@@ -18,9 +18,9 @@ __all__ = ["Passes", "longer", "times_of_few_views", "usual_passes"]
 # dB without metal in the mean and 0.2 everywhere, and take a fifth more time, those of 128^3 on an H200 0.4 and 0.2 in
 # a sixth more; with 20 passes 0.1 dB more in a sixth more time yet.
 _PASSES, _PASSES_PLANAR = 15.0, 10.0
-# Of fewer views than these a run makes more passes, as many views in all up to so many times: 12 to 36 views, six
-# volumes of 36^3, came to 32.0 / 44.0 dB in 3.7 s by 10 passes, and to 32.9 / 44.5 in 6.5 s so (33.2 / 44.6 in 8.2 s
-# by 40).
+# A run of fewer views than these makes more passes, so that it uses as many views in all, but no more than the second
+# number times the usual passes: 12 to 36 views, six volumes of 36^3, came to 32.0 / 44.0 dB in 3.7 s by 10 passes, and
+# to 32.9 / 44.5 in 6.5 s so (33.2 / 44.6 in 8.2 s by 40).
 _MANY_VIEWS, _MOST_TIMES = 45, 3.0
 # Steps of a small cloud cost little: with fewer seeds in matter than the second number a run makes more of them, by up
 # to the first, and a third as many more passes. Ten volumes of 26^3 to 34^3, steps of two views: 33.3 / 39.4 dB in 15
@@ -51,7 +51,7 @@ class Passes(Decision):
         )
 
     def ask(self, known: Known, lab: Lab) -> Answer:
-        """As many as are usual for so many views, and more of a small cloud."""
+        """The usual number for the views there are, and more of them for a small cloud."""
         problem = lab.problem
         passes = usual_passes(problem)
         more = longer(lab.support, known[SeedSpacing], problem)
@@ -72,7 +72,7 @@ def usual_passes(problem: Problem) -> float:
 
 
 def longer(support: int, spacing: float, problem: Problem) -> float:
-    """How many times as long the run of a cloud may be whose seeds lie so far apart in so many voxels."""
+    """Factor of the passes for a cloud of few seeds, which lie ``spacing`` apart in ``support`` voxels of matter."""
     seeds = cells(support, problem) / spacing**problem.dimensions
     most, many = _LONGER_PLANAR if problem.planar else _LONGER
     ratio = many / max(1.0, seeds)

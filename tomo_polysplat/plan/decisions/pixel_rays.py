@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 # Share of the run after which it is asked, and the steps of each way, but for more than this share of the run: the
 # first ones are spent on getting used to it.
 _FROM, _STEPS, _MOST = 0.4, 60, 0.2
-# So many times as long a step of averaged light may take, with two rays a pixel and axis.
+# Factor of the time of a step, at most, where light is averaged over two rays a pixel and axis.
 _SLOWER = 4.0
 # Rays at metal: they and their neighbours see this share of the most metal that any does.
 _SEEN = 0.05

@@ -29,8 +29,8 @@ from tomo_polysplat.start.levels import MAIN_SHARE, main_level, mass_level
 
 __all__ = ["Reference", "SoftReference", "lightness", "soft_reference"]
 
-# Objects of solid metal are so many times as dense as water at most (rods of silver: 180, of gold: 280): only beyond
-# is the unit of length in doubt.
+# Largest density of an object of solid metal, in those of water (rods of silver: 180, of gold: 280). The unit of length
+# is in doubt only beyond.
 _DENSEST = 600.0
 # Lighter than ten to the power of this less 1.5, that is a hundredth of water, nothing is that is not gas (foams have
 # 0.015 and more); in a unit a thousand times too long solids are.
@@ -55,7 +55,8 @@ _LIGHTER = 0.75
 # in the main: of rocks and parts, blurred and hardened, 0.68 and more; of a battery, circuit boards, a connector, whose
 # light matter the start hides, 0.54 and less.
 _ONE, _FACTOR = 0.6, 1.5
-# So many voxels an axis have a mean in which there is little noise, and what is so many times its deviation is matter.
+# Means are taken over this many voxels an axis, so that they hold little noise. What is more than the second number
+# times their deviation is matter.
 _ALIKE_VOXELS, _ABOVE_NOISE, _UPPER = 3, 3.0, 0.75
 # Water is taken after all where so large a share of the matter has about its density, all around it too, which edges of
 # pores have not: marrow in bone of 192^3, measured by bone, left 0.91 of bone's contrast, by water 0.99 (one seed).

@@ -14,7 +14,7 @@ from tomo_polysplat.settings import Settings
 
 __all__ = ["SupportLevel"]
 
-# An object whose main matter is lighter than so many soft references, foam or down, has its level of nothing lowered.
+# Where the main matter is lighter than this, in soft references, as in foam or down, the level of nothing is lowered.
 _LIGHT = 0.15
 
 

@@ -21,9 +21,9 @@ __all__ = ["TvCorner", "bodies", "corners_for", "share_alike", "tv_corners"]
 
 # What counts as the object where its smoothness is judged, in soft references, and how many voxels from metal.
 _BODY, _BESIDE_METAL = 0.3, 3
-# Differences of neighbouring voxels count in full up to so many soft references where nothing tells texture, and where
-# all is texture. That is told by the agreement of two halves of the views on their signs: from the first value to the
-# second, of soft matter and of dense matter, whose surfaces alone agree by as much. Chosen on the six scenes of the
+# Largest difference of neighbouring voxels that counts in full, in soft references: where nothing tells texture, and
+# where all is texture. That is told by the agreement of two halves of the views on their signs: from the first value to
+# the second, of soft matter and of dense matter, whose surfaces alone agree by as much. Chosen on the six scenes of the
 # bench and on slices of other simulators (broccoli, 256^3, with 0.1, 0.03 and 0.01: 33.5, 37.1 and 39.8 dB; pepper,
 # 64^3, with 0.02 and 0.01: 31.8 and 31.4; a hip with 0.1 and 0.03: 32.0 and 31.4).
 _SMOOTH, _TEXTURED = 0.1, 0.015

@@ -46,9 +46,9 @@ logger = logging.getLogger(__name__)
 
 # In thin objects less than the usual weight is taken where it leaves less than this of the held-out misfit.
 _CLEARLY = 0.97
-# In slices so many times the usual weight is tried, and taken where it leaves less of the held-out misfit. Eight slices
-# that gain 0.4 to 3.9 dB by it came to 0.79 to 0.92, one that loses 0.6 to 0.88, a laminate that loses 2.4 to 1.09
-# (docs/decisions/tv_factor.md). Of 24 to 36 views 18 slices gain, by 0.1 to 4.7 dB, and come to 0.67 to 0.98.
+# In slices this multiple of the usual weight is tried. It is taken where it leaves less of the held-out misfit. Eight
+# slices that gain 0.4 to 3.9 dB by it came to 0.79 to 0.92, one that loses 0.6 to 0.88, a laminate that loses 2.4 to
+# 1.09 (docs/decisions/tv_factor.md). Of 24 to 36 views 18 slices gain, by 0.1 to 4.7 dB, and come to 0.67 to 0.98.
 _TIMES = 3.0
 # A cloud that grows takes this share of the weight of smoothing: broccoli of 30^3, 34^3, 36^3 and 44^3 voxels, grown
 # fourfold, gains -0.5, -0.3, 0.7 and 1.7 dB with all of it, 0.6, 0.4, 1.3 and 2.2 with 0.3 of it; in twice the room it
@@ -128,7 +128,7 @@ def _describe_usual(known: Known, lab: Lab) -> str:
 
 
 def _left_by(factor: float, asking: Rays, known: Known, lab: Lab) -> float:
-    """Misfit of the held-out rays that a short fit with so many times the usual weight leaves."""
+    """Misfit of the held-out rays that a short fit leaves, with the usual weight multiplied by ``factor``."""
     passes, views, problem = _PASSES, lab.problem.geometry.views, lab.problem
     if problem.planar:
         passes = min(max(passes, _VIEWS_SEEN / views), 3 * passes)
