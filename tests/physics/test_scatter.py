@@ -7,7 +7,7 @@ import torch
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.beer_lambert import projection
 from tomo_polysplat.physics.quadrature import fit_quadrature
-from tomo_polysplat.physics.ray_estimates import estimate_scatter, matching_factor
+from tomo_polysplat.physics.ray_estimates import FittedRays, estimate_scatter, matching_factor
 from tomo_polysplat.physics.scatter import Scatter, add_scatter, light_around, made_level, without_scatter
 from tomo_polysplat.physics.spectral_change import with_voltage
 from tomo_polysplat.physics.spectrum import Spectrum
@@ -60,7 +60,9 @@ def test_scatter_is_found_although_the_matter_has_taken_some_of_it_up(scatter):
     measured = -np.log(total) + noise.normal(0.0, 0.003, light.shape)
     measured[::97] += 1.0  # rays that nothing explains
     thinner = areal * np.array([[0.97], [1.02], [0.95]])
-    found = estimate_scatter(thinner, measured, np.ones_like(measured), light, SPECTRUM, MATERIALS)
+    found = estimate_scatter(
+        FittedRays(thinner, measured, np.ones_like(measured), light), SPECTRUM, MATERIALS
+    )
     assert found.varies == scatter.varies
     np.testing.assert_allclose(beside(found, light), beside(scatter, light), atol=1.5e-3)
 
@@ -70,7 +72,7 @@ def test_rays_that_nothing_passes_tell_nothing():
     measured = value_of(rays(), FULL)
     measured = np.append(measured, np.full(5, 700.0))
     light = np.linspace(0.2, 1.0, len(measured))
-    found = estimate_scatter(areal, measured, np.ones_like(measured), light, SPECTRUM, MATERIALS)
+    found = estimate_scatter(FittedRays(areal, measured, np.ones_like(measured), light), SPECTRUM, MATERIALS)
     assert not found.varies and found.constant < 1e-3
 
 

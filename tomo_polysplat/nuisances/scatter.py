@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import torch
 
 from tomo_polysplat.nuisances.light_gate import light_gate
 from tomo_polysplat.nuisances.nuisance import Found, Nuisance, Parameter, Place, Verdict
 from tomo_polysplat.physics.base_materials import Materials
-from tomo_polysplat.physics.ray_estimates import estimate_scatter
+from tomo_polysplat.physics.ray_estimates import FittedRays, estimate_scatter
 from tomo_polysplat.physics.scatter import LARGEST_SCATTER, Scatter
 from tomo_polysplat.physics.spectrum import Spectrum
 
@@ -73,7 +72,7 @@ class ScatteredLight(Nuisance):
         cls,
         was: Scatter,
         level: float,
-        sample: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+        sample: FittedRays,
         spectrum: Spectrum,
         materials: Materials,
     ) -> dict[str, float]:
@@ -85,14 +84,13 @@ class ScatteredLight(Nuisance):
             That was assumed.
         level : float
             Constant scatter that the rays have in its place (`physics.scatter.made_level`).
-        sample : tuple of arrays
-            Areal densities, measured values, weights, and light around the rays, as `estimate_scatter` takes them.
+        sample : FittedRays
         spectrum : Spectrum
         materials : Materials
         """
-        found = estimate_scatter(*sample, spectrum, materials, level)
+        found = estimate_scatter(sample, spectrum, materials, level)
         new = Scatter(was.constant + found.constant - level, was.of_light + found.of_light)
-        light = torch.as_tensor(sample[3])
+        light = torch.as_tensor(sample.light)
         old, now = was.at(light), new.at(light)
         if float((now - old).abs().max()) <= max(LEAST_SCATTER, 0.02 * float(old.max())):
             return {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from tomo_polysplat.physics.materials import MaterialLike, mass_attenuation
 from tomo_polysplat.physics.scatter import LARGEST_SCATTER, Scatter
 from tomo_polysplat.physics.spectrum import Spectrum
 
-__all__ = ["estimate_scatter", "matching_factor"]
+__all__ = ["FittedRays", "estimate_scatter", "matching_factor"]
 
 _GAUSS_NEWTON_STEPS = 8
 # Scatter varies where that leaves so much less of the squared residuals: of constant one chance takes 0.2 % at most.
@@ -24,14 +25,27 @@ _HUBER_CORNER = 1.345
 _DEVIATION = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 
 
+class FittedRays(NamedTuple):
+    """What a fit makes of some rays, beside what was measured.
+
+    Attributes
+    ----------
+    areal : (curves, rays) array
+        Areal densities in g/cm2, of the first curve alone or of all.
+    measured, weight : (rays,) arrays
+        ``-log(I / I0)``, and what residuals are multiplied with.
+    light : (rays,) array
+        See `tomo_polysplat.physics.scatter.light_around`.
+    """
+
+    areal: np.ndarray
+    measured: np.ndarray
+    weight: np.ndarray
+    light: np.ndarray
+
+
 def estimate_scatter(
-    areal: np.ndarray,
-    measured: np.ndarray,
-    weight: np.ndarray,
-    light: np.ndarray,
-    spectrum: Spectrum,
-    materials: Materials,
-    start: float = 0.0,
+    sample: FittedRays, spectrum: Spectrum, materials: Materials, start: float = 0.0
 ) -> Scatter:
     """Scatter that explains the residuals of rays, at least one, best; it varies where that is needed.
 
@@ -40,17 +54,14 @@ def estimate_scatter(
 
     Parameters
     ----------
-    areal : (curves, rays) array
-        Areal densities in g/cm2 of a fit that assumed ``start``, of the first curve alone or of all.
-    measured, weight : (rays,) arrays
-        ``-log(I / I0)``, and what residuals are multiplied with.
-    light : (rays,) array
-        See `tomo_polysplat.physics.scatter.light_around`.
+    sample : FittedRays
+        Of a fit that assumed ``start``.
     spectrum : Spectrum
     materials : Materials
     start : float
         Constant scatter, as a fraction of the open beam.
     """
+    areal, measured, weight, light = sample
     lit = spectrum.weights > 0
     curves = materials.mass_attenuation(spectrum.energies[lit])[: len(areal)]
     value, share = shares(areal, np.log(spectrum.weights[lit]), curves)

@@ -55,9 +55,8 @@ def moved_scatter(last: ShortFit, problem: Problem) -> dict[str, float]:
     assert physics.spectrum is not None and physics.materials is not None
     if not len(rays.light):
         return {}
-    sample = (rays.areal, rays.measured, rays.weight, rays.light)
     model = (physics.spectrum, physics.materials)
-    return ScatteredLight.moved(physics.scatter, last.scatter_level, sample, *model)
+    return ScatteredLight.moved(physics.scatter, last.scatter_level, rays.fitted, *model)
 
 
 def moved_factor(name: str, last: ShortFit, soft_density: float, problem: Problem) -> dict[str, float]:

@@ -15,6 +15,7 @@ from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.plan.first_gaussians import first_gaussians
+from tomo_polysplat.plan.means import Means
 from tomo_polysplat.plan.model import rays_of, scene_of
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.trial import TOO_SHORT, fitted_shortly
@@ -99,6 +100,10 @@ class Lab:
         """The settings of the fit to come, with what the search for an agent has changed."""
         return self.plan.with_agent(self.settings)
 
+    def means(self, settings: Settings) -> Means:
+        """What a short fit under these settings may use."""
+        return Means(settings, self.time_budget, self.seed, self.device)
+
     def seeds(self, **assumed: Any) -> Gaussians:
         """Seeds of the plan, or of one with other values of some answers; made once, to be copied before a fit."""
         return self._seeded(self.plan.assuming(**assumed))[0]
@@ -125,8 +130,8 @@ class Lab:
         key = (settings, rays.held_out, plan.spacing, plan.sharp, self.seeding)
         if key not in self._trials:
             seeds = self._seeded(plan)[0].copy()
-            parts = (seeds, plan, self.problem, self.scene, rays, settings)
-            self._trials[key] = fitted_shortly(*parts, self.seed, self.time_budget)
+            parts = (seeds, plan, self.problem, self.scene, rays)
+            self._trials[key] = fitted_shortly(*parts, self.means(settings))
         outcome = self._trials[key]
         if outcome.stop is not None and outcome.stop.by_time:
             raise Untold(TOO_SHORT)

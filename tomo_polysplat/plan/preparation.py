@@ -6,8 +6,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import torch
-
 from tomo_polysplat.checks import fail, require_number
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays
@@ -22,6 +20,7 @@ from tomo_polysplat.plan.checkpoint import Checkpoint
 from tomo_polysplat.plan.decision import When
 from tomo_polysplat.plan.first_volume import first_volume
 from tomo_polysplat.plan.lab import Lab
+from tomo_polysplat.plan.means import Means
 from tomo_polysplat.plan.model import rays_of, scene_of
 from tomo_polysplat.plan.order import alternatives, decide, decide_start
 from tomo_polysplat.plan.plan import Plan
@@ -32,23 +31,14 @@ __all__ = ["PreparedFit", "RunOptions", "calibrate", "fit_start", "physics", "pr
 
 
 @dataclass(frozen=True)
-class RunOptions:
+class RunOptions(Means):
     """How a caller wants a scan fitted, checked.
 
     Attributes
     ----------
-    settings : Settings
-    time_budget : float or None
-        Seconds.
-    seed : int
-    device : torch.device
     callbacks : list of callables
     """
 
-    settings: Settings
-    time_budget: float | None
-    seed: int
-    device: torch.device
     callbacks: list[Callable[[FitState], Any]]
 
     @classmethod
@@ -166,9 +156,7 @@ def prepare(
 def fit_start(lab: Lab, settings: Settings, steps: int) -> ShortFit:
     """A short fit of the start of a ``lab`` under other settings."""
     assert lab.start is not None
-    return short_fit(
-        lab.problem, lab.start, {}, settings, lab.device, lab.seed, lab.time_budget, fewest_steps=steps
-    )
+    return short_fit(lab.problem, lab.start, {}, lab.means(settings), fewest_steps=steps)
 
 
 def _tell(plan: Plan, problem: Problem, facts: Mapping[str, tuple[Any, str]]) -> None:

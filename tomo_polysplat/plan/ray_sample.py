@@ -11,6 +11,7 @@ import torch
 from tomo_polysplat.fit.rays import Rays, batches_around, views_around
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.physics.ray_estimates import FittedRays
 from tomo_polysplat.physics.scatter import Scatter, light_around
 from tomo_polysplat.render.renderer import project_gaussians
 
@@ -49,6 +50,11 @@ class RaySample:
     light: np.ndarray
     view: np.ndarray
     photons: float = math.inf
+
+    @property
+    def fitted(self) -> FittedRays:
+        """What scatter is estimated from."""
+        return FittedRays(self.areal, self.measured, self.weight, self.light)
 
     @property
     def beside(self) -> np.ndarray:

@@ -16,6 +16,7 @@ from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.plan.depth import weights_by_depth
 from tomo_polysplat.plan.first_gaussians import first_gaussians
+from tomo_polysplat.plan.means import Means
 from tomo_polysplat.plan.model import rays_of, scene_of
 from tomo_polysplat.plan.order import plan_from_start
 from tomo_polysplat.plan.ray_sample import RaySample, sample_rays
@@ -78,10 +79,7 @@ def short_fit(
     problem: Problem,
     start: torch.Tensor,
     fitted: dict[str, float],
-    settings: Settings,
-    device: torch.device,
-    seed: int,
-    time_budget: float | None,
+    means: Means,
     fewest_steps: int = _FEWEST_STEPS,
     *,
     density: bool = False,
@@ -94,11 +92,10 @@ def short_fit(
         Under the physics that ``fitted`` states.
     start : (nz, ny, nx) tensor
         Its start volume on the device.
-    settings : Settings
-        Of the fit to come.
-    seed : int
-    time_budget : float or None
-        Seconds of the whole reconstruction.
+    fitted : dict
+        See `ShortFit`.
+    means : Means
+        Its settings are those of the fit to come.
     fewest_steps : int
         Steps of the optimiser at least.
     density : bool
@@ -109,6 +106,7 @@ def short_fit(
     KeyboardInterrupt
         After Ctrl-C: what a calibration has so far is no result.
     """
+    settings, device = means.settings, means.device
     # What is calibrated is judged by the areal densities of all three curves.
     plan = plan_from_start(start, problem, replace(settings, curves=3), device)
     passes = max(_PASSES, fewest_steps * views_of_short_steps(plan, problem) / problem.geometry.views)
@@ -117,13 +115,13 @@ def short_fit(
     scene, rays = scene_of(problem, plan, short, device), rays_of(problem, plan, short, device)
     seeds, _ = first_gaussians(start, plan, problem, short, device)
     short = replace(short, tv_weight=weights_by_depth(plan.depth, rays)[0] * settings.tv_weight)
-    outcome = fitted_shortly(seeds, plan, problem, scene, rays, short, seed, time_budget)
+    outcome = fitted_shortly(seeds, plan, problem, scene, rays, replace(means, settings=short))
     main = None
     with torch.no_grad():
         if density:
             volume = scene.volume(outcome.gaussians).cpu().numpy() * plan.reference
             main = main_density(volume, settings.metal_level * plan.reference)
-        sample = sample_rays(outcome.gaussians, scene, rays, seed)
+        sample = sample_rays(outcome.gaussians, scene, rays, means.seed)
         darkest = _darkest(outcome.gaussians, scene, rays, short)
     errors = [entry["held_out"] or entry["loss"] for entry in outcome.history] or [np.inf]
     level = problem.scatter_level(device)

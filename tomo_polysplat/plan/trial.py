@@ -13,8 +13,8 @@ from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.stopping import StopReason
 from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.plan.means import Means
 from tomo_polysplat.plan.plan import Plan
-from tomo_polysplat.settings import Settings
 
 __all__ = ["TOO_SHORT", "fitted_shortly", "views_of_short_steps"]
 
@@ -35,9 +35,7 @@ def fitted_shortly(
     problem: Problem,
     scene: FitScene,
     rays: Rays,
-    settings: Settings,
-    seed: int,
-    time_budget: float | None,
+    means: Means,
 ) -> FitOutcome:
     """Seeds fitted for the settings' passes, or for a share of the seconds of the whole reconstruction.
 
@@ -52,11 +50,11 @@ def fitted_shortly(
         plan.spacing * problem.voxel,
         rays,
         scene,
-        replace(settings, growth=1.0),
+        replace(means.settings, growth=1.0),
         views_per_step=views_of_short_steps(plan, problem),
-        rng=np.random.default_rng(seed),
+        rng=np.random.default_rng(means.seed),
         started=started,
-        deadline=None if time_budget is None else started + _SHARE_OF_BUDGET * time_budget,
+        deadline=None if means.time_budget is None else started + _SHARE_OF_BUDGET * means.time_budget,
         volume=lambda gaussians: scene.volume(gaussians).cpu().numpy(),
     )
     if outcome.stop is not None and outcome.stop.reason is StopReason.INTERRUPTED:

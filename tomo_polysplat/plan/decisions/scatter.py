@@ -120,8 +120,7 @@ def _most(rays: RaySample, problem: Problem, *, straight: bool) -> float:
     if straight:
         # Without hardening there are no areal densities in g/cm2; beside the object it shows all the same.
         return max(0.0, rays.beam() - 1.0)
-    sample = (rays.areal, rays.measured, rays.weight, rays.light)
-    scatter = estimate_scatter(*sample, spectrum, materials)
+    scatter = estimate_scatter(rays.fitted, spectrum, materials)
     return float(scatter.at(torch.as_tensor(rays.light)).max())
 
 
