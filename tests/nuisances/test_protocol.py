@@ -71,6 +71,12 @@ def test_rays_darker_than_scatter_exclude_it():
     assert ScatteredLight.gate(ERRORS | {"darker": 8, "rays": 100_000}).kept
 
 
+def test_scatter_is_suspected_where_the_beam_is_steady():
+    assert ScatteredLight.suspected({"most": 0.02, "drift": 0.003}).kept
+    for evidence in ({"most": 0.003, "drift": 0.0}, {"most": 0.02}, {"most": 0.02, "drift": 0.01}):
+        assert not ScatteredLight.suspected(evidence).kept
+
+
 def test_a_known_density_is_believed_unless_the_rays_contradict_it():
     inside = {"factor": 1.1, "least": 0.8, "most": 1.25}
     assert Filters.gate(inside | ERRORS | {"held_out_after": 1.05}).kept

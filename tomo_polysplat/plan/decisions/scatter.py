@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.nuisances.scatter import ScatteredLight
 from tomo_polysplat.physics.ray_estimates import estimate_scatter
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.decision import Decision, Known, When, is_number
@@ -28,13 +29,8 @@ logger = logging.getLogger(__name__)
 
 # Share of the run after which it is asked, and how many of the rays.
 _FROM, _RAYS = 0.3, 8000
-# Less scatter than this share of the open beam, in every ray, is none: 35 scans without any came to 0.003 at most, but
-# for a slice without metal, which short fits then told.
-_LEAST = 0.004
-# Beside the object, views that differ by more than this share of the most scatter tell of a drifting beam; and the rays
-# of a view that tell it, and the views.
-_DRIFT, _FEWEST_RAYS, _FEWEST_VIEWS = 0.3, 10, 5
-_ASKED = "calibrate=True fits it all the same"
+# Rays of a view beside the object that tell its light, and views that tell a drift.
+_FEWEST_RAYS, _FEWEST_VIEWS = 10, 5
 # Steps of the short fits that follow.
 _SHORT = 480
 
@@ -79,15 +75,8 @@ class Scattering(Decision):
         rays = sample_rays(fitter.gaussians, fitter.scene, fitter.rays, 0, _RAYS)
         most, drift = _most(rays, lab.problem, straight=fitter.scene.quadrature is None), _drift(rays)
         evidence = {"most": most} | ({} if drift is None else {"drift": drift})
-        if most < _LEAST:
-            return _none(f"the rays show {most:.1g} of the open beam at most", evidence)
-        if drift is None:
-            words = "too few rays pass beside the object to tell it from a drifting beam"
-            return _none(f"the rays may show {most:.2g} of the open beam, but {words}; {_ASKED}", evidence)
-        if drift > _DRIFT * most:
-            words = "the light beside the object differs from view to view, as that of a drifting beam does"
-            return _none(f"{words}; {_ASKED}", evidence)
-        return _by_short_fits(lab, most, evidence)
+        suspected = ScatteredLight.suspected(evidence)
+        return _by_short_fits(lab, most, evidence) if suspected.kept else _none(suspected.why, evidence)
 
 
 def _none(why: str, evidence: dict[str, float]) -> Answer:
