@@ -147,11 +147,11 @@ def lab_of_scan(scan, held_out):
 
 
 def test_a_spectrum_that_fits_worse_than_one_energy_is_named(caplog):
-    """A bare tube of 60 kV told for one of 90 kV with its filters."""
+    """A bare tube of 40 kV told for one of 90 kV with its filters."""
     scan = cone(metal=True)
     with caplog.at_level(logging.WARNING):
         good = reconstruct(scan)
         assert "spectrum does not fit" not in caplog.text and "spectrum_doubt" not in good.plan
-        bad = reconstruct(scan, spectrum=tps.Spectrum.from_tube(60, filters={}))
+        bad = reconstruct(scan, spectrum=tps.Spectrum.from_tube(40, filters={}))
     assert "spectrum does not fit" in caplog.text and "voltage" in bad.plan["spectrum_doubt"].why
     assert any("the spectrum" in words for words in doubts(bad.plan))
