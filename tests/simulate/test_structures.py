@@ -40,7 +40,8 @@ def test_a_scan_is_its_truth_projected_at_one_energy_and_hardens_at_many():
     seen = JosephProjector(geometry, grid).forward(scan.truth, np.arange(9)).transpose(1, 0, 2)
     thick = seen > 0.3
     assert np.median(scan.projections[thick] / seen[thick]) == pytest.approx(1.0, abs=0.02)
-    assert np.corrcoef(scan.projections[thick], seen[thick])[0, 1] > 0.995
+    assert np.abs(scan.projections - seen).max() < 0.2 * seen.max()
+    assert np.corrcoef(scan.projections.ravel(), seen.ravel())[0, 1] > 0.99
     many = scan_structure("bone", 23, 9, **options).projections
     thin, dense = (many[part].mean() / seen[part].mean() for part in ((seen > 0.02) & (seen < 0.1), thick))
     assert thin > 1.1 * dense
