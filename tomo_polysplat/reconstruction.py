@@ -291,7 +291,8 @@ def _result(
             "u": gaussians.material().cpu().numpy(),
         }
     curves = all_curves(problem, own, plan, about["settings"]["bone_level"])
-    if problem.polychromatic:
+    # Of the start, all matter is taken for soft.
+    if problem.polychromatic and outcome.start is None:
         counts = about["counts"]
         lightless = (counts["rays_not_finite"] + counts["rays_opaque"]) / counts["rays"]
         tell_impossible(curves, plan.facts, lightless)
