@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 # told a bare tube of 60 kV 0.43 to 1.22 and 0.46 to 1.55.
 _CLEARLY = 0.9
 # It takes a second start, which of more voxels is not cheap.
-_MOST_VOXELS = 1 << 27
+_MOST_VOXELS = 1 << 24
 
 
 def doubt_spectrum(
