@@ -88,7 +88,12 @@ def test_no_time_at_all_gives_the_start_itself():
     scan = fan(False)
     result = reconstruct(scan, time_budget=1e-6)
     assert result.plan["returned"].value == "start" and not result.gaussians
-    assert result.volume.min() >= 0 and rms(result.volume, scan) < 0.1 * scan.truth.max()
+    assert result.counts["gaussians"] == 0 and result.volume.min() >= 0
+    assert rms(result.volume, scan) < 0.1 * scan.truth.max()
+        result.counts["gaussians"] == 0
+        and result.volume.min() >= 0
+        and rms(result.volume, scan) < 0.1 * scan.truth.max()
+    )
 
 
 def test_a_fit_that_ends_worse_than_its_start_is_not_returned(caplog):

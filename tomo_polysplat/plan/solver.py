@@ -101,6 +101,8 @@ class Solver:
         if start is None:
             start = first_volume(problem, options.device, options.settings)[0].cpu()
         outcome.start = start
+        nothing = torch.empty(0, dtype=torch.int64, device=outcome.gaussians.position.device)
+        outcome.gaussians = outcome.gaussians.select(nothing)
         words = "the fit explains the rays no better, or too little to have regained what its seeds had lost"
         prepared.plan.note("returned", "start", f"{words}: the volume is the one that it began from")
         logger.warning("The start volume is returned: %s.", prepared.plan.facts["returned"].why)
