@@ -42,6 +42,7 @@ LAYERS = (
     ("plan",),
     ("result", "report"),
     ("reconstruction", "viewer"),
+    ("quality",),
     ("baselines", "bench", "cli", "doctor", "plugins"),
 )
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

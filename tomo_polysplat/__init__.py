@@ -21,11 +21,13 @@ _PUBLIC = {
     "Spectrum": "tomo_polysplat.physics.spectrum",
     "cone_geometry": "tomo_polysplat.scan.circular",
     "compare": "tomo_polysplat.baselines.comparison",
+    "contrast": "tomo_polysplat.quality.inserts",
     "load_scan": "tomo_polysplat.scan.io",
     "parallel_geometry": "tomo_polysplat.scan.circular",
     "polysplat": "tomo_polysplat.plugins.tomopy_plugin",
     "reconstruct": "tomo_polysplat.reconstruction",
     "register": "tomo_polysplat.plugins.hosts",
+    "resolution": "tomo_polysplat.quality.halves",
     "save_scan": "tomo_polysplat.scan.io",
     "simulate_scan": "tomo_polysplat.simulate.scenes",
 }

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tomo_polysplat.cli import bench_physics, bench_plan
+from tomo_polysplat.cli import bench_physics, bench_plan, bench_scale
 from tomo_polysplat.cli.options import add_solver_options
 from tomo_polysplat.files import write_text
 from tomo_polysplat.result.files import write_json
@@ -43,7 +43,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     hard.add_argument("--only", nargs="+", default=[], metavar="NAME", help="these cases (default: all)")
     spectrum, materials = bench_physics.add_parsers(what)
     plan = bench_plan.add_parser(what)
-    for child in (kernels, recon, accuracy, ablation, hard, spectrum, materials, plan):
+    scale = bench_scale.add_parser(what)
+    for child in (kernels, recon, accuracy, ablation, hard, spectrum, materials, plan, scale):
         child.add_argument(
             "--record",
             metavar="FOLDER",
@@ -138,6 +139,7 @@ def run(arguments: argparse.Namespace) -> int:
         "spectrum": partial(bench_physics.spectrum, write=_write, say=_say),
         "materials": partial(bench_physics.materials, write=_write, say=_say),
         "plan": partial(bench_plan.plan, write=_write, write_text=_write_text, say=_say),
+        "scale": partial(bench_scale.scale, write=_write, write_text=_write_text, say=_say),
     }
     return commands[arguments.what](arguments)
 

@@ -53,6 +53,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--overwrite", action="store_true", help="replace files that exist")
     parser.add_argument("--report", metavar="FILE", help="write a page about the reconstruction (.html)")
+    parser.add_argument(
+        "--halves",
+        action="store_true",
+        help="tell the resolution in the report, by fits of two halves of the views: as long again as the run",
+    )
+    parser.add_argument(
+        "--faint",
+        action="store_true",
+        help="tell in the report how much of a faint contrast is kept, by a fit with faint balls: as long again",
+    )
     parser.add_argument("--tiff", metavar="FOLDER", help="write the slices as TIFF")
     parser.add_argument("--json", metavar="FILE", help="write the plan, the counts and the errors as JSON")
     add_spectrum_options(parser)

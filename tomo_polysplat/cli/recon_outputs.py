@@ -11,6 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from tomo_polysplat.checks import fail, visible
 from tomo_polysplat.files import require_replaceable, require_room_for, require_writable
 from tomo_polysplat.result.files import write_json
@@ -32,6 +34,9 @@ def require_outputs(arguments: argparse.Namespace) -> None:
     kind = format_of(arguments.output, "--output")
     if not (kind.everything and arguments.tiff is not None):
         kind.require(hu=arguments.hu, bits=arguments.bits, argument="--output")
+    for name in ("halves", "faint"):
+        if getattr(arguments, name) and arguments.report is None:
+            raise fail(f"--{name}", "--report with it, where it is told", "none")
     if arguments.resume and arguments.checkpoint is None:
         raise fail("--resume", "--checkpoint with it", "none")
     written, folders = {}, {}
@@ -129,7 +134,7 @@ def _write_about(result: Result, scan: Scan, arguments: argparse.Namespace, fail
         _attempt(
             arguments.report,
             failures,
-            lambda: result.report(arguments.report, scan=scan, overwrite=overwrite, **known),
+            lambda: _report(result, scan, arguments, known),
         )
     if errors is not None:
         print(as_text([errors], result.unit))
@@ -138,6 +143,25 @@ def _write_about(result: Result, scan: Scan, arguments: argparse.Namespace, fail
         about = {name: getattr(result, name) for name in names}
         about |= {"scan": arguments.scan, "errors": errors}
         _attempt(arguments.json, failures, lambda: write_json(arguments.json, about, overwrite=overwrite))
+
+
+def _report(
+    result: Result, scan: Scan, arguments: argparse.Namespace, known: dict[str, np.ndarray | None]
+) -> None:
+    """The page, with what more fits tell where that was asked for."""
+    from tomo_polysplat.quality.halves import resolution
+    from tomo_polysplat.quality.inserts import contrast
+
+    device = arguments.device
+    result.report(
+        arguments.report,
+        scan=scan,
+        truth=known.get("truth"),
+        metal_mask=known.get("metal_mask"),
+        resolution=resolution(result, scan, device=device) if arguments.halves else None,
+        contrast=contrast(result, scan, device=device) if arguments.faint else None,
+        overwrite=arguments.overwrite,
+    )
 
 
 def _save(result: Result, arguments: argparse.Namespace) -> None:

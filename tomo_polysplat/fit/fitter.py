@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import itertools
 import math
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -23,6 +22,7 @@ from tomo_polysplat.fit.snapshot import Snapshot
 from tomo_polysplat.fit.soft_matter import flatten
 from tomo_polysplat.fit.step import step_rates
 from tomo_polysplat.fit.stopping import Clock
+from tomo_polysplat.kernels.compile_time import working_time
 from tomo_polysplat.kernels.spatial_order import spatial_order
 from tomo_polysplat.model.density_control import grow, relocate, splittable
 from tomo_polysplat.model.gaussians import OF_ALL, Gaussians
@@ -91,18 +91,24 @@ class Fitter:
             views = self._next_views(self.batch)
             self.step(views, share)
             clock.done += 1
+            clock.look_ahead(self._settle)
             made += 1
             if made == 1:
                 # The first step of a pass may wait for what lies between passes, and the first of all compiles.
-                begun = time.perf_counter()
+                begun = working_time()
             if made == self.steps_of_a_pass:
                 self.relocation_due = share < self.settings.relocate_until
                 if made > 1:
-                    self._learn_as_in(clock.expected_steps((time.perf_counter() - begun) / (made - 1)))
+                    self._learn_as_in(clock.expected_steps((working_time() - begun) / (made - 1)))
                 yield self._end_pass(share)
                 made = 0
         if made:
             yield self._end_pass(1.0)
+
+    def _settle(self) -> None:
+        device = self.gaussians.position.device
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
 
     def ahead(self, clock: Clock, passes: int) -> list[tuple[float, float, int]]:
         """What so many more passes gave, as `passes` tells it."""

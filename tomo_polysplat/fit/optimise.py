@@ -4,18 +4,28 @@ from __future__ import annotations
 
 import logging
 import math
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import torch
 
 from tomo_polysplat.fit.fitter import Fitter, views_of_a_pass
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.snapshot import Keeps
-from tomo_polysplat.fit.stopping import Clock, FitState, Stop, StopReason, Watch, is_true, usual_patience
+from tomo_polysplat.fit.stopping import (
+    Clock,
+    FitState,
+    Pace,
+    Stop,
+    StopReason,
+    Watch,
+    is_true,
+    usual_patience,
+)
+from tomo_polysplat.kernels.compile_time import working_time
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 
@@ -41,6 +51,8 @@ class FitOutcome:
         What ended the run.
     restart : anything, or None
         What a question found that the run is to begin anew with.
+    start : tensor or None
+        The volume that it began from, on the host, where that explains the rays better.
     """
 
     gaussians: Gaussians
@@ -49,6 +61,7 @@ class FitOutcome:
     relocated: int = 0
     stop: Stop | None = None
     restart: Any = None
+    start: torch.Tensor | None = None
 
     def counts(self) -> dict[str, int]:
         """What was skipped or held at a bound."""
@@ -104,7 +117,7 @@ class _Keeper(Run):
         outcome, clock = self.outcome, self.clock
         return {
             "steps": clock.done,
-            "seconds": time.perf_counter() - self.started,
+            "seconds": working_time() - self.started,
             "begun": clock.begun - self.started,
             "history": outcome.history,
             "skipped_pairs": outcome.skipped_pairs,
@@ -161,7 +174,7 @@ class _Keeper(Run):
 
     def _state(self, loss: float, held_out: float, volume: Callable[[Gaussians], np.ndarray]) -> FitState:
         gaussians, clock = self.fitter.gaussians, self.clock
-        seconds = time.perf_counter() - self.started
+        seconds = working_time() - self.started
         numbers = (seconds, clock.done, len(gaussians), loss, held_out, clock.share())
         return FitState(*numbers, lambda: volume(gaussians))
 
@@ -181,14 +194,15 @@ def fit(
     callbacks: Sequence[Callable[[FitState], Any]] = (),
     checkpoint: Keeps | None = None,
     between: Between | None = None,
+    pace: Pace | None = None,
 ) -> FitOutcome:
     """Fit Gaussians to rays.
 
-    Stops after ``settings.passes`` over the views, at ``deadline`` (``time.perf_counter`` seconds), when the held-out
+    Stops after ``settings.passes`` over the views, at ``deadline`` (seconds of ``working_time``), when the held-out
     rays have not improved for ``settings.patience`` passes (`usual_patience`), when a callback returns True, or on
     KeyboardInterrupt; returns the Gaussians that `Watch` holds for the best. Where ``checkpoint``
     holds a snapshot, ``gaussians`` are its own and the fit goes on from there. ``between`` is called
-    between passes, and asks what the plan left open.
+    between passes, and asks what the plan left open; ``pace`` is told early on what a deadline has room for.
     """
     if not len(gaussians):
         logger.warning("The start volume is empty: no Gaussians, a volume of zeros.")
@@ -203,7 +217,7 @@ def fit(
     run = _Keeper(
         Fitter(gaussians, spacing, rays, scene, settings, batch, steps, rng),
         # From now on: what compiling or recording the step took is no part of the run that the learning rates follow.
-        clock := Clock(steps, deadline),
+        clock := Clock(steps, deadline, pace),
         outcome=outcome,
         watch=watch,
         started=started,

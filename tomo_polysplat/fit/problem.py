@@ -175,6 +175,13 @@ class Problem:
         object.__setattr__(other, "_known", self._known)
         return other
 
+    def with_one_energy(self) -> Problem:
+        """The same measurements as if all photons had one energy; copies of them on devices serve both."""
+        other = replace(self, spectrum=None, materials=None, depth=self.length, scatter=Scatter(), beam=1.0)
+        known = _Known(self._known.copies, closed=self._known.closed, photons=self._known.photons)
+        object.__setattr__(other, "_known", known)
+        return other
+
     def soft_attenuation(self) -> float:
         """Attenuation in 1/unit of a density of 1 at the volume's energy; 1 for a monochromatic model."""
         if self.spectrum is None or self.materials is None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -11,11 +10,14 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
+from tomo_polysplat.kernels.compile_time import working_time
+
 __all__ = [
     "BY_TIME",
     "Clock",
     "FitState",
     "Fitted",
+    "Pace",
     "Stop",
     "StopReason",
     "Watch",
@@ -24,6 +26,8 @@ __all__ = [
 ]
 
 _Fitted = TypeVar("_Fitted", bound="Fitted")
+# Is told the share of a run that there is room for, and the seconds that it lacks.
+Pace = Callable[[float, float], Any]
 
 # The few held-out rays of one pass may fit well by chance, and a state long before the end would be kept: 35 runs on
 # 24^3 to 128^2 voxels missed 0.16 dB in the mean and 2.8 at most of their best pass, with means of four 0.05 and 0.6.
@@ -33,6 +37,8 @@ _IMPROVEMENT = 2e-3
 # Share of a run's passes, and passes at least, without improvement that end it. While the learning rates are high the
 # held-out error goes up and down: with 4 passes, runs of 20 ended after 8 and 10 (slices of 64^2: 19.4 for 23.2 dB).
 _PATIENCE, _LEAST_PATIENCE = 0.4, 4
+# Between the ends of these steps a run's pace is measured; what the first one waits for is not the pace.
+_PACED = (1, 4)
 
 
 class StopReason(str, Enum):
@@ -107,13 +113,14 @@ class FitState:
 class Clock:
     """How much of a run is done: of its steps or of its time, whichever ends first."""
 
-    def __init__(self, steps: int, deadline: float | None) -> None:
-        self.steps, self.deadline, self.begun, self.done = steps, deadline, time.perf_counter(), 0
+    def __init__(self, steps: int, deadline: float | None, tell: Pace | None = None) -> None:
+        self.steps, self.deadline, self.begun, self.done = steps, deadline, working_time(), 0
+        self._tell, self._settled = tell, self.begun
 
     @property
     def late(self) -> bool:
         """Whether the deadline has passed."""
-        return self.deadline is not None and time.perf_counter() >= self.deadline
+        return self.deadline is not None and working_time() >= self.deadline
 
     def share(self) -> float:
         """From 0 to 1.
@@ -125,15 +132,32 @@ class Clock:
             return by_steps
         if self.late:
             return 1.0
-        by_time = (time.perf_counter() - self.begun) / (self.deadline - self.begun)
+        by_time = (working_time() - self.begun) / (self.deadline - self.begun)
         return by_time if by_time > by_steps + 1 / self.steps else by_steps
 
     def expected_steps(self, seconds: float) -> int:
         """How many steps the run comes to where each of those left takes these ``seconds``."""
         if self.deadline is None:
             return self.steps
-        left = max(self.deadline - time.perf_counter(), 0.0)
+        left = max(self.deadline - working_time(), 0.0)
         return min(self.steps, self.done + math.ceil(left / max(seconds, 1e-9)))
+
+    def look_ahead(self, settle: Callable[[], Any]) -> None:
+        """After a few steps, tell what share of the run a deadline has room for, and seconds that it lacks.
+
+        ``settle`` waits until the steps that were asked for are done: a GPU makes them later.
+        """
+        first, last = _PACED
+        if self._tell is None or self.deadline is None or self.done not in _PACED:
+            return
+        settle()
+        now = working_time()
+        if self.done == last:
+            pace = max(now - self._settled, 1e-9) / (last - first)
+            left = max(self.deadline - now, 0.0)
+            room = (last + left / pace) / self.steps
+            self._tell(min(room, 1.0), max((self.steps - last) * pace - left, 0.0))
+        self._settled = now
 
     def allows(self, slower: float) -> bool:
         """Whether the steps left, slower than those so far by this factor, would end before the deadline."""
@@ -143,7 +167,7 @@ class Clock:
         """Whether these steps would end before the deadline."""
         if self.deadline is None:
             return True
-        now = time.perf_counter()
+        now = working_time()
         return now + steps * (now - self.begun) / max(self.done, 1) <= self.deadline
 
 

@@ -9,7 +9,6 @@ the object's main matter, where that is known.
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,6 +18,7 @@ import torch
 
 from tomo_polysplat.checks import fail, require_choice, require_number
 from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.kernels.compile_time import working_time
 from tomo_polysplat.nuisances.known import SPECTRAL
 from tomo_polysplat.nuisances.scatter import LEAST_SCATTER
 from tomo_polysplat.physics.spectral_change import tube_voltage
@@ -176,7 +176,7 @@ class _Trials:
     device: torch.device
     seed: int
     budget: float | None
-    begun: float = field(default_factory=time.perf_counter)
+    begun: float = field(default_factory=working_time)
     made: list[ShortFit] = field(default_factory=list)
 
     def made_under(self, fitted: Mapping[str, float]) -> ShortFit:
@@ -207,7 +207,7 @@ class _Trials:
         """See to it that no short fit so far was cut, and that one more, as long as they were, can be made."""
         if self.budget is None:
             return
-        spent, number = time.perf_counter() - self.begun, len(self.made)
+        spent, number = working_time() - self.begun, len(self.made)
         if self.made[-1].cut or spent * (number + 1) / number > _SHARE_OF_BUDGET * self.budget:
             raise Untold(TOO_SHORT)
 

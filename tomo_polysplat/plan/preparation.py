@@ -6,11 +6,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import torch
+
 from tomo_polysplat.checks import fail, require_number
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.stopping import FitState
+from tomo_polysplat.kernels.compile_time import track_compiling
 from tomo_polysplat.kernels.select import pick_fast_device
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.plan.answer import Answer, Status
@@ -49,6 +52,7 @@ class RunOptions(Means):
         chosen = make_settings(quality, settings)
         if time_budget is not None:
             time_budget = require_number("time_budget", time_budget, above=0)
+            track_compiling()
         return cls(chosen, time_budget, _whole(seed), pick_fast_device(device), _functions(callbacks))
 
     def to_dict(self) -> dict[str, Any]:
@@ -58,12 +62,13 @@ class RunOptions(Means):
 
 @dataclass(frozen=True)
 class PreparedFit:
-    """All that a fit starts from."""
+    """All that a fit starts from; under a time budget with the start volume on the host, to be fallen back to."""
 
     plan: Plan
     gaussians: Gaussians
     scene: FitScene
     rays: Rays
+    start: torch.Tensor | None = None
 
 
 def physics(
@@ -150,7 +155,8 @@ def prepare(
     plan.note("alternatives", alternatives(lab))
     if saved is not None:
         saved.plan = plan
-    return PreparedFit(plan, gaussians, scene, rays)
+    kept = None if run_options.time_budget is None else start.cpu()
+    return PreparedFit(plan, gaussians, scene, rays, kept)
 
 
 def fit_start(lab: Lab, settings: Settings, steps: int) -> ShortFit:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,13 +15,16 @@ from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.stopping import Stop, StopReason
 from tomo_polysplat.fit.surroundings import cut_out
+from tomo_polysplat.kernels.compile_time import working_time
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.plan.alignment import align, aligned
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.calibration import Calibration
 from tomo_polysplat.plan.checkpoint import Checkpoint
 from tomo_polysplat.plan.decision import When
+from tomo_polysplat.plan.first_volume import first_volume
 from tomo_polysplat.plan.lab import Lab
+from tomo_polysplat.plan.never_worse import judge, note_seeds
 from tomo_polysplat.plan.order import ask_between, decide
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.preparation import PreparedFit, RunOptions, calibrate, physics, prepare, under
@@ -45,7 +47,7 @@ class Solver:
     run_options : RunOptions
     saved : Checkpoint or None
     started : float
-        When the reconstruction began, in seconds of ``time.perf_counter``.
+        When the reconstruction began, in seconds of ``kernels.compile_time.working_time``.
     flipped : bool
         Whether callbacks get slices with row 0 at the largest y.
     moved : "auto", names of moves, or None
@@ -84,9 +86,26 @@ class Solver:
         plan.facts |= alignment
         prepared = prepare(problem, plan, self.run_options, self.saved, self.report)
         outcome = self._fit(prepared, problem, ask_scatter)
-        if outcome.restart is None:
-            return problem, prepared, outcome
-        return self._anew(problem, prepared, outcome)
+        if outcome.restart is not None:
+            problem, prepared, outcome = self._anew(problem, prepared, outcome)
+        self._judge(problem, prepared, outcome)
+        return problem, prepared, outcome
+
+    def _judge(self, problem: Problem, prepared: PreparedFit, outcome: FitOutcome) -> None:
+        """Fall back to the start where the fit explains the rays no better; the plan says how they are missed."""
+        options = self.run_options
+        behind = judge(outcome, prepared, problem, options)
+        if not behind:
+            return
+        start = prepared.start
+        if start is None:
+            start = first_volume(problem, options.device, options.settings)[0].cpu()
+        outcome.start = start
+        nothing = torch.empty(0, dtype=torch.int64, device=outcome.gaussians.position.device)
+        outcome.gaussians = outcome.gaussians.select(nothing)
+        words = "the fit explains the rays no better, or too little to have regained what its seeds had lost"
+        prepared.plan.note("returned", "start", f"{words}: the volume is the one that it began from")
+        logger.warning("The start volume is returned: %s.", prepared.plan.facts["returned"].why)
 
     def _aligned(self, problem: Problem) -> tuple[Problem, dict[str, Answer]]:
         """The problem by the scanner as it stood, and what the plan tells of that; a checkpoint's plan knows it."""
@@ -122,6 +141,7 @@ class Solver:
 
     def _fit(self, prepared: PreparedFit, problem: Problem, ask_scatter: bool) -> FitOutcome:
         plan, scene, run_options = prepared.plan, prepared.scene, self.run_options
+        note_seeds(prepared, problem, run_options)
         settings = plan.adapted(plan.with_agent(run_options.settings))
         return fit(
             prepared.gaussians,
@@ -137,7 +157,18 @@ class Solver:
             callbacks=[lambda state: self.report(state.share, state.describe()), *run_options.callbacks],
             checkpoint=self.saved,
             between=self._questions(prepared, problem, ask_scatter),
+            pace=lambda room, lacking: self._tell_pace(plan, room, lacking),
         )
+
+    def _tell_pace(self, plan: Plan, room: float, lacking: float) -> None:
+        """Say for how much of the run the time budget has room, at its beginning."""
+        budget = self.run_options.time_budget
+        if room >= 1:
+            plan.note("time_budget", room, "room for the whole run")
+            return
+        words = f"room for about {room:.0%} of the run; all of it would take about {lacking:.2g} s more"
+        plan.note("time_budget", room, words)
+        logger.warning("The time budget of %g s has %s. Fine detail will be missing.", budget, words)
 
     def _questions(self, prepared: PreparedFit, problem: Problem, ask_scatter: bool) -> Callable[[Run], None]:
         """What asks between two passes what the plan has left open; what need not be asked is answered now."""
@@ -163,7 +194,7 @@ class Solver:
             return None
         # A volume that takes most of the budget still needs a fit: then the end is late.
         end = self.started + budget
-        left = max(end - time.perf_counter(), 0.0)
+        left = max(end - working_time(), 0.0)
         volume = prepared.plan.growth * prepared.scene.seconds_of_basis(prepared.gaussians)
         return end - min(volume + _FINISHING, 0.5 * left)
 

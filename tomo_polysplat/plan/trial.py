@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +11,7 @@ from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.stopping import StopReason
+from tomo_polysplat.kernels.compile_time import working_time
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.plan.means import Means
 from tomo_polysplat.plan.plan import Plan
@@ -44,7 +44,7 @@ def fitted_shortly(
     KeyboardInterrupt
         After Ctrl-C: what was fitted so far is no result.
     """
-    started = time.perf_counter()
+    started = working_time()
     outcome = fit(
         seeds,
         plan.spacing * problem.voxel,

@@ -12,8 +12,10 @@ from tomo_polysplat.plan.answer import Answer, Status
 __all__ = [
     "RayPhysics",
     "decisions",
+    "doubts",
     "found_about_the_scanner",
     "how_it_ended",
+    "how_rays_are_missed",
     "in_words",
     "ray_physics",
     "rest_of_plan",
@@ -46,7 +48,10 @@ class RayPhysics:
 # What mattered, in the order in which a reader asks; and a sentence's subject for each.
 _TOLD = {
     "model": "The rays",
+    "rays": "How the rays are missed, in times their noise",
+    "returned": "What is returned",
     "spectrum": "The spectrum",
+    "spectrum_doubt": "Whether the spectrum fits",
     "water_correction": "The scanner's water correction",
     "alignment": "The scanner's geometry",
     "scatter": "Scatter",
@@ -65,6 +70,8 @@ _TOLD = {
     "growth": "The number of Gaussians, in those of the seeds",
     "tv_factor": "Smoothing, in times the usual",
     "passes": "Passes over the views",
+    "time_budget": "The time budget, as a share of the run",
+    "compiling": "Compiling, in seconds",
     "stop": "The end",
 }
 
@@ -105,6 +112,23 @@ def _of_nuisances(plan: Mapping[str, Answer]) -> dict[str, Any]:
 def how_it_ended(plan: Mapping[str, Answer]) -> str:
     """Why the run ended."""
     return plan["stop"].why if "stop" in plan else ""
+
+
+def how_rays_are_missed(plan: Mapping[str, Answer]) -> str:
+    """What the run itself found about the rays that it had not seen; empty where it found nothing."""
+    return f"The {plan['rays'].why}." if "rays" in plan else ""
+
+
+def doubts(plan: Mapping[str, Answer]) -> list[str]:
+    """What the run itself says is to be distrusted."""
+    found = []
+    if "returned" in plan:
+        found.append(f"whatever is finer than a filtered backprojection shows ({plan['returned'].why})")
+    elif "rays" in plan and plan["rays"].evidence.get("far"):
+        found.append(f"all of it, for the {plan['rays'].why}")
+    if "spectrum_doubt" in plan:
+        found.append(f"the spectrum ({plan['spectrum_doubt'].why})")
+    return found
 
 
 def rest_of_plan(plan: Mapping[str, Answer]) -> dict[str, Any]:

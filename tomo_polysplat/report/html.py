@@ -14,6 +14,7 @@ from tomo_polysplat.report import table as tables
 from tomo_polysplat.report.browse import browser
 from tomo_polysplat.report.classical import standard_volume
 from tomo_polysplat.report.decided import decisions, in_words, rest_of_plan
+from tomo_polysplat.report.detail import detail
 from tomo_polysplat.report.evidence import by_pixel_figure, by_view_figure
 from tomo_polysplat.report.figures import history_figure, png_bytes, slices_figure
 from tomo_polysplat.report.materials import histogram_figure
@@ -24,6 +25,8 @@ from tomo_polysplat.report.style import OURS, full_name
 from tomo_polysplat.report.verdict import verdict
 
 if TYPE_CHECKING:
+    from tomo_polysplat.quality.halves import Resolution
+    from tomo_polysplat.quality.inserts import Contrast
     from tomo_polysplat.result.result import Result
     from tomo_polysplat.scan.scan import Scan
 
@@ -41,6 +44,7 @@ def write_report(
     scan: Scan | None = None,
     truth: np.ndarray | None = None,
     metal_mask: np.ndarray | None = None,
+    found: tuple[Resolution | None, Contrast | None] = (None, None),
     overwrite: bool = False,
 ) -> None:
     """Write the page; see :meth:`tomo_polysplat.result.result.Result.report`."""
@@ -57,6 +61,7 @@ def write_report(
         *_slices(result, shown, true, metal),
         *_errors(result, volume, true, metal),
         *_rays(residuals),
+        *detail(*found),
         "<h2>What the voxels hold</h2>",
         image(png_bytes(histogram_figure(result)), "histogram of the attenuation with the materials named"),
         *_speed(result),

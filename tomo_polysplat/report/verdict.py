@@ -6,7 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tomo_polysplat.report.decided import found_about_the_scanner, how_it_ended
+from tomo_polysplat.report.decided import (
+    doubts,
+    found_about_the_scanner,
+    how_it_ended,
+    how_rays_are_missed,
+)
 
 if TYPE_CHECKING:
     from tomo_polysplat.report.residuals import Residuals
@@ -43,6 +48,8 @@ def explained(result: Result, residuals: Residuals | None) -> str:
             f"{residuals.within:.1%} of {residuals.rays:,} rays lie within three deviations, where noise alone would "
             f"leave {_NORMAL:.1%}."
         )
+    if told := how_rays_are_missed(result.plan):
+        return told
     known = [entry for entry in result.history if entry.get("held_out") is not None]
     if not known:
         return "How well the rays are explained was not recorded; give the report the scan to find out."
@@ -54,18 +61,19 @@ def explained(result: Result, residuals: Residuals | None) -> str:
 
 def distrusted(result: Result, residuals: Residuals | None) -> str:
     """What to distrust, and where."""
-    doubts = [] if residuals is None else _doubts_of_residuals(result, residuals)
-    doubts += _doubts_of_counts(result)
+    found = doubts(result.plan)
+    found += [] if residuals is None else _doubts_of_residuals(result, residuals)
+    found += _doubts_of_counts(result)
     ended = how_it_ended(result.plan)
     if "interrupted" in ended or "time budget" in ended:
-        doubts.append(f"all fine detail, for the run was cut short ({ended})")
-    if not doubts:
+        found.append(f"all fine detail, for the run was cut short ({ended})")
+    if not found:
         return (
             "Nothing stands out that ought to be distrusted."
             if residuals
             else "Of the rays, nothing was found."
         )
-    return f"Distrust {'; '.join(doubts)}."
+    return f"Distrust {'; '.join(found)}."
 
 
 def _doubts_of_residuals(result: Result, residuals: Residuals) -> list[str]:

@@ -19,6 +19,8 @@ from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.units import cm_per
 
 if TYPE_CHECKING:
+    from tomo_polysplat.quality.halves import Resolution
+    from tomo_polysplat.quality.inserts import Contrast
     from tomo_polysplat.scan.scan import Scan
 
 __all__ = ["Result"]
@@ -253,6 +255,8 @@ class Result:
         scan: Scan | None = None,
         truth: np.ndarray | None = None,
         metal_mask: np.ndarray | None = None,
+        resolution: Resolution | None = None,
+        contrast: Contrast | None = None,
         overwrite: bool = False,
     ) -> None:
         """Write one self-contained HTML page for a colleague: a verdict, slices, residuals, decisions, the record.
@@ -265,6 +269,8 @@ class Result:
             units of their noise, by view and by pixel. It takes the time of FDK and of one look at 180 views.
         truth, metal_mask : array shaped like :attr:`volume`, or None
             True attenuation in 1/`unit` at :attr:`energy_kev`, and voxels of metal, for figures of merit.
+        resolution, contrast : Resolution, Contrast, optional
+            What :func:`tomo_polysplat.resolution` and :func:`tomo_polysplat.contrast` have found of this result.
         overwrite : bool
             Whether an existing file is replaced.
 
@@ -277,7 +283,10 @@ class Result:
         """
         from tomo_polysplat.report.html import write_report
 
-        write_report(self, path, scan=scan, truth=truth, metal_mask=metal_mask, overwrite=overwrite)
+        found = (resolution, contrast)
+        write_report(
+            self, path, scan=scan, truth=truth, metal_mask=metal_mask, found=found, overwrite=overwrite
+        )
 
     def show(
         self,

@@ -14,7 +14,7 @@ from tomo_polysplat.start.fdk import fdk, fits_fdk
 from tomo_polysplat.start.initial import FEW_VIEWS
 from tomo_polysplat.start.on_gpu import fdk_on_gpu
 
-__all__ = ["halves_agree"]
+__all__ = ["halves_agree", "places_of_views"]
 
 # Pairs of voxels that tell a chance from a rule.
 _FEWEST = 1000
@@ -51,7 +51,7 @@ def halves_agree(
         where no two volumes can be made by filtered backprojection, or not in reasonable time.
     """
     nothing: list[float | None] = [None] * len(bodies)
-    places = _places(geometry)
+    places = places_of_views(geometry)
     if places.max() + 1 < 2 * FEW_VIEWS:
         return nothing
     halves = []
@@ -65,7 +65,7 @@ def halves_agree(
     return [signs / pairs if pairs >= _FEWEST else None for signs, pairs in counted]
 
 
-def _places(geometry: Geometry) -> np.ndarray:
+def places_of_views(geometry: Geometry) -> np.ndarray:
     """(views,) places from which views are seen, counted round the axis; parallel rays are the same from both ends."""
     turn = np.arctan2(geometry.origin[:, 1], geometry.origin[:, 0])
     turn = np.mod(turn, np.pi if geometry.beam == "parallel" else 2 * np.pi)

@@ -1,0 +1,117 @@
+"""By how much a state of a fit misses rays, in units of their noise: of those held out, where these are enough."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from tomo_polysplat.fit.loss import misfit
+from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.settings import Settings
+
+__all__ = ["Misses", "misses"]
+
+# Rays that tell it to a few per cent, views looked at for them at least, and views looked at together.
+_ENOUGH, _VIEWS, _AT_ONCE = 1000, 24, 4
+# Where fewer are held out, the fitted ones are taken.
+_FEWEST = 20
+
+
+@dataclass(frozen=True)
+class Misses:
+    """How rays are missed.
+
+    Attributes
+    ----------
+    misfit, least : float
+        Mean of what the fit minimises, and what noise alone would leave of it.
+    times : float
+        Root mean square residual over the rays' noise; infinity for a scan that shows none.
+    allowed : float
+        The same over the noise and the error that the model is allowed (``settings.model_error``).
+    rays : int
+    held_out : bool
+        Whether the fit has not seen them.
+    """
+
+    misfit: float
+    least: float
+    times: float
+    allowed: float
+    rays: int
+    held_out: bool
+
+    @property
+    def excess(self) -> float:
+        """Misfit that noise does not explain."""
+        return max(self.misfit - self.least, 0.0)
+
+    def describe(self) -> str:
+        """Words after "the rays"."""
+        kept = "rays kept out of the fit" if self.held_out else "rays of the fit"
+        if math.isinf(self.times):
+            return f"{kept} are missed by {self.allowed:.2g} times the error that the model is allowed"
+        return f"{kept} are missed by {self.times:.2g} times their noise"
+
+
+@torch.no_grad()
+def misses(gaussians: Gaussians, scene: FitScene, rays: Rays, photons: float, settings: Settings) -> Misses:
+    """How Gaussians miss the rays of some views, evenly spread over the scan.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+    scene : FitScene
+    rays : Rays
+    photons : float
+        Of an unattenuated ray; the variance of -log(I/I0) of Poisson counts is exp(P)/photons. Infinity: no noise.
+    settings : Settings
+        For the misfit, and the model's error.
+    """
+    held_out = rays.held_out * len(rays.views) * _pixels(rays) >= _FEWEST
+    seen = [_some(gaussians, scene, rays, views, held_out) for views in _views(rays)]
+    predicted, measured, weight = (torch.cat(parts) for parts in zip(*seen))
+    variance = torch.exp(measured) / photons
+    drawn = torch.from_numpy(np.random.default_rng(0).standard_normal(len(measured), np.float32))
+    noisy = measured + drawn.to(measured) * variance.sqrt()
+    squares = (predicted - measured).double().square()
+    return Misses(
+        float(misfit(predicted, measured, weight, settings)),
+        float(misfit(noisy, measured, weight, settings)),
+        math.inf if math.isinf(photons) else _root(squares / variance),
+        _root(squares / (variance + settings.model_error**2)),
+        len(measured),
+        held_out,
+    )
+
+
+def _pixels(rays: Rays) -> int:
+    return rays.views.rows * rays.views.columns
+
+
+def _views(rays: Rays) -> list[np.ndarray]:
+    """Numbers of views that hold enough rays of those held out, a few at a time."""
+    a_view = max(rays.held_out, 1e-6) * _pixels(rays)
+    most = min(max(_VIEWS, math.ceil(_ENOUGH / a_view)), len(rays.views))
+    chosen = np.unique(np.linspace(0, len(rays.views) - 1, most).astype(int))
+    return [chosen[first : first + _AT_ONCE] for first in range(0, len(chosen), _AT_ONCE)]
+
+
+def _some(
+    gaussians: Gaussians, scene: FitScene, rays: Rays, views: np.ndarray, held_out: bool
+) -> list[torch.Tensor]:
+    """Predicted and measured values and weights of the rays of some views that are asked, on the host."""
+    chosen, measured, fitted, aside = rays.batch(views)
+    predicted, _ = scene.projections(gaussians, chosen)
+    weight = aside if held_out else fitted
+    used = weight > 0
+    return [part[used].cpu() for part in (predicted, measured, weight)]
+
+
+def _root(squares: torch.Tensor) -> float:
+    return math.sqrt(float(squares.mean())) if len(squares) else 0.0
