@@ -56,10 +56,11 @@ def run(arguments: argparse.Namespace) -> int:
     output = Path(arguments.output)
     require_replaceable(output, arguments.overwrite, "pass --overwrite", "--output")
     require_writable(output.parent, "--output")
+    stated = _stated(arguments)
     scan = scan_from(
         arguments,
         spectrum_from(arguments),
-        scanner=_stated(arguments) or None,
+        scanner=stated or None,
         rows=_numbers("--rows", arguments.rows, 2),
         columns=_numbers("--columns", arguments.columns, 2),
         views=_views(arguments.views),
@@ -76,6 +77,11 @@ def _stated(arguments: argparse.Namespace) -> dict[str, Any]:
     stated = {key: getattr(arguments, name) for name, key in names.items()}
     if arguments.parallel:
         stated["beam"] = "parallel"
+    if arguments.kvp is None and arguments.spectrum is None:
+        # The voltage stands in the scanner's own text, what else there is of the tube comes over it.
+        stated |= {"anode": arguments.anode, "filter": " + ".join(arguments.filter) or None}
+        stated["detector"] = arguments.detector
+        arguments.anode, arguments.filter, arguments.detector = None, [], None
     if arguments.angles is not None:
         try:
             stated["arc"] = float(arguments.angles)
