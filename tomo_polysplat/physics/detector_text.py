@@ -29,7 +29,13 @@ DETECTOR_NAMES = {
     "cdte": _Kind("cadmium telluride", 0.1, False),
     "gaas": _Kind("gallium arsenide", 0.05, False),
 }
-_OTHER_NAMES = {"si": "silicon", "gadox": "gos", "caesium iodide": "csi", "cesium iodide": "csi", "panel": "csi"}
+_OTHER_NAMES = {
+    "si": "silicon",
+    "gadox": "gos",
+    "caesium iodide": "csi",
+    "cesium iodide": "csi",
+    "panel": "csi",
+}
 _WAYS = {"counting": False, "integrating": True}
 _REMEDY = "such as csi:0.6mm, gos:0.2mm or cdte:1mm; counting:MATERIAL:0.5mm or integrating:MATERIAL:0.5mm for others"
 
@@ -69,7 +75,11 @@ def detector_parts(argument: str, text: str) -> dict[str, Any]:
     if way is None and len(words) > 1 and words[1][-1:].isdigit():
         raise fail(argument, "a thickness with its unit", repr(text), f"write {words[0]}:{words[1]}mm or cm")
     thickness = kind.usual_cm if kind and len(words) < 2 else length_in_cm(argument, words[1])
-    parts = {"integrating": integrating, "sensor": kind.sensor if kind else words[0], "thickness_cm": thickness}
+    parts = {
+        "integrating": integrating,
+        "sensor": kind.sensor if kind else words[0],
+        "thickness_cm": thickness,
+    }
     return parts if len(words) < 3 else parts | {"threshold_kev": _kev(argument, words[2])}
 
 

@@ -13,7 +13,9 @@ __all__ = ["FILTER_REMEDY", "filters_of", "require_filters"]
 
 logger = logging.getLogger(__name__)
 
-FILTER_REMEDY = "write a material and its thickness with a unit, such as 'Al 1mm' or 'Al 0.5mm + Cu 0.1mm', or 'none'"
+FILTER_REMEDY = (
+    "write a material and its thickness with a unit, such as 'Al 1mm' or 'Al 0.5mm + Cu 0.1mm', or 'none'"
+)
 _NUMBER = r"(?P<size>\d+(?:[.,]\d+)?)\s*(?P<unit>mm|um|µm|cm)"
 _NAME = r"(?P<name>[A-Za-z][A-Za-z0-9 ]*?)"
 _EITHER = (re.compile(rf"{_NAME}\s*[:=]?\s*{_NUMBER}"), re.compile(rf"{_NUMBER}\s*(?:of\s+)?{_NAME}"))

@@ -102,7 +102,8 @@ class Spectrum:
             ``"W"``, ``"Mo"``, ``"Rh"``, ``"Ag"``, ``"Cu"`` or ``"Au"``.
         filters : str or mapping, optional
             Everything between anode and sample, as ``"Al 1mm"`` or ``"Be 0.5mm + Cu 0.1mm"``, as ``{material: cm}``,
-            or ``{material: (cm, g/cm3)}`` for one without a known density. The tube's own window belongs here too, such as ``{"Be": 0.05, "Al":
+            or ``{material: (cm, g/cm3)}`` for one without a known density. The tube's
+            own window belongs here too, such as ``{"Be": 0.05, "Al":
             0.1}``: without any, the tube is bare and most of its photons are too soft for any sample. The log
             warns of that unless it is asked for, by ``{}``.
         detector : Detector or str, optional
@@ -311,5 +312,5 @@ def require_spectrum(argument: str, value: Any) -> Spectrum | None:
     """
     if value is None or isinstance(value, Spectrum):
         return value
-    remedy = "make one, as Spectrum.from_tube(90, filters='Al 1mm', detector='csi:0.6mm') or Spectrum(energies_kev, weights)"
+    remedy = "make one, as Spectrum.from_tube(90, filters='Al 1mm', detector='csi:0.6mm')"
     raise fail(argument, "a Spectrum or None", repr(value), remedy, TypeError)

@@ -29,7 +29,12 @@ __all__ = ["anode_symbol", "anodes", "tube_counts", "voltage_range"]
 _LINE_GROWTH = 1.63
 _END_POINT_POWER = 8  # of 1, 4, 8, 12, 16 the closest to SpekPy in between: 2e-4 of the peak, rms
 _ELEMENTS = {
-    **{"tungsten": "W", "wolfram": "W", "molybdenum": "Mo", "rhodium": "Rh", "silver": "Ag", "copper": "Cu"},
+    "tungsten": "W",
+    "wolfram": "W",
+    "molybdenum": "Mo",
+    "rhodium": "Rh",
+    "silver": "Ag",
+    "copper": "Cu",
     "gold": "Au",
 }
 _FIRST_CENTRE = 1.5  # keV; SpekPy gives nothing below 1 keV

@@ -12,8 +12,8 @@ import numpy as np
 
 from tomo_polysplat.checks import did_you_mean, fail, require_array, require_choice, require_number
 from tomo_polysplat.files import existing_file
-from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
 from tomo_polysplat.physics.filter_text import require_filters
+from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
 from tomo_polysplat.scan.readers.frames import TiffFrames
 from tomo_polysplat.scan.readers.picture_names import named_files
 from tomo_polysplat.scan.reading import INPUT_KINDS, ReadOptions

@@ -107,9 +107,7 @@ def marked_scan(
             Part(ellipsoid(MARKER, 0.15), "aluminium", 2.7),
         ]
     )
-    spectrum = Spectrum.from_tube(
-        at.kvp, filters={"Al": 0.1 * at.filter_mm}, detector="csi:0.6mm"
-    )
+    spectrum = Spectrum.from_tube(at.kvp, filters={"Al": 0.1 * at.filter_mm}, detector="csi:0.6mm")
     return scan_phantom(phantom, proj_geom, vol_geom, spectrum, Scanner(1e5, seed=seed), name="marker")
 
 
