@@ -19,8 +19,9 @@ class Detector:
     """Relative signal per photon as a function of its energy.
 
     Made by ``Detector.named``, ``Detector.photon_counting`` or ``Detector.energy_integrating``. A photon
-    that interacts in the sensor, with probability ``1 - exp(-mu t)``, gives one count, or a signal proportional to its whole
-    energy: escape of fluorescence and light yield that is not proportional are not modelled. Give
+    that interacts in the sensor, with probability ``1 - exp(-mu t)``, gives one count, or a signal
+    proportional to its whole energy: escape of fluorescence and light yield that is not proportional are not
+    modelled. Give
     ``Spectrum(energies, weights)`` with a measured response where they matter.
 
     Attributes

@@ -13,7 +13,7 @@ from tomo_polysplat.files import existing_file
 from tomo_polysplat.scan.data_exchange import scan_from_hdf5
 from tomo_polysplat.scan.data_exchange_writer import write_hdf5
 from tomo_polysplat.scan.npz import scan_from_npz, write_npz
-from tomo_polysplat.scan.readers import nxtomo
+from tomo_polysplat.scan.readers import cil_nexus, nxtomo
 from tomo_polysplat.scan.readers.part import Part
 from tomo_polysplat.scan.readers.recognise import acquisition_of
 from tomo_polysplat.scan.readers.scan_part import scan_part
@@ -135,7 +135,9 @@ def _reader_of_scans(path: Path) -> Callable[[Path, ReadOptions], Scan] | None:
         raise fail(
             "path", "a complete .npz archive", str(file), "it is truncated: copy or write the file again"
         )
-    return scan_from_hdf5 if start == b"\x89HDF" and not nxtomo.recognises(file) else None
+    if start != b"\x89HDF" or nxtomo.recognises(file) or cil_nexus.recognises(file):
+        return None
+    return scan_from_hdf5
 
 
 def save_scan(scan: Scan, path: str | os.PathLike, *, overwrite: bool = False) -> None:

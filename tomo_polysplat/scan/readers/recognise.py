@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.scan.readers import nikon, nxtomo, rtk, skyscan, tiff_stack
+from tomo_polysplat.scan.readers import cil_nexus, nikon, nxtomo, picture_stack, rtk, skyscan
 from tomo_polysplat.scan.readers.acquisition import Acquisition
 
 __all__ = ["acquisition_of"]
 
 # The first one that recognises what it is shown reads it: what any folder of pictures is comes last.
-READERS = (skyscan, nikon, nxtomo, rtk, tiff_stack)
+READERS = (skyscan, nikon, nxtomo, cil_nexus, rtk, picture_stack)
 
 
 def acquisition_of(path: Path, stated: Mapping[str, Any]) -> Acquisition:

@@ -14,7 +14,7 @@ from tomo_polysplat.checks import did_you_mean, fail, require_array, require_cho
 from tomo_polysplat.files import existing_file
 from tomo_polysplat.physics.filter_text import require_filters
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
-from tomo_polysplat.scan.readers.frames import TiffFrames
+from tomo_polysplat.scan.readers.picture_files import frames_of
 from tomo_polysplat.scan.readers.picture_names import named_files
 from tomo_polysplat.scan.reading import INPUT_KINDS, ReadOptions
 from tomo_polysplat.units import LENGTH_UNITS
@@ -23,7 +23,7 @@ __all__ = ["KEYS", "read_toml", "require_known", "stated_over", "view_degrees", 
 
 # Lengths are in `unit`; `arc` and `degrees` count counterclockwise seen from above, of the source about the object.
 KEYS = {
-    "projections": "TIFF files: a folder, a file of many pictures, or a pattern such as proj_*.tif",
+    "projections": "TIFF, .npy or EDF files: a folder, a file of many pictures, or a pattern such as proj_*.tif",
     "flats": "pictures without the object",
     "darks": "pictures without light",
     "unit": "of the lengths: mm (default), cm, um, m",
@@ -116,7 +116,7 @@ def stated_over(told: Acquisition, stated: Mapping[str, Any], folder: Path) -> A
         raise fail(sorted(given)[0], "nothing, as the file has the geometry of each view", "a value")
     for name in ("flats", "darks"):
         if name in stated:
-            told = replace(told, **{name: TiffFrames(named_files(folder, stated[name], name))})  # type: ignore[arg-type]
+            told = replace(told, **{name: frames_of(named_files(folder, stated[name], name))})  # type: ignore[arg-type]
     return replace(
         told,
         tube=tube,
