@@ -42,6 +42,7 @@ from tomo_polysplat.scan.scan import Scan
 from tomo_polysplat.scan.usable import usable_rays
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.transfer import to_host
+from tomo_polysplat.units import warn_of_unit
 
 __all__ = ["reconstruct"]
 
@@ -92,7 +93,8 @@ def reconstruct(
         The soft, middle and dense material whose curves the model mixes; water, aluminium, iron by default. One
         energy has no use for them, which the log says.
     unit : {"cm", "mm", "um", "m", "pixel"}
-        Unit of length of the geometries; the volume comes in 1/unit. "pixel" goes with no spectrum only.
+        Unit of length of the geometries; the volume comes in 1/unit. The log warns where none stands beside a spectrum.
+        "pixel" goes with no spectrum only.
     quality : {"fast", "balanced", "best"}
         Preset of the settings; none beside a whole ``Settings`` object.
     time_budget : float, optional
@@ -233,6 +235,8 @@ def _of_scan(
         if given is None:
             raise fail(name, "ASTRA's geometry beside an array of projections", "none", "or pass a Scan")
     assert proj_geom is not None and vol_geom is not None
+    if unit is None and spectrum is not None:
+        warn_of_unit("cm")
     return projections, proj_geom, vol_geom, (unit or "cm", spectrum, valid, correction)
 
 

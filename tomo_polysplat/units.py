@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import re
 
 from tomo_polysplat.checks import fail
 
-__all__ = ["LENGTH_UNITS", "cm_per", "length_in_cm"]
+__all__ = ["LENGTH_UNITS", "cm_per", "length_in_cm", "warn_of_unit"]
+
+logger = logging.getLogger(__name__)
 
 CM_PER_UNIT = {"m": 100.0, "cm": 1.0, "mm": 0.1, "um": 1e-4}
 
@@ -31,6 +34,15 @@ def cm_per(unit: str) -> float:
     if unit not in CM_PER_UNIT:
         raise fail("unit", f"one of {', '.join(LENGTH_UNITS)}", repr(unit))
     return CM_PER_UNIT[unit]
+
+
+def warn_of_unit(unit: str) -> None:
+    """Say which unit lengths are taken to be in, where nobody has told."""
+    logger.warning(
+        "No unit of length was given: lengths are taken to be in %s. Attenuations and densities are wrong by as much "
+        "as it is: pass unit='%s', or 'mm', 'um' or 'm' (--unit).",
+        *(unit, unit),
+    )
 
 
 def length_in_cm(argument: str, text: str) -> float:
