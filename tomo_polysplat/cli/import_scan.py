@@ -51,9 +51,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Read and write."""
-    from tomo_polysplat.scan.io import save_scan
+    from tomo_polysplat.scan.io import require_scan_name, save_scan
 
     output = Path(arguments.output)
+    require_scan_name(output, "--output")
     require_replaceable(output, arguments.overwrite, "pass --overwrite", "--output")
     require_writable(output.parent, "--output")
     stated = _stated(arguments)

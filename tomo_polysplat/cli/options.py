@@ -69,8 +69,14 @@ def _two_columns(path: str) -> tuple[Any, Any]:
     import numpy as np
 
     file = existing_file(path, "--spectrum")
-    with open(file, encoding="utf-8") as stream:
-        table = np.loadtxt((line.replace(",", " ") for line in stream), ndmin=2)
+    try:
+        with open(file, encoding="utf-8") as stream:
+            table = np.loadtxt((line.replace(",", " ") for line in stream), ndmin=2)
+    except ValueError as error:
+        remedy = "let lines of words begin with #"
+        raise fail(
+            "--spectrum", "two columns of numbers: keV and weight", f"{file} ({error})", remedy
+        ) from None
     if table.shape[1] != 2:
         raise fail("--spectrum", "two columns: keV and weight", f"{table.shape[1]} columns")
     return table[:, 0], table[:, 1]

@@ -102,6 +102,8 @@ def _line_integrals(
     rows, columns = data.shape[1:]
     white, dark = find_array(exchange, "data_white"), find_array(exchange, "data_dark")
     kind = _input_kind(data, white is not None, options.input)
+    if kind != "counts" and options.saturation is not None:
+        raise fail("saturation", "counts in the file", f"{kind}, which has none", "leave it out")
     flat = background = None
     if kind == "counts":
         if white is None:

@@ -25,7 +25,9 @@ from tomo_polysplat.scan.scan import Scan
 if TYPE_CHECKING:
     from tomo_polysplat.physics.spectrum import Spectrum
 
-__all__ = ["load_scan", "save_scan"]
+__all__ = ["load_scan", "require_scan_name", "save_scan"]
+
+_WRITERS: dict[str, Callable[..., None]] = {".npz": write_npz, ".h5": write_hdf5, ".hdf5": write_hdf5}
 
 
 def load_scan(
@@ -159,8 +161,13 @@ def save_scan(scan: Scan, path: str | os.PathLike, *, overwrite: bool = False) -
     ValueError
         For another ending.
     """
-    writers = {".npz": write_npz, ".h5": write_hdf5, ".hdf5": write_hdf5}
+    _WRITERS[require_scan_name(path)](scan, Path(path), overwrite=overwrite)
+
+
+def require_scan_name(path: str | os.PathLike, argument: str = "path") -> str:
+    """The ending of a name that a scan can be saved under; refuses others, before the work begins."""
     suffix = Path(path).suffix.lower()
-    if suffix not in writers:
-        raise fail("path", "a name ending in .npz, .h5 or .hdf5", str(path))
-    writers[suffix](scan, Path(path), overwrite=overwrite)
+    if suffix not in _WRITERS:
+        remedy = "a scan is no volume: `recon` writes those"
+        raise fail(argument, f"a name ending in {', '.join(_WRITERS)}", str(path), remedy)
+    return suffix
