@@ -68,7 +68,7 @@ def simulated(number: int) -> tuple[str, Scan]:
     scene, photons = str(rng.choice(list(SCENES))), float(PHOTONS[number // len(KINDS) % len(PHOTONS)])
     size, views = int(rng.integers(20, 41)), int(rng.integers(40, 121))
     where = geometry(kind, SCENES[scene].half_width, size, views)
-    spectrum = Spectrum.from_tube(90, filters={"Al": 0.1})
+    spectrum = Spectrum.from_tube(90, filters={"Al": 0.1}, detector="counting")
     scanner = Scanner(photons, 0.0 if photons < 1e3 else 3.0, 0.0, True, number)
     return kind, scan_phantom(
         scene_phantom(scene, bool(rng.random() < 0.5)), *where, spectrum, scanner, name=scene

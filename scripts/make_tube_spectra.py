@@ -21,11 +21,13 @@ import spekpy
 
 ANODE_ANGLE = 12.0  # degrees
 LINE_STEP = 0.1  # keV, fine enough to place the lines
-LOW_GRID = [*range(30, 60, 2)]  # the shape changes fastest with voltage here
+LOW_GRID = [*range(20, 60, 2)]  # the shape changes fastest with voltage here
 TUBES = {
-    "W": LOW_GRID + [*range(60, 226, 5)],
-    **dict.fromkeys(("Mo", "Rh", "Ag", "Cu"), [*range(30, 51, 2)]),  # SpekPy's range for these ends at 50 kVp
+    "W": LOW_GRID + [*range(60, 226, 5), *range(250, 451, 25)],
+    **dict.fromkeys(("Mo", "Rh", "Ag", "Cu", "Au"), [*range(20, 51, 2)]),  # SpekPy's end at 50 kVp
 }
+# Lines that are merged are at their mean energy over these voltages.
+MEAN_OVER = (30, 225)
 OUTPUT = Path(__file__).resolve().parents[1] / "tomo_polysplat" / "physics" / "data" / "tube_spectra.npz"
 
 
@@ -53,7 +55,8 @@ def lines(anode: str, voltages: list[int]) -> tuple[np.ndarray, np.ndarray]:
         np.add.at(counts[row], np.floor(energies).astype(int), fluence * LINE_STEP)
         np.add.at(moments[row], np.floor(energies).astype(int), fluence * LINE_STEP * energies)
     used = np.flatnonzero(counts.sum(axis=0) > 0)
-    kev = moments.sum(axis=0)[used] / counts.sum(axis=0)[used]
+    usual = [MEAN_OVER[0] <= kvp <= MEAN_OVER[1] for kvp in voltages]
+    kev = moments[usual].sum(axis=0)[used] / counts[usual].sum(axis=0)[used]
     return kev.astype(np.float32), counts[:, used].astype(np.float32)
 
 

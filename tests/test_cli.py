@@ -181,7 +181,7 @@ def test_check_describes_a_scan(scan_file, capsys):
         (["-o", "x.h5", "--spectrum", "s.txt", "--anode", "W"], "--spectrum: expected none of --kvp"),
         (["-o", "x.h5", "--energy", "60000"], "--energy: expected keV between"),
         (["-o", "x.h5", "--energy", "-4"], "--energy: expected a finite number > 0"),
-        (["-o", "x.h5", "--kvp", "90", "--filter", "Al"], "--filter: expected MATERIAL:CM"),
+        (["-o", "x.h5", "--kvp", "90", "--filter", "Al"], "--filter: expected a material and its thickness"),
         (["-o", "x.h5", "--kvp", "90", "--detector", "film"], "--detector: expected counting"),
         (["-o", "x.h5", "--kvp", "9000"], "kV"),
         (["-o", "x.h5", "--mono", "--energy", "60"], "--energy: expected a spectrum"),
@@ -219,7 +219,7 @@ def test_what_cannot_be_compared_with_the_truth_is_written_all_the_same(
 @pytest.mark.parametrize("options, told", [([], True), (["--filter", "Al:0.1"], False)])
 def test_a_tube_without_a_filter_is_told(scan_file, tmp_path, solver, caplog, options, told):
     assert main(["recon", str(scan_file), "-o", str(tmp_path / "x.h5"), "--kvp", "90", *options]) == 0
-    assert ("--filter Al:0.1" in caplog.text) == told
+    assert ("--filter 'Al 1mm'" in caplog.text) == told
 
 
 def test_a_missing_or_damaged_scan_is_status_2(tmp_path, capsys):

@@ -15,8 +15,12 @@ SMALL = {
     "03_astra_cone_geometry": {"SIZE, VIEWS, QUALITY = 40, 120": "SIZE, VIEWS, QUALITY = 20, 48"},
     "04_spectrum_and_materials": {"SIZE, VIEWS, QUALITY = 40, 120": "SIZE, VIEWS, QUALITY = 32, 60"},
     "05_speed_against_error": {
-        "SIZE, VIEWS, BUDGETS = 40, 120, (3.0, 10.0)": "SIZE, VIEWS, BUDGETS = 20, 40, (1.0, 2.0)"
+        "SIZE, VIEWS, PASSES = 40, 120, (10, 40)": "SIZE, VIEWS, PASSES = 16, 32, (2, 4)"
     },
+    "06_against_other_methods": {
+        'SIZE, VIEWS, QUALITY = 40, 120, "balanced"': 'SIZE, VIEWS, QUALITY = 16, 32, "fast"'
+    },
+    "07_skyscan_to_imagej": {'VIEWS, QUALITY = 48, "balanced"': 'VIEWS, QUALITY = 24, "fast"'},
 }
 
 

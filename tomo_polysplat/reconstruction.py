@@ -44,6 +44,7 @@ from tomo_polysplat.scan.measurement import Measurement
 from tomo_polysplat.scan.usable import usable_rays
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.transfer import to_host
+from tomo_polysplat.units import warn_of_unit
 
 __all__ = ["reconstruct"]
 
@@ -94,7 +95,8 @@ def reconstruct(
         The soft, middle and dense material whose curves the model mixes; water, aluminium, iron by default. One
         energy has no use for them, which the log says.
     unit : {"cm", "mm", "um", "m", "pixel"}
-        Unit of length of the geometries; the volume comes in 1/unit. "pixel" goes with no spectrum only.
+        Unit of length of the geometries; the volume comes in 1/unit. The log warns where none stands beside a spectrum.
+        "pixel" goes with no spectrum only.
     quality : {"fast", "balanced", "best"}
         Preset of the settings; none beside a whole ``Settings`` object.
     time_budget : float, optional
@@ -162,6 +164,8 @@ def reconstruct(
     started, compiled = working_time(), compiled_seconds()
     measured = Measurement(projections, proj_geom, vol_geom, unit, spectrum, valid, water_correction).filled()
     proj_geom, vol_geom = measured.geometries()
+    if measured.unit is None and measured.spectrum is not None:
+        warn_of_unit("cm")
     unit, water_correction = measured.unit or "cm", measured.water_correction
     spectrum = require_spectrum("spectrum", measured.spectrum)
     geometry, grid = from_astra(proj_geom, vol_geom)

@@ -54,3 +54,14 @@ def test_iron_in_a_unit_ten_times_too_short(unit, told, caplog):
     with caplog.at_level(logging.WARNING):
         result = tps.reconstruct(*disc("iron", spectrum), spectrum=spectrum, unit=unit, settings=QUICK)
     assert ("lengths" in result.plan) == told == ("which no solid has" in caplog.text)
+
+
+@pytest.mark.parametrize("given, told", [({}, True), ({"unit": "cm"}, False)])
+def test_lengths_of_no_unit_beside_a_spectrum_are_told(given, told, caplog):
+    spectrum = tps.Spectrum.from_tube(90, filters="Al 1mm", detector="counting")
+    with caplog.at_level(logging.WARNING):
+        tps.reconstruct(*disc("water", spectrum), spectrum=spectrum, settings=QUICK, **given)
+    assert ("lengths are taken to be in cm" in caplog.text) == told
+    caplog.clear()
+    tps.reconstruct(*disc("water", spectrum), settings=QUICK)
+    assert "lengths are taken" not in caplog.text  # one energy: any unit will do

@@ -6,7 +6,7 @@ import tifffile
 from folders import marked, require_the_same_volume
 
 import tomo_polysplat as tps
-from tomo_polysplat.scan.readers.filter_text import filters_of
+from tomo_polysplat.physics.filter_text import filters_of
 from tomo_polysplat.simulate.folders.scene import pictures_of
 from tomo_polysplat.simulate.folders.skyscan import log_text
 from tomo_polysplat.simulate.folders.tiffs import write_pictures

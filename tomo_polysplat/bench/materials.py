@@ -92,7 +92,7 @@ class MaterialsBench:
     @property
     def spectrum(self) -> Spectrum:
         """The tube behind its filter."""
-        return Spectrum.from_tube(self.kvp, filters={"Al": self.aluminium_cm})
+        return Spectrum.from_tube(self.kvp, filters={"Al": self.aluminium_cm}, detector="counting")
 
 
 def run_materials_bench(

@@ -61,7 +61,7 @@ class PlanScan:
         if self.lines:
             spectrum = Spectrum(np.array(self.lines), np.full(len(self.lines), 1 / len(self.lines)))
         else:
-            spectrum = Spectrum.from_tube(90, filters={"Al": 0.1})
+            spectrum = Spectrum.from_tube(90, filters={"Al": 0.1}, detector="counting")
         phantom = scene_phantom(self.scene, self.metal)
         geometries = circular_orbit("cone", half, count, pixels, pixels, angles)
         return scan_phantom(phantom, *geometries, spectrum, Scanner(1e5, 3.0, 0.0, True, seed))

@@ -60,7 +60,7 @@ class Case:
     def spectrum(self) -> Spectrum:
         """The spectrum that the reconstruction is given."""
         filters = {"Al": self.filtration * _FILTER}
-        return Spectrum.from_tube(self.kvp * _KVP, filters=filters, detector=self.detector)
+        return Spectrum.from_tube(self.kvp * _KVP, filters=filters, detector=self.detector or "counting")
 
 
 CASES = {

@@ -51,15 +51,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Read and write."""
-    from tomo_polysplat.scan.io import save_scan
+    from tomo_polysplat.scan.io import require_scan_name, save_scan
 
     output = Path(arguments.output)
+    require_scan_name(output, "--output")
     require_replaceable(output, arguments.overwrite, "pass --overwrite", "--output")
     require_writable(output.parent, "--output")
+    stated = _stated(arguments)
     scan = scan_from(
         arguments,
         spectrum_from(arguments),
-        scanner=_stated(arguments) or None,
+        scanner=stated or None,
         rows=_numbers("--rows", arguments.rows, 2),
         columns=_numbers("--columns", arguments.columns, 2),
         views=_views(arguments.views),
@@ -76,6 +78,11 @@ def _stated(arguments: argparse.Namespace) -> dict[str, Any]:
     stated = {key: getattr(arguments, name) for name, key in names.items()}
     if arguments.parallel:
         stated["beam"] = "parallel"
+    if arguments.kvp is None and arguments.spectrum is None:
+        # The voltage stands in the scanner's own text, what else there is of the tube comes over it.
+        stated |= {"anode": arguments.anode, "filter": " + ".join(arguments.filter) or None}
+        stated["detector"] = arguments.detector
+        arguments.anode, arguments.filter, arguments.detector = None, [], None
     if arguments.angles is not None:
         try:
             stated["arc"] = float(arguments.angles)

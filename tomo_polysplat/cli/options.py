@@ -10,7 +10,6 @@ from tomo_polysplat.checks import fail
 from tomo_polysplat.files import existing_file
 
 if TYPE_CHECKING:
-    from tomo_polysplat.physics.detector import Detector
     from tomo_polysplat.physics.spectrum import Spectrum
 
 __all__ = [
@@ -27,18 +26,18 @@ def add_spectrum_options(parser: argparse.ArgumentParser) -> None:
     """The x-ray spectrum: a tube with filters and a detector, or a table."""
     group = parser.add_argument_group("spectrum (used instead of the file's)")
     group.add_argument("--kvp", type=float, metavar="KV", help="tube voltage in kV")
-    group.add_argument("--anode", help="anode: W, Mo, Rh, Ag or Cu (default: W)")
+    group.add_argument("--anode", help="anode: W, Mo, Rh, Ag, Cu or Au (default: W)")
     group.add_argument(
         "--filter",
         action="append",
         default=[],
-        metavar="MATERIAL:CM",
-        help="filter and its thickness in cm, such as Al:0.1; may be repeated",
+        metavar="TEXT",
+        help="what the beam passes before the object, such as 'Al 1mm', or none; may be repeated (Al:0.1 is in cm)",
     )
     group.add_argument(
         "--detector",
-        metavar="KIND",
-        help="counting, or integrating:SCINTILLATOR:CM such as integrating:CsI:0.06 (default: counting)",
+        metavar="NAME:THICKNESS",
+        help="such as csi:0.6mm, gos:0.2mm, luag:0.1mm, silicon:0.3mm, cdte:1mm, or counting (default)",
     )
     group.add_argument(
         "--spectrum", metavar="FILE", help="detected spectrum as text: energy in keV and weight on each line"
@@ -47,6 +46,8 @@ def add_spectrum_options(parser: argparse.ArgumentParser) -> None:
 
 def spectrum_from(arguments: argparse.Namespace) -> Spectrum | None:
     """The spectrum that the options describe, or None."""
+    from tomo_polysplat.physics.detector import Detector
+    from tomo_polysplat.physics.filter_text import require_filters
     from tomo_polysplat.physics.spectrum import Spectrum
 
     tube = {name: value for name in ("anode", "filter", "detector") if (value := getattr(arguments, name))}
@@ -58,43 +59,27 @@ def spectrum_from(arguments: argparse.Namespace) -> Spectrum | None:
         for name in tube:
             raise fail(f"--{name}", "--kvp with it", "no --kvp")
         return None
-    filters = dict(_filter(text) for text in arguments.filter)
-    return Spectrum.from_tube(
-        arguments.kvp, arguments.anode or "W", filters or None, _detector(arguments.detector or "counting")
-    )
+    filters = require_filters("--filter", " + ".join(arguments.filter)) if arguments.filter else None
+    named = arguments.detector
+    detector = None if named is None else Detector.named(named, "--detector")
+    return Spectrum.from_tube(arguments.kvp, arguments.anode or "W", filters, detector)
 
 
 def _two_columns(path: str) -> tuple[Any, Any]:
     import numpy as np
 
     file = existing_file(path, "--spectrum")
-    with open(file, encoding="utf-8") as stream:
-        table = np.loadtxt((line.replace(",", " ") for line in stream), ndmin=2)
+    try:
+        with open(file, encoding="utf-8") as stream:
+            table = np.loadtxt((line.replace(",", " ") for line in stream), ndmin=2)
+    except ValueError as error:
+        remedy = "let lines of words begin with #"
+        raise fail(
+            "--spectrum", "two columns of numbers: keV and weight", f"{file} ({error})", remedy
+        ) from None
     if table.shape[1] != 2:
         raise fail("--spectrum", "two columns: keV and weight", f"{table.shape[1]} columns")
     return table[:, 0], table[:, 1]
-
-
-def _filter(text: str) -> tuple[str, float]:
-    material, _, thickness = text.partition(":")
-    try:
-        return material, float(thickness)
-    except ValueError:
-        raise fail("--filter", "MATERIAL:CM, such as Al:0.1", repr(text)) from None
-
-
-def _detector(text: str) -> Detector:
-    from tomo_polysplat.physics.detector import Detector
-
-    kind, *rest = text.split(":")
-    if kind == "counting" and not rest:
-        return Detector.photon_counting()
-    try:
-        if kind == "integrating" and len(rest) == 2:
-            return Detector.energy_integrating(rest[0], float(rest[1]))
-    except ValueError as error:
-        raise fail("--detector", "a scintillator and its thickness in cm", f"{text!r} ({error})") from None
-    raise fail("--detector", "counting or integrating:SCINTILLATOR:CM", repr(text))
 
 
 def add_scan_options(parser: argparse.ArgumentParser) -> None:

@@ -39,6 +39,16 @@ class Parser(argparse.ArgumentParser):
         words = f"{value!r}: {meant} " if meant else f"{value!r}: "
         raise argparse.ArgumentError(action, f"{words}expected one of {', '.join(names)}")
 
+    def _get_value(self, action: argparse.Action, arg_string: str) -> Any:
+        """What an option's text means; of a number that is none it is told what one looks like."""
+        try:
+            return super()._get_value(action, arg_string)  # type: ignore[misc]
+        except argparse.ArgumentError:
+            if action.type not in (float, int):
+                raise
+            expected = "a whole number" if action.type is int else "a number without a unit, such as 2.5"
+            raise argparse.ArgumentError(action, f"expected {expected}, got {arg_string!r}") from None
+
 
 def _meant(unknown: Sequence[str], options: Iterable[str]) -> str:
     """What the first unknown option was probably meant to be."""

@@ -38,10 +38,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Simulate and write."""
-    from tomo_polysplat.scan.io import save_scan
+    from tomo_polysplat.scan.io import require_scan_name, save_scan
     from tomo_polysplat.simulate.scenes import scan_bytes, simulate_scan
 
     output = Path(arguments.output)
+    require_scan_name(output, "--output")
     require_replaceable(output, arguments.overwrite, "pass --overwrite", "--output")
     require_writable(output.parent, "--output")
     require_room(output.parent, scan_bytes(arguments.size, arguments.views, arguments.geometry))

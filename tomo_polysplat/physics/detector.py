@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from tomo_polysplat.checks import fail, require_number
+from tomo_polysplat.physics.detector_text import detector_parts
 from tomo_polysplat.physics.materials import composition, density, mass_attenuation, require_energies
 
 __all__ = ["Detector"]
@@ -17,9 +18,10 @@ __all__ = ["Detector"]
 class Detector:
     """Relative signal per photon as a function of its energy.
 
-    Made by ``Detector.photon_counting`` or ``Detector.energy_integrating``. A photon that interacts in the
-    sensor, with probability ``1 - exp(-mu t)``, gives one count, or a signal proportional to its whole
-    energy: escape of fluorescence and light yield that is not proportional are not modelled. Give
+    Made by ``Detector.named``, ``Detector.photon_counting`` or ``Detector.energy_integrating``. A photon
+    that interacts in the sensor, with probability ``1 - exp(-mu t)``, gives one count, or a signal
+    proportional to its whole energy: escape of fluorescence and light yield that is not proportional are not
+    modelled. Give
     ``Spectrum(energies, weights)`` with a measured response where they matter.
 
     Attributes
@@ -51,6 +53,32 @@ class Detector:
             )
         elif self.thickness_cm > 0:
             raise fail("sensor", "a material with a thickness", "None", 'such as sensor="CdTe"')
+
+    @classmethod
+    def named(cls, text: str, argument: str = "detector") -> Detector:
+        """A detector by its usual name, such as ``"csi:0.6mm"``, ``"gos:0.2mm"``, ``"cdte:1mm:20kev"``, ``"counting"``.
+
+        Parameters
+        ----------
+        text : str
+            The name, the thickness of what absorbs the photons, and the threshold where it counts them, with colons
+            between: csi, gos, luag, yag and cdwo4 integrate the energy; silicon, cdte and gaas count. Any material
+            comes after ``counting:`` or ``integrating:``; these alone absorb all. A powder has less matter than its
+            thickness tells: give what its mass per area makes, about half.
+        argument : str
+            For errors.
+
+        Raises
+        ------
+        ValueError
+            For an unknown name or material, or what is no thickness.
+        """
+        try:
+            return cls(**detector_parts(argument, text))
+        except ValueError as error:
+            if str(error).startswith(f"{argument}:"):
+                raise
+            raise fail(argument, "a known material of some thickness", f"{text!r} ({error})") from None
 
     @classmethod
     def photon_counting(

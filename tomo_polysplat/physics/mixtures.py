@@ -142,6 +142,8 @@ NAMED: Mapping[str, tuple[float, str | Mapping[str, float]]] = {
     "cadmium telluride": (5.85, "CdTe"),
     "gallium arsenide": (5.32, "GaAs"),
     "cadmium tungstate": (7.90, "CdWO4"),
+    "lutetium aluminium garnet": (6.73, "Lu3Al5O12"),
+    "yttrium aluminium garnet": (4.55, "Y3Al5O12"),
 }
 
 ALIASES: Mapping[str, str] = {
@@ -161,6 +163,8 @@ ALIASES: Mapping[str, str] = {
     "cocr": "cobalt chrome",
     "gos": "gadolinium oxysulfide",
     "gadox": "gadolinium oxysulfide",
+    "luag": "lutetium aluminium garnet",
+    "yag": "yttrium aluminium garnet",
     "cesium iodide": "caesium iodide",
     "barium sulphate": "barium sulfate",
 }

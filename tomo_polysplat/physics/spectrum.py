@@ -10,15 +10,16 @@ import numpy as np
 
 from tomo_polysplat.checks import fail, require_array, require_number, require_shape
 from tomo_polysplat.physics.detector import Detector
+from tomo_polysplat.physics.filter_text import FILTER_REMEDY, require_filters
 from tomo_polysplat.physics.materials import density, mass_attenuation, require_energies
-from tomo_polysplat.physics.tube_tables import tube_counts
+from tomo_polysplat.physics.tube_tables import anode_symbol, tube_counts
 
 __all__ = ["Filters", "Spectrum", "require_energy_of", "require_spectrum"]
 
 logger = logging.getLogger(__name__)
 
-# material -> thickness in cm, or (thickness in cm, density in g/cm3)
-Filters = Mapping[str, float | tuple[float, float]]
+# material -> thickness in cm, or (thickness in cm, density in g/cm3); or words, such as "Al 1mm"
+Filters = Mapping[str, float | tuple[float, float]] | str
 
 _SUPPORT = 1e-4  # of the largest weight per keV; weaker ends do not count as support
 
@@ -85,23 +86,29 @@ class Spectrum:
 
     @classmethod
     def from_tube(
-        cls, kvp: float, anode: str = "W", filters: Filters | None = None, detector: Detector | None = None
+        cls,
+        kvp: float,
+        anode: str = "W",
+        filters: Filters | None = None,
+        detector: Detector | str | None = None,
     ) -> Spectrum:
         """Spectrum of an x-ray tube from the packaged tables (SpekPy, 12 degree anode).
 
         Parameters
         ----------
         kvp : float
-            Tube voltage, 30 to 225 kV for tungsten, 30 to 50 kV for the other anodes.
+            Tube voltage, 20 to 450 kV for tungsten, 20 to 50 kV for the other anodes.
         anode : str
-            ``"W"``, ``"Mo"``, ``"Rh"``, ``"Ag"`` or ``"Cu"``.
-        filters : mapping, optional
-            Everything between anode and sample as ``{material: cm}``, or ``{material: (cm, g/cm3)}`` for one
-            without a known density. The tube's own window belongs here too, such as ``{"Be": 0.05, "Al":
+            ``"W"``, ``"Mo"``, ``"Rh"``, ``"Ag"``, ``"Cu"`` or ``"Au"``.
+        filters : str or mapping, optional
+            Everything between anode and sample, as ``"Al 1mm"`` or ``"Be 0.5mm + Cu 0.1mm"``, as ``{material: cm}``,
+            or ``{material: (cm, g/cm3)}`` for one without a known density. The tube's
+            own window belongs here too, such as ``{"Be": 0.05, "Al":
             0.1}``: without any, the tube is bare and most of its photons are too soft for any sample. The log
             warns of that unless it is asked for, by ``{}``.
-        detector : Detector, optional
-            Response; None counts every photon.
+        detector : Detector or str, optional
+            Response, or its name as in :meth:`Detector.named`, such as ``"csi:0.6mm"``. None counts every photon, and
+            the log warns of that unless it is asked for, by ``"counting"``.
 
         Raises
         ------
@@ -109,32 +116,40 @@ class Spectrum:
             For a voltage or anode outside the tables, or an unknown filter material.
         """
         kvp = require_number("kvp", kvp)
+        anode = anode_symbol(anode)
         tube = cls(*tube_counts(kvp, anode), label=f"{kvp:g} kVp {anode} tube")
         if filters is None:
             logger.warning(
                 "No filter was given: the %s is bare, of %.0f keV in the mean. Pass what lies between anode and sample,"
-                " its window too, as filters={'Al': 0.1} or --filter Al:0.1 in cm; filters={} if there is nothing.",
+                " its window too, as filters='Al 1mm' or --filter 'Al 1mm'; filters={} or none if there is nothing.",
                 tube.label,
                 tube.effective_energy,
             )
+        if detector is None:
+            logger.warning(
+                "No detector was given: it is taken to count every photon, which a flat panel does not. Pass "
+                "detector='csi:0.6mm' or --detector csi:0.6mm, or whatever it is; 'counting' if it counts them."
+            )
         spectrum = tube.filtered({} if filters is None else filters)
-        return spectrum.detected(Detector.photon_counting() if detector is None else detector)
+        return spectrum.detected("counting" if detector is None else detector)
 
     def filtered(self, filters: Filters) -> Spectrum:
         """This spectrum behind more filters, each of which takes away ``exp(-mu t)``.
 
         Parameters
         ----------
-        filters : mapping
-            ``{material: cm}``, or ``{material: (cm, g/cm3)}`` for one without a known density.
+        filters : str or mapping
+            ``"Al 1mm"``, ``{material: cm}``, or ``{material: (cm, g/cm3)}`` for one without a known density.
 
         Raises
         ------
         ValueError, TypeError
             For an unknown material, a negative thickness, or what is no mapping.
         """
+        if isinstance(filters, str):
+            filters = require_filters("filters", filters)
         if not isinstance(filters, Mapping):
-            raise fail("filters", "a dict of material and cm", repr(filters), error=TypeError)
+            raise fail("filters", "a dict of material and cm", repr(filters), FILTER_REMEDY, TypeError)
         exponent = np.zeros_like(self._energies)
         for material, amount in filters.items():
             thickness, grams = amount if isinstance(amount, tuple) and len(amount) == 2 else (amount, None)
@@ -152,20 +167,23 @@ class Spectrum:
         amounts = [f"{f'{a[0]:g}' if isinstance(a, tuple) else f'{a:g}'} cm {m}" for m, a in filters.items()]
         return Spectrum(self._energies, weights, " + ".join([self._label, *amounts]))
 
-    def detected(self, detector: Detector) -> Spectrum:
+    def detected(self, detector: Detector | str) -> Spectrum:
         """This spectrum of photons as seen by a detector.
 
         Parameters
         ----------
-        detector : Detector
+        detector : Detector or str
+            A name is as in :meth:`Detector.named`.
 
         Raises
         ------
         ValueError, TypeError
             For a detector that sees none of it, or what is no `Detector`.
         """
+        if isinstance(detector, str):
+            detector = Detector.named(detector)
         if not isinstance(detector, Detector):
-            raise fail("detector", "a Detector", repr(detector), error=TypeError)
+            raise fail("detector", "a Detector or its name", repr(detector), "such as 'csi:0.6mm'", TypeError)
         weights = self._weights * detector.response(self._energies)
         if not weights.any():
             raise fail(
@@ -294,5 +312,5 @@ def require_spectrum(argument: str, value: Any) -> Spectrum | None:
     """
     if value is None or isinstance(value, Spectrum):
         return value
-    remedy = "make one, as Spectrum.from_tube(90, filters={'Al': 0.1}) or Spectrum(energies_kev, weights)"
+    remedy = "make one, as Spectrum.from_tube(90, filters='Al 1mm', detector='csi:0.6mm')"
     raise fail(argument, "a Spectrum or None", repr(value), remedy, TypeError)

@@ -2,8 +2,8 @@
 
 The tables (``data/tube_spectra.npz``, made by ``scripts/make_tube_spectra.py``) hold unfiltered spectra
 computed with SpekPy 2.5.4 (Poludniowski et al. 2021, doi:10.1002/mp.14945): model "casim", reflection target,
-anode angle 12 degrees, 1 keV bins, every 2 kVp up to 60 kVp and every 5 kVp above. Tungsten covers 30 to 225
-kVp, the other anodes 30 to 50.
+anode angle 12 degrees, 1 keV bins, every 2 kVp up to 60 kVp, every 5 kVp up to 225, every 25 above. Tungsten covers
+20 to 450 kVp, the other anodes 20 to 50.
 
 Between two tabulated voltages both parts are interpolated linearly, each after a change of variable that
 makes it nearly linear:
@@ -24,10 +24,19 @@ import numpy as np
 
 from tomo_polysplat.checks import require_choice, require_number
 
-__all__ = ["anodes", "tube_counts", "voltage_range"]
+__all__ = ["anode_symbol", "anodes", "tube_counts", "voltage_range"]
 
 _LINE_GROWTH = 1.63
 _END_POINT_POWER = 8  # of 1, 4, 8, 12, 16 the closest to SpekPy in between: 2e-4 of the peak, rms
+_ELEMENTS = {
+    "tungsten": "W",
+    "wolfram": "W",
+    "molybdenum": "Mo",
+    "rhodium": "Rh",
+    "silver": "Ag",
+    "copper": "Cu",
+    "gold": "Au",
+}
 _FIRST_CENTRE = 1.5  # keV; SpekPy gives nothing below 1 keV
 
 
@@ -43,9 +52,22 @@ def anodes() -> list[str]:
     return [name[: -len("_kvp")] for name in _tables() if name.endswith("_kvp")]
 
 
+def anode_symbol(name: str) -> str:
+    """The symbol of an anode's element, by which its tables are named, of ``"W"``, ``"w"`` or ``"tungsten"``.
+
+    Raises
+    ------
+    ValueError
+        For an anode without tables.
+    """
+    symbols = {symbol.lower(): symbol for symbol in anodes()}
+    known = _ELEMENTS.get(name.lower()) or symbols.get(name.lower()) if isinstance(name, str) else None
+    return known or require_choice("anode", name, anodes(), "else pass Spectrum(energies_kev, weights)")
+
+
 def voltage_range(anode: str = "W") -> tuple[float, float]:
     """Lowest and highest tube voltage (kVp) of an anode's tables."""
-    voltages = _tables()[f"{require_choice('anode', anode, anodes())}_kvp"]
+    voltages = _tables()[f"{anode_symbol(anode)}_kvp"]
     return float(voltages[0]), float(voltages[-1])
 
 
@@ -55,7 +77,7 @@ def tube_counts(kvp: float, anode: str = "W") -> tuple[np.ndarray, np.ndarray]:
     Parameters
     ----------
     kvp : float
-        Tube voltage in kV, within ``voltage_range(anode)``: 30 to 225 for tungsten.
+        Tube voltage in kV, within ``voltage_range(anode)``: 20 to 450 for tungsten.
     anode : str
         One of ``anodes()``.
 
@@ -78,6 +100,7 @@ def tube_counts(kvp: float, anode: str = "W") -> tuple[np.ndarray, np.ndarray]:
     kvp = require_number("kvp", kvp, at_least=lowest, at_most=highest, remedy=covered)
     edges = np.append(np.arange(1.0, np.ceil(kvp)), kvp)
     energies = 0.5 * (edges[1:] + edges[:-1])
+    anode = anode_symbol(anode)
     counts = _bremsstrahlung(kvp, anode, energies) * np.diff(edges)
     _add_lines(counts, energies, *_lines(kvp, anode))
     return energies, counts

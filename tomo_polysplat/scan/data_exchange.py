@@ -102,6 +102,8 @@ def _line_integrals(
     rows, columns = data.shape[1:]
     white, dark = find_array(exchange, "data_white"), find_array(exchange, "data_dark")
     kind = _input_kind(data, white is not None, options.input)
+    if kind != "counts" and options.saturation is not None:
+        raise fail("saturation", "counts in the file", f"{kind}, which has none", "leave it out")
     flat = background = None
     if kind == "counts":
         if white is None:
@@ -263,7 +265,7 @@ def _missing_theta(views: int) -> Exception:
 def _pixel_size(file: h5py.File, options: ReadOptions) -> tuple[float, str]:
     """Size of a pixel in the plane of the object, and its unit; ``(1, "pixel")`` when unknown."""
     if options.pixel_size is not None:
-        return options.pixel_size, options.unit or "cm"
+        return options.pixel_size, options.settled_unit(None, "cm")
     for path in PIXEL_SIZE_PATHS:
         dataset = find_array(file, path)
         if dataset is not None and dataset.size == 1:

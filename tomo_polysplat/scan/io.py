@@ -13,7 +13,7 @@ from tomo_polysplat.files import existing_file
 from tomo_polysplat.scan.data_exchange import scan_from_hdf5
 from tomo_polysplat.scan.data_exchange_writer import write_hdf5
 from tomo_polysplat.scan.npz import scan_from_npz, write_npz
-from tomo_polysplat.scan.readers import nxtomo
+from tomo_polysplat.scan.readers import cil_nexus, nxtomo
 from tomo_polysplat.scan.readers.part import Part
 from tomo_polysplat.scan.readers.recognise import acquisition_of
 from tomo_polysplat.scan.readers.scan_part import scan_part
@@ -25,7 +25,9 @@ from tomo_polysplat.scan.scan import Scan
 if TYPE_CHECKING:
     from tomo_polysplat.physics.spectrum import Spectrum
 
-__all__ = ["load_scan", "save_scan"]
+__all__ = ["load_scan", "require_scan_name", "save_scan"]
+
+_WRITERS: dict[str, Callable[..., None]] = {".npz": write_npz, ".h5": write_hdf5, ".hdf5": write_hdf5}
 
 
 def load_scan(
@@ -135,7 +137,9 @@ def _reader_of_scans(path: Path) -> Callable[[Path, ReadOptions], Scan] | None:
         raise fail(
             "path", "a complete .npz archive", str(file), "it is truncated: copy or write the file again"
         )
-    return scan_from_hdf5 if start == b"\x89HDF" and not nxtomo.recognises(file) else None
+    if start != b"\x89HDF" or nxtomo.recognises(file) or cil_nexus.recognises(file):
+        return None
+    return scan_from_hdf5
 
 
 def save_scan(scan: Scan, path: str | os.PathLike, *, overwrite: bool = False) -> None:
@@ -157,8 +161,13 @@ def save_scan(scan: Scan, path: str | os.PathLike, *, overwrite: bool = False) -
     ValueError
         For another ending.
     """
-    writers = {".npz": write_npz, ".h5": write_hdf5, ".hdf5": write_hdf5}
+    _WRITERS[require_scan_name(path)](scan, Path(path), overwrite=overwrite)
+
+
+def require_scan_name(path: str | os.PathLike, argument: str = "path") -> str:
+    """The ending of a name that a scan can be saved under; refuses others, before the work begins."""
     suffix = Path(path).suffix.lower()
-    if suffix not in writers:
-        raise fail("path", "a name ending in .npz, .h5 or .hdf5", str(path))
-    writers[suffix](scan, Path(path), overwrite=overwrite)
+    if suffix not in _WRITERS:
+        remedy = "a scan is no volume: `recon` writes those"
+        raise fail(argument, f"a name ending in {', '.join(_WRITERS)}", str(path), remedy)
+    return suffix

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from tomo_polysplat.checks import fail, require_choice
-from tomo_polysplat.units import LENGTH_UNITS
+from tomo_polysplat.units import LENGTH_UNITS, warn_of_unit
 
 if TYPE_CHECKING:
     from tomo_polysplat.physics.spectrum import Spectrum
@@ -47,6 +47,8 @@ class ReadOptions:
             if self.unit not in (None, stated):
                 raise fail("unit", f"'{stated}', which the file states", repr(self.unit), "leave unit out")
             return stated
+        if self.unit is None:
+            warn_of_unit(otherwise)
         return self.unit or otherwise
 
     def refuse_parallel_only(self) -> None:

@@ -169,7 +169,7 @@ def simulate_scan(
     spectrum = require_spectrum("spectrum", spectrum)
     if spectrum is None:
         spectrum = Spectrum.from_tube(
-            kvp, filters={"Al": 0.1} if filters is None else filters, detector=detector
+            kvp, filters={"Al": 0.1} if filters is None else filters, detector=detector or "counting"
         )
     scan = scan_phantom(
         scene_phantom(scene, metal),

@@ -47,7 +47,7 @@ _SIRT_PASSES = 50
 @cache
 def tube(kvp: float = 90.0) -> Spectrum:
     """The spectrum of all scans: 90 kV behind 1 mm of aluminium."""
-    return Spectrum.from_tube(kvp, filters={"Al": 0.1})
+    return Spectrum.from_tube(kvp, filters={"Al": 0.1}, detector="counting")
 
 
 def parts(scale: float = 1.0) -> list[Part]:

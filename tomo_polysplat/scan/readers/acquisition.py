@@ -89,11 +89,14 @@ class Tube:
     filters : mapping or None
         Material and thickness in cm; empty if there is said to be none.
     anode : str
+    detector : str or None
+        Its name, as `tomo_polysplat.Detector.named` takes it.
     """
 
     kvp: float | None = None
     filters: Mapping[str, float] | None = None
     anode: str = "W"
+    detector: str | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from tomo_polysplat.checks import fail
+from tomo_polysplat.physics.filter_text import filters_of
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
-from tomo_polysplat.scan.readers.filter_text import filters_of
 from tomo_polysplat.scan.readers.frames import TiffFrames
 from tomo_polysplat.scan.readers.ini_text import IniText
 from tomo_polysplat.scan.readers.picture_names import has_word, in_order, tiffs_in

@@ -9,9 +9,11 @@ from typing import Any
 
 from tomo_polysplat.checks import fail
 
-__all__ = ["TIFF_SUFFIXES", "has_word", "in_order", "named_files", "tiffs_in"]
+__all__ = ["PICTURE_SUFFIXES", "has_word", "in_order", "named_files", "pictures_in", "tiffs_in"]
 
 TIFF_SUFFIXES = (".tif", ".tiff")
+# What a plain stack may be of.
+PICTURE_SUFFIXES = (*TIFF_SUFFIXES, ".npy", ".edf")
 # Words in a name that make a picture, or a folder of them, a flat or a dark one, or one with the object.
 _WORDS = {
     "flats": ("flat", "flats", "white", "whites", "open", "bright", "ref", "gain", "ff", "i0"),
@@ -31,8 +33,17 @@ def _part(text: str) -> tuple[int, str]:
 
 def tiffs_in(folder: Path) -> list[Path]:
     """The TIFF files of a folder, in order."""
-    files = folder.iterdir()
-    return in_order(file for file in files if file.suffix.lower() in TIFF_SUFFIXES and file.is_file())
+    return _of_kind(folder, TIFF_SUFFIXES)
+
+
+def pictures_in(folder: Path) -> list[Path]:
+    """The TIFF files of a folder, else its EDF, else its ``.npy`` files, in order."""
+    kinds = (TIFF_SUFFIXES, (".edf",), (".npy",))
+    return next((files for kind in kinds if (files := _of_kind(folder, kind))), [])
+
+
+def _of_kind(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    return in_order(file for file in folder.iterdir() if file.suffix.lower() in suffixes and file.is_file())
 
 
 def has_word(name: str, kind: str) -> bool:
@@ -47,9 +58,9 @@ def named_files(folder: Path, names: Any, argument: str) -> list[Path]:
     for text in [names] if isinstance(names, (str, Path)) else list(names):
         here = next((place for place in (folder / text, Path(text)) if place.exists()), None)
         if here is not None:
-            files += tiffs_in(here) if here.is_dir() else [here]
+            files += pictures_in(here) if here.is_dir() else [here]
         elif not Path(text).is_absolute():
             files += in_order(folder.glob(str(text)))
     if not files:
-        raise fail(argument, "TIFF files", f"{names}, of which there is none in {folder}")
+        raise fail(argument, "files of pictures", f"{names}, of which there is none in {folder}")
     return files

@@ -7,13 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.scan.readers import nikon, nxtomo, rtk, skyscan, tiff_stack
+from tomo_polysplat.scan.readers import cil_nexus, nikon, nxtomo, picture_stack, rtk, skyscan
 from tomo_polysplat.scan.readers.acquisition import Acquisition
 
 __all__ = ["acquisition_of"]
 
 # The first one that recognises what it is shown reads it: what any folder of pictures is comes last.
-READERS = (skyscan, nikon, nxtomo, rtk, tiff_stack)
+READERS = (skyscan, nikon, nxtomo, cil_nexus, rtk, picture_stack)
+_REMEDY = (
+    "name the folder or the file that the scanner wrote; docs/scanner_files.md tells what is read of each"
+)
 
 
 def acquisition_of(path: Path, stated: Mapping[str, Any]) -> Acquisition:
@@ -35,5 +38,8 @@ def acquisition_of(path: Path, stated: Mapping[str, Any]) -> Acquisition:
             return reader.read(path, stated)
     kinds = ", ".join(reader.KIND for reader in READERS)
     raise fail(
-        "path", f"a Data Exchange HDF5 file, an .npz scan, or one of: {kinds}", f"{path}, which is neither"
+        "path",
+        f"a Data Exchange HDF5 file, an .npz scan, or one of: {kinds}",
+        f"{path}, which is neither",
+        _REMEDY,
     )

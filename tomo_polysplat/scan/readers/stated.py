@@ -12,9 +12,9 @@ import numpy as np
 
 from tomo_polysplat.checks import did_you_mean, fail, require_array, require_choice, require_number
 from tomo_polysplat.files import existing_file
+from tomo_polysplat.physics.filter_text import require_filters
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
-from tomo_polysplat.scan.readers.filter_text import filters_of
-from tomo_polysplat.scan.readers.frames import TiffFrames
+from tomo_polysplat.scan.readers.picture_files import frames_of
 from tomo_polysplat.scan.readers.picture_names import named_files
 from tomo_polysplat.scan.reading import INPUT_KINDS, ReadOptions
 from tomo_polysplat.units import LENGTH_UNITS
@@ -23,7 +23,7 @@ __all__ = ["KEYS", "read_toml", "require_known", "stated_over", "view_degrees", 
 
 # Lengths are in `unit`; `arc` and `degrees` count counterclockwise seen from above, of the source about the object.
 KEYS = {
-    "projections": "TIFF files: a folder, a file of many pictures, or a pattern such as proj_*.tif",
+    "projections": "TIFF, .npy or EDF files: a folder, a file of many pictures, or a pattern such as proj_*.tif",
     "flats": "pictures without the object",
     "darks": "pictures without light",
     "unit": "of the lengths: mm (default), cm, um, m",
@@ -40,8 +40,9 @@ KEYS = {
     "input": "counts (default), transmission or attenuation",
     "white": "counts of the open beam where there are no flats",
     "kvp": "tube voltage in kV",
-    "anode": "W (default), Mo, Rh, Ag or Cu",
+    "anode": "W (default), Mo, Rh, Ag, Cu or Au",
     "filter": "such as Al 1mm, or none",
+    "detector": "such as csi:0.6mm, gos:0.2mm, cdte:1mm or counting",
     "exposure": "seconds a picture",
     "name": "of the scan",
 }
@@ -105,8 +106,9 @@ def stated_over(told: Acquisition, stated: Mapping[str, Any], folder: Path) -> A
     """What a reader was told, with what the user states put in its place."""
     tube = Tube(
         _number(stated, "kvp", told.tube.kvp),
-        told.tube.filters if "filter" not in stated else _filters(stated["filter"]),
+        told.tube.filters if "filter" not in stated else require_filters("filter", str(stated["filter"])),
         stated.get("anode", told.tube.anode),
+        stated.get("detector", told.tube.detector),
     )
     if isinstance(told.setup, Setup):
         told = replace(told, setup=_setup(told.setup, stated, folder, told.frames.shape[0]))
@@ -114,7 +116,7 @@ def stated_over(told: Acquisition, stated: Mapping[str, Any], folder: Path) -> A
         raise fail(sorted(given)[0], "nothing, as the file has the geometry of each view", "a value")
     for name in ("flats", "darks"):
         if name in stated:
-            told = replace(told, **{name: TiffFrames(named_files(folder, stated[name], name))})  # type: ignore[arg-type]
+            told = replace(told, **{name: frames_of(named_files(folder, stated[name], name))})  # type: ignore[arg-type]
     return replace(
         told,
         tube=tube,
@@ -172,13 +174,6 @@ def _angle_file(name: str | Path, folder: Path) -> np.ndarray:
         return np.array([float(words[-1]) for words in fields if words and not words[0].startswith("#")])
     except ValueError as error:
         raise fail("degrees", "a text file with one angle a line", f"{path} ({error})") from None
-
-
-def _filters(text: Any) -> dict[str, float]:
-    filters = filters_of(str(text))
-    if filters is None:
-        raise fail("filter", "a material and its thickness, such as Al 1mm, or none", repr(text))
-    return filters
 
 
 def _number(stated: Mapping[str, Any], key: str, otherwise: Any) -> Any:

@@ -29,8 +29,8 @@ logger = logging.getLogger(__name__)
 
 # Percent of the pixels of pictures without flats that are darker than what is taken for the open beam.
 _BRIGHT = 99.0
-# Scintillator and thickness in cm of a usual flat panel, where nothing tells of the detector.
-_PANEL = ("CsI", 0.06)
+# A usual flat panel, where nothing tells of the detector.
+_PANEL = "csi:0.6mm"
 
 
 def scan_from_acquisition(told: Acquisition, options: ReadOptions, part: Part) -> Scan:
@@ -132,15 +132,17 @@ def _spectrum(told: Acquisition, options: ReadOptions) -> tuple[Acquisition, Spe
     from tomo_polysplat.physics.detector import Detector
     from tomo_polysplat.physics.spectrum import Spectrum
 
-    panel = Detector.energy_integrating(*_PANEL)
+    detector = Detector.named(tube.detector or _PANEL)
     try:
-        spectrum = Spectrum.from_tube(tube.kvp, tube.anode, dict(tube.filters), panel)
+        spectrum = Spectrum.from_tube(tube.kvp, tube.anode, dict(tube.filters), detector)
     except ValueError as error:
         return told.saying(f"there is no spectrum: {error}"), None
-    known = _filter_words(tube.filters)
+    known = f"the spectrum is that of {tube.anode} at {tube.kvp:g} kV behind {_filter_words(tube.filters)}"
+    if tube.detector is not None:
+        return told.saying(f"{known}; what else the beam passes is not known"), spectrum
     return told.saying(
-        f"the spectrum is that of {tube.anode} at {tube.kvp:g} kV behind {known}, seen by a flat panel of "
-        f"{10 * _PANEL[1]:g} mm {_PANEL[0]}; what else the beam passes and the detector are not known"
+        f"{known}, seen by a flat panel of 0.6 mm CsI; what else the beam passes and the detector are not known; give "
+        "detector="
     ), spectrum
 
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tomo_polysplat.physics.detector import Detector
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.scan.circular import cone_geometry, parallel_geometry
 from tomo_polysplat.scan.scan import Scan
@@ -108,9 +107,7 @@ def marked_scan(
             Part(ellipsoid(MARKER, 0.15), "aluminium", 2.7),
         ]
     )
-    spectrum = Spectrum.from_tube(
-        at.kvp, filters={"Al": 0.1 * at.filter_mm}, detector=Detector.energy_integrating("CsI", 0.06)
-    )
+    spectrum = Spectrum.from_tube(at.kvp, filters={"Al": 0.1 * at.filter_mm}, detector="csi:0.6mm")
     return scan_phantom(phantom, proj_geom, vol_geom, spectrum, Scanner(1e5, seed=seed), name="marker")
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from tomo_polysplat.simulate.folders.scene import SETTINGS, Pictures
 
-__all__ = ["write", "write_pictures"]
+__all__ = ["write", "write_distances", "write_pictures"]
 
 
 def write(folder: Path, pictures: Pictures) -> None:
@@ -16,6 +16,11 @@ def write(folder: Path, pictures: Pictures) -> None:
     write_pictures(folder, "proj_", pictures.projections)
     write_pictures(folder, "flat_", pictures.flats)
     write_pictures(folder, "dark_", pictures.darks)
+    write_distances(folder)
+
+
+def write_distances(folder: Path) -> None:
+    """The TOML file that stands beside pictures that tell nothing."""
     at = SETTINGS
     (folder / "scan.toml").write_text(
         f"""# Lengths are in mm.

@@ -7,17 +7,20 @@ from pathlib import Path
 
 from tomo_polysplat.checks import fail, require_choice
 from tomo_polysplat.scan.scan import Scan
-from tomo_polysplat.simulate.folders import nikon, nxtomo, rtk, skyscan, tiffs
+from tomo_polysplat.simulate.folders import arrays, cil, nikon, nxtomo, rtk, skyscan, tiffs
 from tomo_polysplat.simulate.folders.scene import marked_scan, pictures_of
 
 __all__ = ["KINDS", "write_folder"]
 
 KINDS = {
     "tiffs": tiffs.write,
+    "npy": arrays.write_npy,
+    "edf": arrays.write_edf,
     "skyscan": skyscan.write,
     "nikon": nikon.write,
     "nxtomo": nxtomo.write,
     "rtk": rtk.write,
+    "cil": cil.write,
 }
 # Scans of a geometry that a kind has of its own.
 _SCANS = {"nikon": nikon.make}

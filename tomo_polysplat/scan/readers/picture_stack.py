@@ -1,4 +1,4 @@
-"""A plain stack of TIFFs, with flats and darks beside them, about which somebody has to say the distances."""
+"""A plain stack of pictures (TIFF, EDF or ``.npy``), flats and darks beside them; somebody has to say the distances."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import numpy as np
 
 from tomo_polysplat.checks import fail
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup
-from tomo_polysplat.scan.readers.frames import TiffFrames
-from tomo_polysplat.scan.readers.picture_names import TIFF_SUFFIXES, has_word, named_files, tiffs_in
+from tomo_polysplat.scan.readers.picture_files import frames_of
+from tomo_polysplat.scan.readers.picture_names import PICTURE_SUFFIXES, has_word, named_files, pictures_in
 from tomo_polysplat.scan.readers.stated import read_toml, require_known, stated_over
 
 __all__ = ["read", "recognises"]
 
-KIND = "stack of TIFFs"
+KIND = "stack of TIFFs, EDF or .npy files"
 _REMEDY = (
     "pass scanner={'source_object': ..., 'source_detector': ..., 'pixel': ...} in mm (--sod, --sdd, --pixel), write "
     "them into a file scan.toml in the folder, or say that beam = 'parallel'"
@@ -25,10 +25,10 @@ _REMEDY = (
 
 
 def recognises(path: Path) -> bool:
-    """Whether it is a TIFF, a TOML file, or a folder with TIFFs in it or in folders of it."""
+    """Whether it is a picture, a TOML file, or a folder with pictures in it or in folders of it."""
     if path.is_file():
-        return path.suffix.lower() in (*TIFF_SUFFIXES, ".toml")
-    return bool(tiffs_in(path)) or any(tiffs_in(folder) for folder in path.iterdir() if folder.is_dir())
+        return path.suffix.lower() in (*PICTURE_SUFFIXES, ".toml")
+    return bool(pictures_in(path)) or any(pictures_in(folder) for folder in path.iterdir() if folder.is_dir())
 
 
 def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
@@ -36,10 +36,10 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     folder = path if path.is_dir() else path.parent
     written, other = _written(path)
     known = written | require_known(stated, "scanner")
-    if path.suffix.lower() in TIFF_SUFFIXES and path.is_file():
+    if path.suffix.lower() in PICTURE_SUFFIXES and path.is_file():
         known.setdefault("projections", path)
     files = _sorted_out(folder, known)
-    frames = TiffFrames(files["projections"])
+    frames = frames_of(files["projections"])
     views = frames.shape[0]
     known |= {name: files[name] for name in ("flats", "darks") if files[name]}
     setup = Setup(np.arange(views) * (360.0 / views), np.nan)
@@ -77,19 +77,21 @@ def _sorted_out(folder: Path, known: Mapping[str, Any]) -> dict[str, list[Path]]
     inside = [inner for inner in sorted(folder.iterdir()) if inner.is_dir()]
     for name in ("flats", "darks"):
         if name not in files:
-            matching = [file for file in tiffs_in(folder) if has_word(file.stem, name) and file not in taken]
+            matching = [
+                file for file in pictures_in(folder) if has_word(file.stem, name) and file not in taken
+            ]
             for inner in inside:
-                matching += tiffs_in(inner) if has_word(inner.name, name) else []
+                matching += pictures_in(inner) if has_word(inner.name, name) else []
             files[name] = matching
             taken |= set(matching)
     if "projections" not in files:
-        left = [file for file in tiffs_in(folder) if file not in taken]
+        left = [file for file in pictures_in(folder) if file not in taken]
         folders = [inner for inner in inside if has_word(inner.name, "projections")]
         if not left and len(folders) == 1:
-            left = tiffs_in(folders[0])
+            left = pictures_in(folders[0])
         if not left:
             remedy = "pass scanner={'projections': 'FOLDER or PATTERN'}"
-            raise fail("path", "TIFF pictures of an object", f"none in {folder}", remedy)
+            raise fail("path", "pictures of an object (TIFF, EDF or .npy)", f"none in {folder}", remedy)
         files["projections"] = left
     return files
 

@@ -9,6 +9,9 @@ from folders import marked, require_the_same_volume
 
 import tomo_polysplat as tps
 from tomo_polysplat.scan.geometry import from_astra
+from tomo_polysplat.scan.readers.edf import EdfFrames
+from tomo_polysplat.scan.readers.picture_files import frames_of
+from tomo_polysplat.simulate.folders.arrays import edf_bytes
 from tomo_polysplat.simulate.folders.scene import pictures_of
 from tomo_polysplat.simulate.folders.write import write_folder
 
@@ -178,7 +181,7 @@ def test_pictures_that_do_not_go_together_are_refused(bare):
 
 def test_a_folder_without_pictures_is_refused(tmp_path):
     with pytest.raises(
-        ValueError, match="a Data Exchange HDF5 file, an .npz scan, or one of: .*stack of TIFFs"
+        ValueError, match="a Data Exchange HDF5 file, an .npz scan, or one of: .*stack of TIFFs, EDF or"
     ):
         tps.load_scan(tmp_path)
     with pytest.raises(FileNotFoundError):
@@ -190,3 +193,44 @@ def test_texts_of_files_are_shown_as_they_are(folder, bare):
     (bare / "scan.toml").write_text(text)
     keys = tps.load_scan(bare).notes["scanner"]["keys"]
     assert keys == {"operator": "nobody", "comment": "\\x1b[31mred"}
+
+
+def test_edf_of_another_byte_order_size_and_damage(tmp_path):
+    """Type, size and order stand in the header; more pictures may follow, and blanks after them."""
+    picture = (np.arange(35) * 0.25).reshape(5, 7).astype(">f4")
+    after = (picture + 1).astype(">f4")
+    file = tmp_path / "a.edf"
+    file.write_bytes(edf_bytes(picture, motor_pos="1 2") + edf_bytes(after) + b"\n\n")
+    frames = EdfFrames([file])
+    assert frames.shape == (2, 5, 7) and frames.dtype == np.dtype(">f4")
+    np.testing.assert_array_equal(frames.read(1, slice(1, 3), slice(2, 7)), after[1:3, 2:7])
+    for content, message in (
+        (edf_bytes(picture)[:-1], "140 bytes of a picture, got 139"),
+        (b"{ Dim_1 = 5 ;", "one without an end"),
+        (b"something else", "begins with {"),
+        (edf_bytes(picture).replace(b"FloatValue", b"ComplexVal"), "pictures of numbers"),
+        (edf_bytes(picture, Compression="GzipCompression"), "not compressed"),
+        (edf_bytes(picture).replace(b"Dim_2 = 5", b"Dim_2 = 0"), "of two axes"),
+    ):
+        file.write_bytes(content)
+        with pytest.raises(ValueError, match=message):
+            EdfFrames([file])
+
+
+def test_npy_pictures_in_one_file_or_one_in_each(tmp_path):
+    stack = np.arange(2 * 3 * 4, dtype=np.uint16).reshape(2, 3, 4)
+    np.save(tmp_path / "all.npy", stack)
+    for k, picture in enumerate(stack):
+        np.save(tmp_path / f"{k}.npy", picture)
+    for names in (["all.npy"], ["0.npy", "1.npy"]):
+        frames = frames_of([tmp_path / name for name in names])
+        assert frames.shape == (2, 3, 4)
+        np.testing.assert_array_equal(frames.read(1, slice(1, 3), slice(0, 2)), stack[1, 1:3, :2])
+    np.save(tmp_path / "1.npy", stack[0, :2])
+    with pytest.raises(ValueError, match=r"as in 0.npy, got uint16 of \(2, 4\)"):
+        frames_of([tmp_path / "0.npy", tmp_path / "1.npy"]).read(1, slice(0, 1), slice(0, 1))
+    np.save(tmp_path / "texts.npy", np.array([["a"]]))
+    with pytest.raises(ValueError, match=r"one stack \(pictures, rows, columns\)"):
+        frames_of([tmp_path / "texts.npy"])
+    with pytest.raises(ValueError, match="pictures of one kind of file, got .npy, .tif"):
+        frames_of([tmp_path / "0.npy", tmp_path / "0.tif"])

@@ -1,0 +1,71 @@
+"""The pictures of files of any kind that a plain stack may have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from tomo_polysplat.checks import fail
+from tomo_polysplat.files import existing_file
+from tomo_polysplat.scan.readers.edf import EdfFrames
+from tomo_polysplat.scan.readers.frames import ArrayFrames, Frames, TiffFrames
+
+__all__ = ["NpyFrames", "frames_of"]
+
+
+class NpyFrames:
+    """Pictures of NumPy's ``.npy`` files, mapped and not read: one file of (pictures, rows, columns), or one a picture.
+
+    Raises
+    ------
+    ValueError
+        For files that are none, and pictures of different sizes or types.
+    """
+
+    def __init__(self, files: Sequence[Path]) -> None:
+        self._files = [existing_file(file) for file in files]
+        first = self._mapped(0)
+        self._stack = ArrayFrames(first) if first.ndim == 3 and len(self._files) == 1 else None
+        if self._stack is None and (first.ndim != 2 or first.dtype.kind not in "fiu"):
+            got = f"{first.dtype} of shape {first.shape} in {self._files[0]}"
+            raise fail(
+                "path", "one stack (pictures, rows, columns), or a picture (rows, columns) in each", got
+            )
+        shape = first.shape if self._stack is not None else (len(self._files), *first.shape)
+        self.shape, self.dtype = (shape[0], shape[1], shape[2]), first.dtype
+
+    def read(self, index: int, rows: slice, columns: slice) -> np.ndarray:
+        """Part of one picture."""
+        if self._stack is not None:
+            return self._stack.read(index, rows, columns)
+        picture = self._mapped(index)
+        if picture.shape != self.shape[1:] or picture.dtype != self.dtype:
+            got = f"{picture.dtype} of {picture.shape} in {self._files[index]}"
+            raise fail("path", f"{self.dtype} of {self.shape[1:]} as in {self._files[0].name}", got)
+        return np.asarray(picture[rows, columns])
+
+    def _mapped(self, index: int) -> np.ndarray:
+        try:
+            return np.load(self._files[index], mmap_mode="r", allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            got = f"{self._files[index]} ({str(error)[:120]})"
+            raise fail("path", "a .npy file of numbers", got, "save it again with numpy.save") from error
+
+
+_READERS: dict[str, Callable[[Sequence[Path]], Frames]] = {".npy": NpyFrames, ".edf": EdfFrames}
+
+
+def frames_of(files: Sequence[Path]) -> Frames:
+    """Pictures of TIFF, ``.npy`` or EDF files, told apart by the first one's name.
+
+    Raises
+    ------
+    ValueError
+        For files that are not what their name says, and for files of several kinds.
+    """
+    kinds = {file.suffix.lower().replace("tiff", "tif") for file in files}
+    if len(kinds) > 1:
+        raise fail("path", "pictures of one kind of file", ", ".join(sorted(kinds)))
+    return _READERS.get(kinds.pop() if kinds else "", TiffFrames)(files)

@@ -1,0 +1,48 @@
+"""Plain folders of arrays: NumPy's .npy files, and the ESRF's EDF pictures, beside a small TOML file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from tomo_polysplat.simulate.folders.scene import Pictures
+from tomo_polysplat.simulate.folders.tiffs import write_distances
+
+__all__ = ["edf_bytes", "write_edf", "write_npy"]
+
+_EDF_TYPES = {"u2": "UnsignedShort", "f4": "FloatValue", "i4": "SignedInteger"}
+_EDF_BLOCK = 512
+
+
+def write_npy(folder: Path, pictures: Pictures) -> None:
+    """Fill an empty folder with three stacks."""
+    for name in ("projections", "flats", "darks"):
+        np.save(folder / f"{name}.npy", getattr(pictures, name))
+    write_distances(folder)
+
+
+def write_edf(folder: Path, pictures: Pictures) -> None:
+    """Fill an empty folder: a picture a file, and all flats in one."""
+    for index, picture in enumerate(pictures.projections):
+        (folder / f"marker{index:04d}.edf").write_bytes(edf_bytes(picture))
+    (folder / "flat.edf").write_bytes(b"".join(edf_bytes(flat) for flat in pictures.flats))
+    (folder / "dark.edf").write_bytes(edf_bytes(pictures.darks[0]))
+    write_distances(folder)
+
+
+def edf_bytes(picture: np.ndarray, **others: object) -> bytes:
+    """One picture (rows, columns) as EDF: a header that fills whole blocks, and the numbers."""
+    rows, columns = picture.shape
+    about: dict[str, object] = {
+        "HeaderID": "EH:000001:000000:000000",
+        "ByteOrder": "HighByteFirst" if picture.dtype.byteorder == ">" else "LowByteFirst",
+        "DataType": _EDF_TYPES[picture.dtype.str[1:]],
+        "Dim_1": columns,
+        "Dim_2": rows,
+        "Size": picture.nbytes,
+        **others,
+    }
+    text = "{\n" + "".join(f"{key} = {value} ;\n" for key, value in about.items())
+    blank = -(len(text) + 2) % _EDF_BLOCK
+    return (text + " " * blank + "}\n").encode("ascii") + picture.tobytes()
