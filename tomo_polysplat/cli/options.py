@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.files import existing_file
 
 if TYPE_CHECKING:
     from tomo_polysplat.physics.detector import Detector
@@ -48,12 +47,14 @@ def add_spectrum_options(parser: argparse.ArgumentParser) -> None:
 def spectrum_from(arguments: argparse.Namespace) -> Spectrum | None:
     """The spectrum that the options describe, or None."""
     from tomo_polysplat.physics.spectrum import Spectrum
+    from tomo_polysplat.physics.spectrum_file import read_spectrum_table
 
     tube = {name: value for name in ("anode", "filter", "detector") if (value := getattr(arguments, name))}
     if arguments.spectrum is not None:
         if tube or arguments.kvp is not None:
             raise fail("--spectrum", "none of --kvp, --anode, --filter, --detector beside it", "both")
-        return Spectrum(*_two_columns(arguments.spectrum), label=Path(arguments.spectrum).name)
+        energies, weights = read_spectrum_table(arguments.spectrum, "--spectrum")
+        return Spectrum(energies, weights, label=Path(arguments.spectrum).name)
     if arguments.kvp is None:
         for name in tube:
             raise fail(f"--{name}", "--kvp with it", "no --kvp")
@@ -62,17 +63,6 @@ def spectrum_from(arguments: argparse.Namespace) -> Spectrum | None:
     return Spectrum.from_tube(
         arguments.kvp, arguments.anode or "W", filters or None, _detector(arguments.detector or "counting")
     )
-
-
-def _two_columns(path: str) -> tuple[Any, Any]:
-    import numpy as np
-
-    file = existing_file(path, "--spectrum")
-    with open(file, encoding="utf-8") as stream:
-        table = np.loadtxt((line.replace(",", " ") for line in stream), ndmin=2)
-    if table.shape[1] != 2:
-        raise fail("--spectrum", "two columns: keV and weight", f"{table.shape[1]} columns")
-    return table[:, 0], table[:, 1]
 
 
 def _filter(text: str) -> tuple[str, float]:
