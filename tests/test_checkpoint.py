@@ -159,6 +159,17 @@ def rewritten(path, **changes):
     np.savez(path, **{name: value for name, value in (arrays | changes).items() if value is not None})
 
 
+def test_a_compressed_checkpoint_is_refused(tmp_path):
+    """It is never written so, and could unpack to a thousand times its size."""
+    path = tmp_path / "fit.npz"
+    reconstruct(fan(), checkpoint=path)
+    with np.load(path) as file:
+        arrays = dict(file)
+    np.savez_compressed(path, **arrays)
+    with pytest.raises(ValueError, match="expected a stored array"):
+        reconstruct(fan(), checkpoint=path, resume=True)
+
+
 def with_numbers(path, part="numbers", **changes):
     with np.load(path) as file:
         about = json.loads(file["about"].tobytes())

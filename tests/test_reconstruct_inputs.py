@@ -11,6 +11,7 @@ import torch
 from small_scans import QUICK, fan, in_two_dimensions, reconstruct, relative
 
 import tomo_polysplat as tps
+from tomo_polysplat.settings import make_settings
 
 
 @pytest.fixture(scope="module")
@@ -246,3 +247,17 @@ def test_a_scan_brings_all_that_it_knows():
     assert np.array_equal(whole.volume, parts.volume) and whole.spectrum == scan.spectrum
     with pytest.raises(ValueError, match="proj_geom: .*pass a Scan"):
         tps.reconstruct(scan.projections)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("seed_spacing", 1e4), ("closer_seeds", 1e3), ("largest_scale", 1e-3), ("smallest_scale", 100)),
+        *(("seed_width", 1e-3), ("support_level", 5), ("final_rate", 1e9)),
+        *(("learning_rate_scale", 1e3), ("learning_rate_position", 1e4)),
+    ],
+)
+def test_settings_that_would_empty_the_volume_are_refused(name, value):
+    """With each of these the mean of a fan's volume was a third of what it is or less, or ten times as much."""
+    with pytest.raises(ValueError, match=rf"settings\['{name}'\]: .*(<=|>=)"):
+        make_settings("balanced", {name: value})

@@ -11,13 +11,23 @@ from tomo_polysplat.checks import did_you_mean, fail, require_choice, require_nu
 
 __all__ = ["PRESETS", "Settings", "make_settings"]
 
+_MOVED = ("position", "scale", "rotation", "attenuation", "material", "shared", "blur")
 # Of those that are not any number from 0 on. Material numbers reach a little below the first curve.
 _RANGES: dict[str, dict[str, Any]] = {
     **dict.fromkeys(("soft_u", "bone_u", "metal_u"), {"at_least": -0.1, "at_most": 1.0}),
     "light_u": {"at_least": -0.1, "at_most": 0.1},
-    **dict.fromkeys(("seed_width", "largest_scale", "cutoff"), {"above": 0.0}),
-    **dict.fromkeys(("model_error", "huber_corner", "final_rate"), {"above": 0.0}),
-    **dict.fromkeys(("passes", "seed_spacing", "smallest_scale", "metal_rim"), {"above": 0.0}),
+    # Far beyond these the mean of a volume fell to a third or to 0, or rose to ten times and more.
+    "seed_width": {"at_least": 0.3, "at_most": 100.0},
+    "largest_scale": {"at_least": 0.5, "at_most": 100.0},
+    "cutoff": {"above": 0.0},
+    "support_level": {"at_least": 0.0, "at_most": 1.0},
+    "seed_spacing": {"above": 0.0, "at_most": 32.0},
+    "closer_seeds": {"at_least": 0.0, "at_most": 8.0},
+    "smallest_scale": {"above": 0.0, "at_most": 3.0},
+    "final_rate": {"above": 0.0, "at_most": 1.0},
+    **dict.fromkeys((f"learning_rate_{of}" for of in _MOVED), {"at_least": 0.0, "at_most": 100.0}),
+    **dict.fromkeys(("model_error", "huber_corner"), {"above": 0.0}),
+    **dict.fromkeys(("passes", "metal_rim"), {"above": 0.0}),
     **dict.fromkeys(("tv_factor", "tv_corner", "growth"), {"above": 0.0}),
     **dict.fromkeys(
         ("views_per_step", "max_gaussians", "pixel_rays", "tv_every", "patience", "spectral_nodes"),

@@ -32,6 +32,17 @@ def archive(path, method=zipfile.ZIP_DEFLATED, **members):
     return path
 
 
+def test_a_long_list_of_members_is_not_taken_into_memory(tmp_path):
+    """One of 10^6 names, which a file of 100 MB may hold, takes a gigabyte before anything is asked."""
+    path = archive(tmp_path / "scan.npz")
+    assert load_scan(path).projections.size
+    with zipfile.ZipFile(path, "a") as file:
+        for number in range(20_000):
+            file.writestr(f"{number}.npy", b"")
+    with pytest.raises(ValueError, match="list of members has .* bytes"):
+        load_scan(path)
+
+
 def test_the_files_that_are_tampered_with_are_sound_before(tmp_path):
     for make in (exchange, archive):
         scan = load_scan(make(tmp_path / "scan"))

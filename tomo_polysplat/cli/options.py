@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.files import existing_file
 
 if TYPE_CHECKING:
     from tomo_polysplat.physics.spectrum import Spectrum
@@ -49,12 +48,14 @@ def spectrum_from(arguments: argparse.Namespace) -> Spectrum | None:
     from tomo_polysplat.physics.detector import Detector
     from tomo_polysplat.physics.filter_text import require_filters
     from tomo_polysplat.physics.spectrum import Spectrum
+    from tomo_polysplat.physics.spectrum_file import read_spectrum_table
 
     tube = {name: value for name in ("anode", "filter", "detector") if (value := getattr(arguments, name))}
     if arguments.spectrum is not None:
         if tube or arguments.kvp is not None:
             raise fail("--spectrum", "none of --kvp, --anode, --filter, --detector beside it", "both")
-        return Spectrum(*_two_columns(arguments.spectrum), label=Path(arguments.spectrum).name)
+        energies, weights = read_spectrum_table(arguments.spectrum, "--spectrum")
+        return Spectrum(energies, weights, label=Path(arguments.spectrum).name)
     if arguments.kvp is None:
         for name in tube:
             raise fail(f"--{name}", "--kvp with it", "no --kvp")
@@ -63,23 +64,6 @@ def spectrum_from(arguments: argparse.Namespace) -> Spectrum | None:
     named = arguments.detector
     detector = None if named is None else Detector.named(named, "--detector")
     return Spectrum.from_tube(arguments.kvp, arguments.anode or "W", filters, detector)
-
-
-def _two_columns(path: str) -> tuple[Any, Any]:
-    import numpy as np
-
-    file = existing_file(path, "--spectrum")
-    try:
-        with open(file, encoding="utf-8") as stream:
-            table = np.loadtxt((line.replace(",", " ") for line in stream), ndmin=2)
-    except ValueError as error:
-        remedy = "let lines of words begin with #"
-        raise fail(
-            "--spectrum", "two columns of numbers: keV and weight", f"{file} ({error})", remedy
-        ) from None
-    if table.shape[1] != 2:
-        raise fail("--spectrum", "two columns: keV and weight", f"{table.shape[1]} columns")
-    return table[:, 0], table[:, 1]
 
 
 def add_scan_options(parser: argparse.ArgumentParser) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tomo_polysplat.checks import fail, require_array, require_number, require_shape
+from tomo_polysplat.checks import fail, require_array, require_number, require_shape, visible
 from tomo_polysplat.physics.detector import Detector
 from tomo_polysplat.physics.filter_text import FILTER_REMEDY, require_filters
 from tomo_polysplat.physics.materials import density, mass_attenuation, require_energies
@@ -65,7 +65,7 @@ class Spectrum:
         total = values.sum()
         # Normalising twice would change the last digits, and a spectrum must survive saving unchanged.
         self._weights = values[inside] / (total if abs(total - 1.0) > 1e-12 else 1.0)
-        self._label = str(label)
+        self._label = visible(label)
         self._energies.flags.writeable = self._weights.flags.writeable = False
 
     @classmethod

@@ -123,7 +123,7 @@ class Checkpoint:
             np.savez(file, **arrays)  # type: ignore[arg-type]  # its stubs know only NumPy 2.1 and later
 
     def _read(self) -> None:
-        arrays = read_archive(self.path, _NAMES)
+        arrays = read_archive(self.path, _NAMES, compressed=False)
         try:
             about = _content(arrays["about"])
             self._require_same(about)

@@ -26,14 +26,21 @@ _BROKEN = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, Runt
 _LONGEST_TEXT = 1000
 # NumPy's own limit for headers that it takes apart.
 _LONGEST_HEADER = 10_000
+# The list of an archive's members is taken into memory whole, some ten times as large; ours have 15 members.
+_LARGEST_DIRECTORY = 2**20
 
 
 def read_archive(
-    path: str | Path, names: Iterable[str], most: Mapping[str, int] | None = None
+    path: str | Path,
+    names: Iterable[str],
+    most: Mapping[str, int] | None = None,
+    *,
+    compressed: bool = True,
 ) -> dict[str, np.ndarray]:
     """Read the arrays called `names` that a NumPy archive has.
 
-    `most` limits how many numbers some of them may have; the header alone is enough to refuse more.
+    `most` limits how many numbers some of them may have; the header alone is enough to refuse more. Without
+    `compressed` the arrays need no more memory than the file has bytes.
 
     Nothing is unpickled, and each header is compared with what is stored before memory is taken.
 
@@ -47,12 +54,15 @@ def read_archive(
     file = existing_file(path)
     size = file.stat().st_size
     try:
-        with zipfile.ZipFile(file) as archive:
+        with _Listed(io.FileIO(file)) as stream, zipfile.ZipFile(stream) as archive:
+            stream.listed = True
             members = {info.filename: info for info in archive.infolist()}
             chosen = [name for name in names if f"{name}.npy" in members]
             limits = most or {}
+            kinds = _COMPRESSIONS if compressed else (zipfile.ZIP_STORED,)
             return {
-                name: _read_member(archive, members[f"{name}.npy"], size, limits.get(name)) for name in chosen
+                name: _read_member(archive, members[f"{name}.npy"], size, limits.get(name), kinds)
+                for name in chosen
             }
     except _BROKEN as error:
         raise fail(
@@ -60,11 +70,27 @@ def read_archive(
         ) from error
 
 
+class _Listed(io.BufferedReader):
+    """A file of which `zipfile` reads no longer list of members than ours may be."""
+
+    listed = False
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if not self.listed and size is not None and size > _LARGEST_DIRECTORY:
+            raise zipfile.BadZipFile(f"its list of members has {size} bytes, at most {_LARGEST_DIRECTORY}")
+        return super().read(size)
+
+
 def _read_member(
-    archive: zipfile.ZipFile, info: zipfile.ZipInfo, file_size: int, most: int | None
+    archive: zipfile.ZipFile,
+    info: zipfile.ZipInfo,
+    file_size: int,
+    most: int | None,
+    kinds: tuple[int, ...],
 ) -> np.ndarray:
-    if info.compress_type not in _COMPRESSIONS:
-        raise fail(info.filename, "a stored or deflated array", f"compression type {info.compress_type}")
+    if info.compress_type not in kinds:
+        expected = "a stored or deflated array" if len(kinds) > 1 else "a stored array"
+        raise fail(info.filename, expected, f"compression type {info.compress_type}")
     with archive.open(info) as stream:
         shape, dtype = _header(stream, info)
     if most is not None and math.prod(shape) > most:
