@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.checks import fail
+from tomo_polysplat.fit.filtered import filtered
 from tomo_polysplat.fit.memory import require_machine
 from tomo_polysplat.fit.optimise import FitOutcome, FitState
 from tomo_polysplat.fit.problem import Problem
@@ -63,6 +64,7 @@ def reconstruct(
     device: str = "auto",
     valid: Any = None,
     water_correction: Sequence[float] | None = None,
+    filter_map: Sequence[Any] | None = None,
     calibrate: bool | str | Sequence[str] | None = None,
     soft_density: float | None = None,
     align: bool | str | Sequence[str] | None = None,
@@ -106,6 +108,10 @@ def reconstruct(
         Coefficients c_0 = 0, c_1, ... of the polynomial ``sum_k c_k P^k`` that the scanner has put its
         -log(I/I0) through; it is undone first, so that every ray keeps the noise of its counts. With a
         spectrum only.
+    filter_map : (material, thickness) or (material, thickness, density), optional
+        A filter that is not everywhere as thick, such as a bowtie: its thickness at each pixel, an array
+        (rows, columns) in ``unit``, or one row for all; g/cm3 where the material has no known density. The open beam
+        I0 was measured through it. Each pixel then has the spectrum behind its filter; ``spectrum`` is that in front.
     calibrate : bool or names among "scatter", "kvp", "filter", optional
         Fit these by a few short fits first, and use what fits the held-out rays better: a scattered signal, and the
         tube's voltage or its filters, which need ``soft_density``. True calibrates scatter, and the voltage where
@@ -157,9 +163,9 @@ def reconstruct(
     started = time.perf_counter()
     run_options = RunOptions.of(quality, settings, time_budget, seed, device, callbacks)
     projections, proj_geom, vol_geom, rest = _of_scan(
-        projections, proj_geom, vol_geom, (unit, spectrum, valid, water_correction)
+        projections, proj_geom, vol_geom, (unit, spectrum, valid, water_correction, filter_map)
     )
-    unit, spectrum, valid, water_correction = rest
+    unit, spectrum, valid, water_correction, filter_map = rest
     spectrum = require_spectrum("spectrum", spectrum)
     geometry, grid = from_astra(proj_geom, vol_geom)
     widest, on = run_options.settings.surroundings, run_options.device
@@ -169,6 +175,7 @@ def reconstruct(
     with one_torch_thread(on):
         values, counts = usable_rays(projections, proj_geom, valid, water_correction, spectrum)
         problem = Problem.of(values, geometry, grid, unit, spectrum, materials, widest, on)
+        problem = filtered(problem, filter_map, unit, proj_geom["type"] == "cyl_cone_vec")
     # Made wider where the object is, it may have many times the voxels.
     require_machine(0, math.prod(problem.grid.shape), energies, on)
     # Sorted, they may be a copy: these would stay in memory beside it.
@@ -188,6 +195,8 @@ def reconstruct(
         problem, prepared, outcome = solver.solve(problem, wanted, ask_scatter=calibrate is None)
         if water_correction is not None:
             prepared.plan.note("water_correction", "undone", describe_polynomial(water_correction))
+        if problem.filter_map is not None:
+            prepared.plan.note("filter_map", "modelled", problem.filter_map.describe())
         with postponed_interrupts("the volume") as interruption:
             report(1.0, "volume")
             result = _result(
@@ -213,12 +222,10 @@ def _of_scan(
     projections: Any,
     proj_geom: Mapping[str, Any] | None,
     vol_geom: Mapping[str, Any] | None,
-    rest: tuple[str | None, Spectrum | None, Any, Sequence[float] | None],
-) -> tuple[
-    Any, Mapping[str, Any], Mapping[str, Any], tuple[str, Spectrum | None, Any, Sequence[float] | None]
-]:
-    """Projections, geometries, and unit, spectrum, valid rays and water correction: as given, else a scan's."""
-    unit, spectrum, valid, correction = rest
+    rest: tuple[str | None, Spectrum | None, Any, Sequence[float] | None, Sequence[Any] | None],
+) -> tuple[Any, Mapping[str, Any], Mapping[str, Any], tuple[str, Spectrum | None, Any, Any, Any]]:
+    """Projections, geometries, unit, spectrum, valid rays, water correction and filters: as given, else a scan's."""
+    unit, spectrum, valid, correction, filters = rest
     if isinstance(projections, Scan):
         scan = projections
         projections, proj_geom, vol_geom = (
@@ -229,11 +236,12 @@ def _of_scan(
         unit, spectrum = unit or scan.unit, scan.spectrum if spectrum is None else spectrum
         valid = scan.usable if valid is None else valid
         correction = scan.water_correction if correction is None and spectrum is not None else correction
+        filters = scan.filter_map if filters is None else filters
     for name, given in (("proj_geom", proj_geom), ("vol_geom", vol_geom)):
         if given is None:
             raise fail(name, "ASTRA's geometry beside an array of projections", "none", "or pass a Scan")
     assert proj_geom is not None and vol_geom is not None
-    return projections, proj_geom, vol_geom, (unit or "cm", spectrum, valid, correction)
+    return projections, proj_geom, vol_geom, (unit or "cm", spectrum, valid, correction, filters)
 
 
 def _stopped(outcome: FitOutcome, interrupted: bool) -> Answer:

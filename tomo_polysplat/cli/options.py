@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     *("INTERRUPTED", "add_scan_options", "add_solver_options", "add_spectrum_options"),
-    *("scan_from", "spectrum_from"),
+    *("filter_map_from", "scan_from", "spectrum_from"),
 ]
 
 
@@ -81,6 +81,24 @@ def _filter(text: str) -> tuple[str, float]:
         return material, float(thickness)
     except ValueError:
         raise fail("--filter", "MATERIAL:CM, such as Al:0.1", repr(text)) from None
+
+
+def filter_map_from(text: str) -> tuple[str, Any]:
+    """Material and thickness at each pixel, of MATERIAL:FILE."""
+    import numpy as np
+
+    material, _, name = text.partition(":")
+    if not name:
+        raise fail("--filter-map", "MATERIAL:FILE, such as Al:bowtie.npy", repr(text))
+    file = existing_file(name, "--filter-map")
+    if file.suffix.lower() == ".npy":
+        return material, np.load(file, allow_pickle=False)
+    if file.suffix.lower() in (".tif", ".tiff"):
+        import tifffile
+
+        return material, tifffile.imread(file)
+    with open(file, encoding="utf-8") as stream:
+        return material, np.loadtxt((line.replace(",", " ") for line in stream), ndmin=2)
 
 
 def _detector(text: str) -> Detector:

@@ -14,6 +14,7 @@ from tomo_polysplat.cli.options import (
     add_scan_options,
     add_solver_options,
     add_spectrum_options,
+    filter_map_from,
     scan_from,
     spectrum_from,
 )
@@ -94,6 +95,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " alone: what of these the rays tell",
     )
     group.add_argument(
+        "--filter-map",
+        metavar="MATERIAL:FILE",
+        help="a filter that is not everywhere as thick, such as a bowtie: its thickness at each pixel (rows, columns) "
+        "in --unit, as .npy, .tif or text; one row stands for all",
+    )
+    group.add_argument(
         "--soft-density", type=float, metavar="G/CM3", help="known density of what most of the object is"
     )
     group.add_argument(
@@ -115,6 +122,8 @@ def run(arguments: argparse.Namespace) -> int:
     require_outputs(arguments)
     scan = scan_from(arguments, spectrum_from(arguments))
     spectrum = _spectrum_of(scan, arguments)
+    if arguments.filter_map is not None:
+        scan = replace(scan, filter_map=filter_map_from(arguments.filter_map))
     require_room_of(arguments, scan)
     print(scan)
     with progress_reports(None) as progress:
@@ -134,6 +143,7 @@ def run(arguments: argparse.Namespace) -> int:
             align=None if arguments.align is None else arguments.align or True,
             soft_density=arguments.soft_density,
             water_correction=None if spectrum is None else scan.water_correction,
+            filter_map=scan.filter_map,
             progress=progress,
             settings=dict(_setting(text) for text in arguments.set) or None,
             checkpoint=arguments.checkpoint,

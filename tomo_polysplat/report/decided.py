@@ -47,6 +47,7 @@ _TOLD = {
     "model": "The rays",
     "spectrum": "The spectrum",
     "water_correction": "The scanner's water correction",
+    "filter_map": "The filter in front of each pixel",
     "alignment": "The scanner's geometry",
     "scatter": "Scatter",
     "detector_blur": "The detector's blur",
@@ -89,6 +90,8 @@ def found_about_the_scanner(plan: Mapping[str, Answer]) -> str:
         found.append(f"a geometry that has moved ({plan['alignment'].why})")
     if "water_correction" in plan:
         found.append(f"a water correction, undone ({plan['water_correction'].why})")
+    if "filter_map" in plan:
+        found.append(f"a filter in front of each pixel ({plan['filter_map'].why})")
     if rays.scatter or rays.of_light:
         found.append(f"scatter of {rays.scatter:.2g} of the open beam")
     if rays.beam != 1.0:
