@@ -39,6 +39,7 @@ from tomo_polysplat.progress import progress_reports
 from tomo_polysplat.result.provenance import provenance
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import VolumeGrid, from_astra, is_planar_geometry, to_astra
+from tomo_polysplat.scan.mending import mend_scan
 from tomo_polysplat.scan.scan import Scan
 from tomo_polysplat.scan.usable import usable_rays
 from tomo_polysplat.settings import Settings
@@ -68,6 +69,7 @@ def reconstruct(
     calibrate: bool | str | Sequence[str] | None = None,
     soft_density: float | None = None,
     align: bool | str | Sequence[str] | None = None,
+    mend: bool = True,
     callbacks: Sequence[Callable[[FitState], Any]] = (),
     progress: bool | Callable[[float, str], Any] | None = None,
     settings: Settings | Mapping[str, Any] | None = None,
@@ -127,6 +129,9 @@ def reconstruct(
         True or "auto": what of these the rays tell. Moves that held-out rays do not confirm are not made.
         `Result.geometry` is the geometry found, ``result.plan["alignment"]`` the moves. None or False: the geometry
         is as told. Not beside a ``time_budget``.
+    mend : bool
+        Of a `Scan` with its own geometry, move the detector where the rays show beyond doubt that the axis of rotation
+        is off (`tomo_polysplat.scan.mending`). The log and ``result.plan["mended"]`` say so.
     callbacks : sequence of callables
         Each gets a :class:`~tomo_polysplat.fit.optimise.FitState` once a pass over the views; returning True
         ends the fit.
@@ -162,6 +167,9 @@ def reconstruct(
     """
     started = time.perf_counter()
     run_options = RunOptions.of(quality, settings, time_budget, seed, device, callbacks)
+    mended: list[str] = []
+    if mend and isinstance(projections, Scan) and proj_geom is None:
+        projections, mended = mend_scan(projections)
     projections, proj_geom, vol_geom, rest = _of_scan(
         projections, proj_geom, vol_geom, (unit, spectrum, valid, water_correction, filter_map)
     )
@@ -195,6 +203,8 @@ def reconstruct(
         problem, prepared, outcome = solver.solve(problem, wanted, ask_scatter=calibrate is None)
         if water_correction is not None:
             prepared.plan.note("water_correction", "undone", describe_polynomial(water_correction))
+        if mended:
+            prepared.plan.note("mended", "the axis", "; ".join(mended))
         if problem.filter_map is not None:
             prepared.plan.note("filter_map", "modelled", problem.filter_map.describe())
         with postponed_interrupts("the volume") as interruption:

@@ -95,6 +95,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " alone: what of these the rays tell",
     )
     group.add_argument(
+        "--no-mend",
+        action="store_true",
+        help="leave the axis where the file has it, whatever the rays show",
+    )
+    group.add_argument(
         "--filter-map",
         metavar="MATERIAL:FILE",
         help="a filter that is not everywhere as thick, such as a bowtie: its thickness at each pixel (rows, columns) "
@@ -128,22 +133,16 @@ def run(arguments: argparse.Namespace) -> int:
     print(scan)
     with progress_reports(None) as progress:
         result = tomo_polysplat.reconstruct(
-            scan.projections,
-            scan.proj_geom,
-            scan.vol_geom,
-            spectrum=spectrum,
+            replace(scan, spectrum=spectrum),
             materials=arguments.materials,
-            unit=scan.unit,
             quality=arguments.quality,
             time_budget=arguments.time_budget,
             seed=arguments.seed,
             device=arguments.device,
-            valid=scan.usable,
             calibrate=_calibrated(arguments),
             align=None if arguments.align is None else arguments.align or True,
             soft_density=arguments.soft_density,
-            water_correction=None if spectrum is None else scan.water_correction,
-            filter_map=scan.filter_map,
+            mend=not arguments.no_mend,
             progress=progress,
             settings=dict(_setting(text) for text in arguments.set) or None,
             checkpoint=arguments.checkpoint,

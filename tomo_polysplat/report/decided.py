@@ -48,6 +48,7 @@ _TOLD = {
     "spectrum": "The spectrum",
     "water_correction": "The scanner's water correction",
     "filter_map": "The filter in front of each pixel",
+    "mended": "What was mended",
     "alignment": "The scanner's geometry",
     "scatter": "Scatter",
     "detector_blur": "The detector's blur",
@@ -86,6 +87,8 @@ def found_about_the_scanner(plan: Mapping[str, Answer]) -> str:
     """One sentence on what the fit took from the rays about how they were measured."""
     rays = ray_physics(plan)
     found = []
+    if "mended" in plan:
+        found.append(f"an axis that was off ({plan['mended'].why})")
     if "alignment" in plan and plan["alignment"].value:
         found.append(f"a geometry that has moved ({plan['alignment'].why})")
     if "water_correction" in plan:

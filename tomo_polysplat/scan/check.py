@@ -19,7 +19,7 @@ from tomo_polysplat.scan.probes.truncation import TRUNCATION, probe_truncation
 from tomo_polysplat.scan.probes.unseen import COVERAGE, probe_coverage
 from tomo_polysplat.scan.scan import Scan
 
-__all__ = ["DEFECT", "OK", "UNKNOWN", "Finding", "Verdict", "check_scan"]
+__all__ = ["DEFECT", "OK", "UNKNOWN", "Finding", "Verdict", "asked", "check_scan", "nothing_to_see"]
 
 Probe = Callable[[Measured], "Finding | list[Finding]"]
 # What each probe answers, in the order in which they are asked; a defect of one of the first group would mislead the
@@ -61,7 +61,7 @@ def check_scan(scan: Scan) -> list[Finding]:
     findings = [probe_rays(measured, kinds)]
     # The other probes look at what is left.
     measured = replace(measured, dead_pixels=np.asarray(kinds[DEAD].any(axis=1)))
-    nothing = _nothing_to_see(measured)
+    nothing = nothing_to_see(measured)
     for names, probe in FIRST + LATER:
         misleading = [
             finding.probe for finding in findings if finding.probe in _MISLEADING and finding.misleading
@@ -72,11 +72,11 @@ def check_scan(scan: Scan) -> list[Finding]:
             text = f"looked for once this is mended: {', '.join(misleading)}"
             findings += [Finding(name, UNKNOWN, text, "the scan mended") for name in names]
         else:
-            findings += _asked(probe, names, measured)
+            findings += asked(probe, names, measured)
     return findings
 
 
-def _asked(probe: Probe, names: tuple[str, ...], measured: Measured) -> list[Finding]:
+def asked(probe: Probe, names: tuple[str, ...], measured: Measured) -> list[Finding]:
     """What a probe answers; where it cannot look at a scan such as this one, that it does not know."""
     try:
         answer = probe(measured)
@@ -85,7 +85,7 @@ def _asked(probe: Probe, names: tuple[str, ...], measured: Measured) -> list[Fin
     return answer if isinstance(answer, list) else [answer]
 
 
-def _nothing_to_see(measured: Measured) -> str:
+def nothing_to_see(measured: Measured) -> str:
     """Why the whole scan shows nothing, or an empty text."""
     if measured.scan.columns < _FEWEST_COLUMNS:
         return f"fewer than {_FEWEST_COLUMNS} columns do not tell"
