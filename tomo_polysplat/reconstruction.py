@@ -38,6 +38,7 @@ from tomo_polysplat.plan.unit_check import tell_impossible
 from tomo_polysplat.progress import progress_reports
 from tomo_polysplat.result.provenance import provenance
 from tomo_polysplat.result.result import Result
+from tomo_polysplat.scan.coverage import unseen_share
 from tomo_polysplat.scan.geometry import VolumeGrid, from_astra, is_planar_geometry, to_astra
 from tomo_polysplat.scan.mending import mend_scan
 from tomo_polysplat.scan.scan import Scan
@@ -48,6 +49,9 @@ from tomo_polysplat.transfer import to_host
 __all__ = ["reconstruct"]
 
 logger = logging.getLogger(__name__)
+
+# So many views tell which pixels measure.
+_VIEWS_OF_PIXELS = 16
 
 
 @usual_modes()
@@ -203,6 +207,7 @@ def reconstruct(
         problem, prepared, outcome = solver.solve(problem, wanted, ask_scatter=calibrate is None)
         if water_correction is not None:
             prepared.plan.note("water_correction", "undone", describe_polynomial(water_correction))
+        prepared.plan.note("unseen", *_unseen(problem, grid))
         if mended:
             prepared.plan.note("mended", "the axis", "; ".join(mended))
         if problem.filter_map is not None:
@@ -252,6 +257,17 @@ def _of_scan(
             raise fail(name, "ASTRA's geometry beside an array of projections", "none", "or pass a Scan")
     assert proj_geom is not None and vol_geom is not None
     return projections, proj_geom, vol_geom, (unit or "cm", spectrum, valid, correction, filters)
+
+
+def _unseen(problem: Problem, grid: VolumeGrid) -> tuple[float, str]:
+    """Share of the volume that no ray sees, and what that means."""
+    some = problem.projections[:: -(-len(problem.projections) // _VIEWS_OF_PIXELS)]
+    share = unseen_share(problem.told_geometry(), grid, np.isfinite(some).any(axis=0))
+    if share == 0:
+        return share, "every part of the volume is seen by some ray"
+    words = f"no ray sees {100 * share:.2g} % of the volume: not measured, which is not air; Result.coverage tells"
+    logger.info("%s", words)
+    return share, words
 
 
 def _stopped(outcome: FitOutcome, interrupted: bool) -> Answer:

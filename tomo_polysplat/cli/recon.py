@@ -52,6 +52,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=32,
         help="16 for whole numbers with their slope and offset in the file (default: 32)",
     )
+    parser.add_argument(
+        "--unseen-nan",
+        action="store_true",
+        help="NaN for voxels that no ray sees (not in .h5, not in 16 bits)",
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace files that exist")
     parser.add_argument("--report", metavar="FILE", help="write a page about the reconstruction (.html)")
     parser.add_argument("--tiff", metavar="FOLDER", help="write the slices as TIFF")

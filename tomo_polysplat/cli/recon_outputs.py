@@ -32,6 +32,9 @@ def require_outputs(arguments: argparse.Namespace) -> None:
     kind = format_of(arguments.output, "--output")
     if not (kind.everything and arguments.tiff is not None):
         kind.require(hu=arguments.hu, bits=arguments.bits, argument="--output")
+    if arguments.unseen_nan and (kind.everything or arguments.bits == 16):
+        remedy = "choose another ending of --output, and 32 bits"
+        raise fail("--unseen-nan", "a file of the volume alone, in floating point", arguments.output, remedy)
     if arguments.resume and arguments.checkpoint is None:
         raise fail("--resume", "--checkpoint with it", "none")
     written, folders = {}, {}
@@ -144,7 +147,8 @@ def _save(result: Result, arguments: argparse.Namespace) -> None:
     from tomo_polysplat.result.formats import format_of
 
     everything = format_of(arguments.output, "--output").everything
-    options = {} if everything else {"hu": arguments.hu, "bits": arguments.bits}
+    options = {"hu": arguments.hu, "bits": arguments.bits, "unseen_nan": arguments.unseen_nan}
+    options = {} if everything else options
     result.save(arguments.output, overwrite=arguments.overwrite, **options)
 
 

@@ -61,6 +61,7 @@ _TOLD = {
     "soft_material": "The material number of soft matter",
     "light": "Less dense soft matter",
     "start": "The start",
+    "unseen": "The share of the volume that no ray sees",
     "window": "The edge of the volume",
     "edges": "Edges",
     "growth": "The number of Gaussians, in those of the seeds",
