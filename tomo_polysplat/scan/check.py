@@ -10,11 +10,13 @@ import numpy as np
 from tomo_polysplat.scan.probes.axes import AXES, probe_axes
 from tomo_polysplat.scan.probes.beam import BEAM, probe_beam
 from tomo_polysplat.scan.probes.finding import DEFECT, OK, UNKNOWN, Finding, Verdict
+from tomo_polysplat.scan.probes.lengths import LENGTHS, probe_lengths
 from tomo_polysplat.scan.probes.logarithm import LOGARITHM, probe_logarithm
 from tomo_polysplat.scan.probes.measured import Measured
 from tomo_polysplat.scan.probes.opposite import CENTRE, DIRECTION, probe_centre_and_direction
 from tomo_polysplat.scan.probes.order import ORDER, probe_order
 from tomo_polysplat.scan.probes.rays import DEAD, bad_rays, probe_rays
+from tomo_polysplat.scan.probes.scale import SCALE, probe_scale
 from tomo_polysplat.scan.probes.truncation import TRUNCATION, probe_truncation
 from tomo_polysplat.scan.probes.unseen import COVERAGE, probe_coverage
 from tomo_polysplat.scan.scan import Scan
@@ -30,9 +32,11 @@ FIRST: tuple[tuple[tuple[str, ...], Probe], ...] = (
 )
 LATER: tuple[tuple[tuple[str, ...], Probe], ...] = (
     ((ORDER,), probe_order),
+    ((SCALE,), probe_scale),
     ((BEAM,), probe_beam),
     ((TRUNCATION,), probe_truncation),
     ((COVERAGE,), probe_coverage),
+    ((LENGTHS,), probe_lengths),
     ((CENTRE, DIRECTION), probe_centre_and_direction),
 )
 # Whose defects say nothing of the rest but that it is to be looked at again; those of the others hide nothing.
@@ -52,9 +56,9 @@ def check_scan(scan: Scan) -> list[Finding]:
     Returns
     -------
     list of Finding
-        On bad rays, the logarithm, the order of the axes and of the views, the open beam, truncation, voxels that no
-        ray sees, the centre and the direction of the angles. A probe without evidence says "unknown" and what it would
-        take, and the others answer all the same.
+        On bad rays, the logarithm and its base, the order of the axes and of the views, the open beam, truncation,
+        voxels that no ray sees, the unit of length, the centre and the direction of the angles. A probe without
+        evidence says "unknown" and what it would take, and the others answer all the same.
     """
     measured = Measured(scan)
     kinds = bad_rays(measured)
