@@ -14,6 +14,7 @@ import numpy as np
 
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.scan.check import check_scan
+from tomo_polysplat.scan.geometry import from_astra, to_astra
 from tomo_polysplat.scan.scan import Scan
 from tomo_polysplat.simulate.scanner import Scanner
 from tomo_polysplat.simulate.scenes import SCENES, scan_phantom, scene_phantom
@@ -99,6 +100,11 @@ def planted(scan: Scan, seed: int) -> list[tuple[str, str, Scan, Scan]]:
         values[..., scan.columns // 2 : scan.columns // 2 + columns] = 0
         return changed(values)
 
+    def longer(times: float) -> Scan:
+        where, grid = from_astra(scan.proj_geom, scan.vol_geom)
+        told, volume = to_astra(where.scaled(times), grid.scaled(times))
+        return replace(scan, proj_geom=told, vol_geom=volume, truth=None, metal_mask=None)
+
     fall = np.linspace(0, 1, scan.views)[:, None]
     return [
         ("axis off by 1, 3 columns", "centre", moved(1.0), moved(3.0)),
@@ -112,6 +118,13 @@ def planted(scan: Scan, seed: int) -> list[tuple[str, str, Scan, Scan]]:
             changed(p - np.log(1 - 0.2 * fall)),
         ),
         ("transmissions, counts", "logarithm", changed(np.exp(-p)), changed(1e4 * np.exp(-p))),
+        (
+            "log to the base of 3, of 10",
+            "base of the logarithm",
+            changed(p / np.log(3)),
+            changed(p / np.log(10)),
+        ),
+        ("lengths 100, 10 000 times too long", "unit of length", longer(1e2), longer(1e4)),
     ]
 
 
@@ -120,11 +133,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scans", type=int, nargs="?", default=55)
     parser.add_argument("--planted", type=int, default=11, help="scans that defects are planted in")
+    parser.add_argument("--from", type=int, default=0, dest="first", help="number of the first clean scan")
     arguments = parser.parse_args()
     logging.disable(logging.CRITICAL)
     answers: dict[str, Counter] = {}
     alarms = []
-    for number in range(arguments.scans):
+    for number in range(arguments.first, arguments.first + arguments.scans):
         kind, scan = simulated(number)
         for finding in check_scan(scan):
             verdict = str(finding.verdict)

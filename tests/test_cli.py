@@ -31,10 +31,13 @@ def solver(monkeypatch):
     """Stands in for the solver: water everywhere, and the arguments it was called with."""
     calls = []
 
-    def reconstruct(projections, proj_geom, vol_geom, **options):
-        calls.append(options | {"shape": projections.shape})
+    def reconstruct(scan, **options):
+        correction = None if scan.spectrum is None else scan.water_correction
+        own = {"spectrum": scan.spectrum, "unit": scan.unit, "valid": scan.usable}
+        options = own | {"water_correction": correction} | options
+        calls.append(options | {"shape": scan.projections.shape})
         options["progress"](0.5, "half way")
-        grid = from_astra(proj_geom, vol_geom)[1]
+        grid = from_astra(scan.proj_geom, scan.vol_geom)[1]
         if options["spectrum"] is None:
             return Result(np.ones((1, *grid.shape)), grid, options["unit"])
         basis = np.zeros((3, *grid.shape))

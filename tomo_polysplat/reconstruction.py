@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.checks import fail
+from tomo_polysplat.fit.filtered import filtered
 from tomo_polysplat.fit.memory import require_machine
 from tomo_polysplat.fit.optimise import FitOutcome, FitState
 from tomo_polysplat.fit.problem import Problem
@@ -39,8 +40,11 @@ from tomo_polysplat.plan.unit_check import tell_impossible
 from tomo_polysplat.progress import progress_reports
 from tomo_polysplat.result.provenance import provenance
 from tomo_polysplat.result.result import Result
+from tomo_polysplat.scan.coverage import unseen_share
 from tomo_polysplat.scan.geometry import VolumeGrid, from_astra, is_planar_geometry, to_astra
 from tomo_polysplat.scan.measurement import Measurement
+from tomo_polysplat.scan.mending import mend_scan
+from tomo_polysplat.scan.scan import Scan
 from tomo_polysplat.scan.usable import usable_rays
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.transfer import to_host
@@ -49,6 +53,9 @@ from tomo_polysplat.units import warn_of_unit
 __all__ = ["reconstruct"]
 
 logger = logging.getLogger(__name__)
+
+# So many views tell which pixels measure.
+_VIEWS_OF_PIXELS = 16
 
 
 @usual_modes()
@@ -66,9 +73,11 @@ def reconstruct(
     device: str = "auto",
     valid: Any = None,
     water_correction: Sequence[float] | None = None,
+    filter_map: Sequence[Any] | None = None,
     calibrate: bool | str | Sequence[str] | None = None,
     soft_density: float | None = None,
     align: bool | str | Sequence[str] | None = None,
+    mend: bool = True,
     callbacks: Sequence[Callable[[FitState], Any]] = (),
     progress: bool | Callable[[float, str], Any] | None = None,
     settings: Settings | Mapping[str, Any] | None = None,
@@ -111,6 +120,10 @@ def reconstruct(
         Coefficients c_0 = 0, c_1, ... of the polynomial ``sum_k c_k P^k`` that the scanner has put its
         -log(I/I0) through; it is undone first, so that every ray keeps the noise of its counts. With a
         spectrum only.
+    filter_map : (material, thickness) or (material, thickness, density), optional
+        A filter that is not everywhere as thick, such as a bowtie: its thickness at each pixel, an array
+        (rows, columns) in ``unit``, or one row for all; g/cm3 where the material has no known density. The open beam
+        I0 was measured through it. Each pixel then has the spectrum behind its filter; ``spectrum`` is that in front.
     calibrate : bool or names among "scatter", "kvp", "filter", optional
         Fit these by a few short fits first, and use what fits the held-out rays better: a scattered signal, and the
         tube's voltage or its filters, which need ``soft_density``. True calibrates scatter, and the voltage where
@@ -126,6 +139,9 @@ def reconstruct(
         True or "auto": what of these the rays tell. Moves that held-out rays do not confirm are not made.
         `Result.geometry` is the geometry found, ``result.plan["alignment"]`` the moves. None or False: the geometry
         is as told. Not beside a ``time_budget``.
+    mend : bool
+        Of a `Scan` with its own geometry, move the detector where the rays show beyond doubt that the axis of rotation
+        is off (`tomo_polysplat.scan.mending`). The log and ``result.plan["mended"]`` say so.
     callbacks : sequence of callables
         Each gets a :class:`~tomo_polysplat.fit.optimise.FitState` once a pass over the views; returning True
         ends the fit.
@@ -162,12 +178,17 @@ def reconstruct(
     begun = time.perf_counter()
     run_options = RunOptions.of(quality, settings, time_budget, seed, device, callbacks)
     started, compiled = working_time(), compiled_seconds()
-    measured = Measurement(projections, proj_geom, vol_geom, unit, spectrum, valid, water_correction).filled()
+    mended: list[str] = []
+    if mend and isinstance(projections, Scan) and proj_geom is None:
+        projections, mended = mend_scan(projections)
+    measured = Measurement(
+        projections, proj_geom, vol_geom, unit, spectrum, valid, water_correction, filter_map
+    ).filled()
     proj_geom, vol_geom = measured.geometries()
     if measured.unit is None and measured.spectrum is not None:
         warn_of_unit("cm")
     unit, water_correction = measured.unit or "cm", measured.water_correction
-    spectrum = require_spectrum("spectrum", measured.spectrum)
+    spectrum, filter_map = require_spectrum("spectrum", measured.spectrum), measured.filter_map
     geometry, grid = from_astra(proj_geom, vol_geom)
     widest, on = run_options.settings.surroundings, run_options.device
     energies = 1 if spectrum is None else len(spectrum.energies)
@@ -178,6 +199,7 @@ def reconstruct(
             measured.projections, proj_geom, measured.valid, water_correction, spectrum
         )
         problem = Problem.of(values, geometry, grid, unit, spectrum, materials, widest, on)
+        problem = filtered(problem, filter_map, unit, proj_geom["type"] == "cyl_cone_vec")
     # Made wider where the object is, it may have many times the voxels.
     require_machine(0, math.prod(problem.grid.shape), energies, on)
     # Sorted, they may be a copy: these would stay in memory beside it.
@@ -198,6 +220,11 @@ def reconstruct(
         problem, prepared, outcome = solver.solve(problem, wanted, ask_scatter=calibrate is None)
         if water_correction is not None:
             prepared.plan.note("water_correction", "undone", describe_polynomial(water_correction))
+        prepared.plan.note("unseen", *_unseen(problem, grid))
+        if mended:
+            prepared.plan.note("mended", "the axis", "; ".join(mended))
+        if problem.filter_map is not None:
+            prepared.plan.note("filter_map", "modelled", problem.filter_map.describe())
         with postponed_interrupts("the volume") as interruption:
             report(1.0, "volume")
             result = _result(
@@ -220,6 +247,17 @@ def reconstruct(
     result.seconds = time.perf_counter() - begun
     logger.info("Reconstructed in %.1f s: %s; %s", result.seconds, result.plan["stop"].why, result.counts)
     return result
+
+
+def _unseen(problem: Problem, grid: VolumeGrid) -> tuple[float, str]:
+    """Share of the volume that no ray sees, and what that means."""
+    some = problem.projections[:: -(-len(problem.projections) // _VIEWS_OF_PIXELS)]
+    share = unseen_share(problem.told_geometry(), grid, np.isfinite(some).any(axis=0))
+    if share == 0:
+        return share, "every part of the volume is seen by some ray"
+    words = f"no ray sees {100 * share:.2g} % of the volume: not measured, which is not air; Result.coverage tells"
+    logger.info("%s", words)
+    return share, words
 
 
 def _stopped(outcome: FitOutcome, interrupted: bool) -> Answer:

@@ -31,14 +31,20 @@ def fit_problem(kind, polychromatic, device, kernel, count=17, **changes):
     values[:, -1, 7] = 400.0
     blurring, one_curve = changes.pop("blurring", True), changes.pop("one_curve", False)
     corners, every = changes.pop("corners", (0.1, 0.03)), changes.pop("every", 1)
-    pixel_rays = changes.pop("pixel_rays", 1)
+    pixel_rays, filtered = changes.pop("pixel_rays", 1), changes.pop("filtered", False)
     settings = Settings(**({"held_out": 0.2, "tv_weight": 0.3, "material_from": 0.5} | changes))
-    rays = Rays(values.to(device), views, 1e3, settings.model_error, settings.held_out)
+    dimmed, behind = None, None
+    if filtered:
+        # A bowtie, and its P alone by the nodes and by the spectrum, which need not be the same.
+        filters = 0.1 + torch.linspace(-1, 1, views.columns).square().expand(views.rows, -1)
+        dimmed, behind = (0.8 * filters).to(device), torch.stack([filters, 0.7 * filters]).to(device)
+    rays = Rays(values.to(device), views, 1e3, settings.model_error, settings.held_out, None, dimmed)
     quadrature, curves = None, (None, None)
     if polychromatic:
         weights = np.log([0.2, 0.5, 0.3])
         attenuation = CURVES.T.double().numpy() @ np.ones((2, 3)) * [3.0, 1.0, 0.4]
-        quadrature = Quadrature(weights, attenuation[:1] if one_curve else attenuation, 0, 0, 0, 5)
+        by_node = np.array([2.0, 0.9, 0.3]) if filtered else None
+        quadrature = Quadrature(weights, attenuation[:1] if one_curve else attenuation, 0, 0, 0, 5, by_node)
         curves = (None, None) if one_curve else CURVES.to(device)
     shape = (1, 7, 9) if planar else (4, 5, 6)
     box = VoxelBox(np.array([-0.6, -0.5, 0.0 if planar else -0.4]), np.array([0.2, 0.21, 0.23]), shape)
@@ -57,6 +63,7 @@ def fit_problem(kind, polychromatic, device, kernel, count=17, **changes):
         every,
         0.2,
         pixel_rays,
+        behind=behind if polychromatic else None,
     )
     return _gaussians(count, planar, device), 0.2, rays, scene, settings
 

@@ -84,6 +84,18 @@ def pixels_that_average_the_light_of_several_rays(device):
 
 
 @case
+def pixels_behind_a_filter_that_is_not_everywhere_as_thick(device):
+    for kind, polychromatic, changes in (
+        ("cone", True, {}),
+        ("cone", True, {"blurring": False}),
+        ("fan", True, {"one_curve": True, "pixel_rays": 2, "blurring": False}),
+        ("parallel", False, {"blurring": False, "loss": "weighted-l1"}),
+    ):
+        changes = {"filtered": True} | changes
+        compare_steps(_fused, device, ("cpu", "numba"), kind, polychromatic, **changes)
+
+
+@case
 def the_slope_by_the_blur_behind_much_matter(device):
     """As large as the projections, and yet a sum of whole numbers."""
     slopes = []

@@ -15,6 +15,7 @@ from tomo_polysplat.baselines.arrays import nmar as nmar_of_arrays
 from tomo_polysplat.baselines.arrays import sirt as sirt_of_arrays
 from tomo_polysplat.baselines.arrays import water_bhc as water_bhc_of_arrays
 from tomo_polysplat.checks import fail
+from tomo_polysplat.physics.filter_map import FilterMap
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.result.provenance import provenance
 from tomo_polysplat.result.result import Result
@@ -144,6 +145,9 @@ def _result(
     correction = None if spectrum is None else scan.water_correction
     values, counts = usable_rays(scan.projections, scan.proj_geom, scan.usable, correction, spectrum)
     geometry, grid = from_astra(scan.proj_geom, scan.vol_geom)
+    if spectrum is not None and scan.filter_map is not None:
+        behind = FilterMap.of(scan.filter_map, scan.unit, *values.shape[1:])
+        values = behind.as_if_bare(torch.from_numpy(values), spectrum, "water").numpy()
     energies = {} if spectrum is None else {"spectrum": spectrum}
     volume = method(values, geometry, grid, device=device, **energies, **options)
     only = scan.spectrum if scan.spectrum is not None and scan.spectrum.is_monochromatic else spectrum

@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tomo_polysplat.checks import fail
+from tomo_polysplat.files import existing_file
 
 if TYPE_CHECKING:
     from tomo_polysplat.physics.spectrum import Spectrum
 
 __all__ = [
     *("INTERRUPTED", "add_scan_options", "add_solver_options", "add_spectrum_options"),
-    *("scan_from", "spectrum_from"),
+    *("filter_map_from", "scan_from", "spectrum_from"),
 ]
 
 
@@ -64,6 +65,24 @@ def spectrum_from(arguments: argparse.Namespace) -> Spectrum | None:
     named = arguments.detector
     detector = None if named is None else Detector.named(named, "--detector")
     return Spectrum.from_tube(arguments.kvp, arguments.anode or "W", filters, detector)
+
+
+def filter_map_from(text: str) -> tuple[str, Any]:
+    """Material and thickness at each pixel, of MATERIAL:FILE."""
+    import numpy as np
+
+    material, _, name = text.partition(":")
+    if not name:
+        raise fail("--filter-map", "MATERIAL:FILE, such as Al:bowtie.npy", repr(text))
+    file = existing_file(name, "--filter-map")
+    if file.suffix.lower() == ".npy":
+        return material, np.load(file, allow_pickle=False)
+    if file.suffix.lower() in (".tif", ".tiff"):
+        import tifffile
+
+        return material, tifffile.imread(file)
+    with open(file, encoding="utf-8") as stream:
+        return material, np.loadtxt((line.replace(",", " ") for line in stream), ndmin=2)
 
 
 def add_scan_options(parser: argparse.ArgumentParser) -> None:

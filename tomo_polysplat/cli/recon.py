@@ -14,6 +14,7 @@ from tomo_polysplat.cli.options import (
     add_scan_options,
     add_solver_options,
     add_spectrum_options,
+    filter_map_from,
     scan_from,
     spectrum_from,
 )
@@ -50,6 +51,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=[16, 32],
         default=32,
         help="16 for whole numbers with their slope and offset in the file (default: 32)",
+    )
+    parser.add_argument(
+        "--unseen-nan",
+        action="store_true",
+        help="NaN for voxels that no ray sees (not in .h5, not in 16 bits)",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace files that exist")
     parser.add_argument("--report", metavar="FILE", help="write a page about the reconstruction (.html)")
@@ -104,6 +110,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " alone: what of these the rays tell",
     )
     group.add_argument(
+        "--no-mend",
+        action="store_true",
+        help="leave the axis where the file has it, whatever the rays show",
+    )
+    group.add_argument(
+        "--filter-map",
+        metavar="MATERIAL:FILE",
+        help="a filter that is not everywhere as thick, such as a bowtie: its thickness at each pixel (rows, columns) "
+        "in --unit, as .npy, .tif or text; one row stands for all",
+    )
+    group.add_argument(
         "--soft-density", type=float, metavar="G/CM3", help="known density of what most of the object is"
     )
     group.add_argument(
@@ -125,25 +142,22 @@ def run(arguments: argparse.Namespace) -> int:
     require_outputs(arguments)
     scan = scan_from(arguments, spectrum_from(arguments))
     spectrum = _spectrum_of(scan, arguments)
+    if arguments.filter_map is not None:
+        scan = replace(scan, filter_map=filter_map_from(arguments.filter_map))
     require_room_of(arguments, scan)
     print(scan)
     with progress_reports(None) as progress:
         result = tomo_polysplat.reconstruct(
-            scan.projections,
-            scan.proj_geom,
-            scan.vol_geom,
-            spectrum=spectrum,
+            replace(scan, spectrum=spectrum),
             materials=arguments.materials,
-            unit=scan.unit,
             quality=arguments.quality,
             time_budget=arguments.time_budget,
             seed=arguments.seed,
             device=arguments.device,
-            valid=scan.usable,
             calibrate=_calibrated(arguments),
             align=None if arguments.align is None else arguments.align or True,
             soft_density=arguments.soft_density,
-            water_correction=None if spectrum is None else scan.water_correction,
+            mend=not arguments.no_mend,
             progress=progress,
             settings=dict(_setting(text) for text in arguments.set) or None,
             checkpoint=arguments.checkpoint,

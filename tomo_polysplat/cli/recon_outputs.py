@@ -37,6 +37,9 @@ def require_outputs(arguments: argparse.Namespace) -> None:
     for name in ("halves", "faint"):
         if getattr(arguments, name) and arguments.report is None:
             raise fail(f"--{name}", "--report with it, where it is told", "none")
+    if arguments.unseen_nan and (kind.everything or arguments.bits == 16):
+        remedy = "choose another ending of --output, and 32 bits"
+        raise fail("--unseen-nan", "a file of the volume alone, in floating point", arguments.output, remedy)
     if arguments.resume and arguments.checkpoint is None:
         raise fail("--resume", "--checkpoint with it", "none")
     written, folders = {}, {}
@@ -168,7 +171,8 @@ def _save(result: Result, arguments: argparse.Namespace) -> None:
     from tomo_polysplat.result.formats import format_of
 
     everything = format_of(arguments.output, "--output").everything
-    options = {} if everything else {"hu": arguments.hu, "bits": arguments.bits}
+    options = {"hu": arguments.hu, "bits": arguments.bits, "unseen_nan": arguments.unseen_nan}
+    options = {} if everything else options
     result.save(arguments.output, overwrite=arguments.overwrite, **options)
 
 

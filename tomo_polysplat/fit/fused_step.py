@@ -136,7 +136,19 @@ class FusedStep:
             corner,
             scene.areal_scale,
             nodes,
+            *self._filters(),
         )
+
+    def _filters(self) -> tuple[torch.Tensor | None, torch.Tensor | None]:
+        """What pixels are behind, and its attenuation at the nodes, as `Measurement` has them."""
+        rays, scene = self.rays, self.scene
+        if rays.dimmed is None:
+            return None, None
+        dimmed = rays.dimmed[None].float()
+        if scene.quadrature is None or scene.behind is None or scene.quadrature.filter is None:
+            return torch.cat([torch.zeros_like(dimmed).expand(2, -1, -1), dimmed]), None
+        by_node = torch.tensor(scene.quadrature.filter, dtype=torch.float32, device=rays.target)
+        return torch.cat([scene.behind, dimmed]), by_node
 
     def __call__(self, views: np.ndarray, share: float) -> None:
         """One step; see `Step`."""

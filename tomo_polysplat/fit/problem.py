@@ -19,6 +19,7 @@ from tomo_polysplat.fit.inside import matter_is_inside
 from tomo_polysplat.fit.memory import projections_stay
 from tomo_polysplat.fit.surroundings import widened_grid
 from tomo_polysplat.physics.base_materials import Materials
+from tomo_polysplat.physics.filter_map import FilterMap
 from tomo_polysplat.physics.scatter import Scatter, made_level, without_scatter
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
@@ -79,6 +80,9 @@ class Problem:
         Voxels that the grid has more on either side than the volume that is asked for; see `fit.surroundings`.
     surroundings : str
         Why, if so.
+    filter_map : FilterMap or None
+        In front of the object, where it is not everywhere as thick; what was measured is relative to the open beam
+        behind it.
     order : (views,) int array or None
         Which of the caller's views each one is; None where they are as the caller has them.
     """
@@ -97,6 +101,7 @@ class Problem:
     margin: tuple[int, int] = (0, 0)
     surroundings: str = ""
     order: np.ndarray | None = None
+    filter_map: FilterMap | None = None
     _known: _Known = field(default_factory=_Known, init=False, repr=False)
 
     @classmethod
@@ -204,6 +209,7 @@ class Problem:
     def _level(self, device: torch.device) -> tuple[torch.Tensor, float]:
         """What was measured, made level, and its scatter; of what differs from the copies the last one is kept."""
         values, light = self._copied(device), (self.scatter, self.beam)
+        dimmed = self.dimmed(device)
         if not self.scatter.varies and self.beam == 1.0:
             return values, self.scatter.constant
         known = self._known.level.get(device)
@@ -212,7 +218,13 @@ class Problem:
             known = None
             self._known.level.pop(device, None)
             values = values if projections_stay(values.nbytes, device) else torch.from_numpy(self.projections)
-            known = (light, *made_level(values, self.scatter, self.beam))
+            if dimmed is None:
+                known = (light, *made_level(values, self.scatter, self.beam))
+            else:
+                # Scatter is relative to the beam in front of the filter.
+                dimmed = dimmed.to(values.device)
+                level, constant = made_level(values + dimmed, self.scatter, self.beam)
+                known = (light, level.sub_(dimmed), constant)
             self._known.level[device] = known
         return known[1:]
 
@@ -244,7 +256,7 @@ class Problem:
     def photons(self, device: torch.device) -> float:
         """Photons of an unattenuated ray, told once a scan; see ``scan.noise``."""
         if self._known.photons is None:
-            self._known.photons = photons_per_ray(self._copied(device))
+            self._known.photons = photons_per_ray(self._copied(device), self.dimmed(device))
         return self._known.photons
 
     def closed(self, device: torch.device) -> tuple[bool, str]:
@@ -257,7 +269,19 @@ class Problem:
             )
         return self._known.closed
 
+    def dimmed(self, device: torch.device) -> torch.Tensor | None:
+        """(rows, columns) -log of the share of the beam that passes each pixel's filter; None without filters."""
+        if self.filter_map is None or self.spectrum is None:
+            return None
+        return torch.from_numpy(self.filter_map.dimmed(self.spectrum)).to(device)
+
     def primary(self, device: torch.device) -> torch.Tensor:
-        """The projections as they would be without scatter, on a device."""
+        """The projections as they would be without scatter and without pixels' filters, on a device."""
         values, level = self._level(device)
-        return without_scatter(values, level, OPAQUE) if level else values
+        dimmed = self.dimmed(values.device)
+        if dimmed is None:
+            return without_scatter(values, level, OPAQUE) if level else values
+        assert self.filter_map is not None and self.spectrum is not None and self.materials is not None
+        if level:
+            values = without_scatter(values + dimmed, level, OPAQUE) - dimmed
+        return self.filter_map.as_if_bare(values, self.spectrum, self.materials.soft)

@@ -37,6 +37,8 @@ class Rays:
         Share of the rays kept from the fit.
     device : torch.device, optional
         Where batches go, for projections that stay on the host because they do not fit there.
+    dimmed : (rows, columns) tensor, optional
+        -log of the share of the beam that reaches each pixel through its filter: as many fewer photons.
     """
 
     projections: torch.Tensor
@@ -45,6 +47,7 @@ class Rays:
     model_error: float
     held_out: float
     device: torch.device | None = None
+    dimmed: torch.Tensor | None = None
 
     @property
     def target(self) -> torch.device:
@@ -73,7 +76,8 @@ class Rays:
         values = torch.where(usable, values, torch.zeros_like(values))
         weight = usable.to(values.dtype)
         if self.noise:
-            weight = weight * torch.rsqrt(1 + torch.exp(values) * self.noise)
+            depth = values if self.dimmed is None else values + self.dimmed
+            weight = weight * torch.rsqrt(1 + torch.exp(depth) * self.noise)
         aside = self._aside(chosen, values.shape[1:])
         return self.views.select(chosen), values, weight * ~aside, weight * aside
 

@@ -63,6 +63,9 @@ class FitScene:
         Rays a pixel and axis over which the light is averaged; see ``physics.pixel_light``.
     light_u : float
         Material number of light soft matter, less that of the rest; see ``fit.light_matter``.
+    behind : (2, rows, columns) tensor or None
+        Areal density (g/cm2) of the filter that each pixel is behind, and P of the nodes through it alone; see
+        ``physics.filter_map``.
     solid_number : callable or None
         Material numbers of solids by their attenuation in soft references; None where that does not tell them.
     """
@@ -84,6 +87,7 @@ class FitScene:
     pixel_rays: int = 1
     light_u: float = 0.0
     solid_number: Callable[[np.ndarray], np.ndarray] | None = None
+    behind: torch.Tensor | None = None
 
     def fine(self, views: DetectorViews) -> DetectorViews:
         """The rays whose light the pixels of these views average."""
@@ -100,10 +104,29 @@ class FitScene:
         rays = self.fine(views)
         areal, skipped = project_gaussians(gaussians, weights, rays, self.kernel, self.cutoff, vectors)
         areal = areal * self.areal_scale
-        sharp = areal[0] if self.quadrature is None else polychromatic_projection(areal, self.quadrature)
+        sharp = self._seen(areal)
         if self.pixel_rays > 1:
             sharp = averaged_light(sharp, views.rows, views.columns)
         return (blurred(sharp, gaussians.blur) if self.blurring else sharp), skipped
+
+    def _seen(self, areal: torch.Tensor) -> torch.Tensor:
+        """(views, rows, columns) -log(I/I0) of rays with these (curves, views, rows, columns) areal densities."""
+        if self.quadrature is None:
+            return areal[0]
+        if self.behind is None:
+            return polychromatic_projection(areal, self.quadrature)
+        parts = [fine // whole for fine, whole in zip(areal.shape[2:], self.behind.shape[1:])]
+        filters, alone = self.behind.repeat_interleave(parts[0], 1).repeat_interleave(parts[1], 2)
+        return polychromatic_projection(areal, self.quadrature, filters) - alone
+
+    def as_if_bare(self, areal: torch.Tensor, measured: torch.Tensor) -> torch.Tensor:
+        """Rays in front of no filter with as much more or less light, of the whole beam, than the model has."""
+        if self.quadrature is None or self.behind is None:
+            return measured
+        bare = torch.exp(-polychromatic_projection(areal, self.quadrature))
+        open_beam = torch.exp(-self.behind[1])
+        excess = open_beam * (torch.exp(-measured) - torch.exp(-self._seen(areal)))
+        return -torch.log((bare + excess).clamp(min=torch.finfo(bare.dtype).tiny))
 
     def keep_within(self, gaussians: Gaussians) -> None:
         """Move Gaussians that have left a closed volume back to its faces."""
@@ -160,11 +183,11 @@ class FitScene:
             voxelise_means(gaussians.select(index), weights[:, index], self.box, self.kernel)
             for index in chosen
         )
-        seen, some = self._seen(inside), gaussians.select(chosen[1])
+        seen, some = self._visible(inside), gaussians.select(chosen[1])
         tail = tails(seen, some, self._output_weights(some), self.box, self.kernel, self.metal_tail)
-        return rest + inside * tail_factors(seen, self._seen(rest), tail)
+        return rest + inside * tail_factors(seen, self._visible(rest), tail)
 
-    def _seen(self, densities: torch.Tensor) -> torch.Tensor:
+    def _visible(self, densities: torch.Tensor) -> torch.Tensor:
         """(nz, ny, nx) attenuation at the effective energy, of (channels, nz, ny, nx) densities or of itself."""
         if len(densities) == 1 or self.output_curve is None:
             return densities[0]

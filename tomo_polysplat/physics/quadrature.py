@@ -19,21 +19,29 @@ import numpy as np
 from tomo_polysplat.checks import require_number
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.beer_lambert import projection
+from tomo_polysplat.physics.filtered_rays import Behind, filtered_rays
+from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.physics.quadrature_fit import fit_nodes
 from tomo_polysplat.physics.ray_range import MaxPath, span_rays
 from tomo_polysplat.physics.spectrum import Spectrum
 
-__all__ = ["Quadrature", "fit_quadrature"]
+__all__ = ["Behind", "Quadrature", "fit_quadrature"]
 
 MAX_FITTED_NODES = 16
 # Of a table of P along the first material.
 _STEPS = 2048
 _SLOPE_TOLERANCE = 1e-3  # relative, of dP/da at P = 0: thin objects keep their attenuation
+# Likewise, behind any areal density of a filter: more nodes than 8 come no nearer than 0.02 behind copper.
+_FILTERED_SLOPES = 3e-2
 # Steps between pure materials and levels of P, of the rays that a quadrature is fitted to: more levels where
 # there are too few rays for its unknowns.
 _FIT_STEPS, _FIT_LEVELS = 4, 20
 # The rays its errors are taken from: finer, and other mixtures but for the pure materials.
 _JUDGE_GRID = (11, np.linspace(0.0, 1.0, 41)[1:] ** 2)
+
+# At how many areal densities of it nodes are fitted and judged, and on which mixtures and levels of P behind each.
+_FIT_FILTERS = (6, 3, np.linspace(0.0, 1.0, 13)[1:] ** 2)
+_JUDGE_FILTERS = (9, 5, np.linspace(0.0, 1.0, 41)[1:] ** 2)
 
 _Nodes = tuple[np.ndarray, np.ndarray]  # log weights (n,) and attenuation (3, n) or (1, n)
 
@@ -56,6 +64,8 @@ class Quadrature:
         Largest relative error of ``dP/da_k`` at ``P = 0``.
     max_path : float or tuple of three floats
         Range for which the errors hold: the largest P, or the largest areal densities (g/cm2).
+    filter : (n,) float64 array or None
+        Mass attenuation at each node of a filter that pixels see so much of; see `physics.filter_map`.
     """
 
     log_weights: np.ndarray
@@ -64,6 +74,7 @@ class Quadrature:
     rms_error: float
     slope_error: float
     max_path: float | tuple[float, ...]
+    filter: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         self.log_weights.flags.writeable = self.attenuation.flags.writeable = False
@@ -119,6 +130,7 @@ def fit_quadrature(
     nodes: int | None = None,
     tolerance: float = 5e-4,
     curves: int = 3,
+    behind: Behind | None = None,
 ) -> Quadrature:
     """The fewest nodes that reproduce the measurement over the range of a scan.
 
@@ -137,6 +149,8 @@ def fit_quadrature(
         node.
     curves : 3 or 1
         Rays of mixtures of the three materials, or of the first one alone, which takes fewer nodes.
+    behind : (material, least, largest), optional
+        A filter of which pixels see so much (g/cm2): P counts from the open beam behind it.
 
     Returns
     -------
@@ -152,14 +166,19 @@ def fit_quadrature(
         nodes = int(require_number("nodes", nodes, at_least=1))
     full = _nodes_of(spectrum, materials or Materials(), curves)
     bins = full[0].size
-    judge = _Judge(full, max_path)
     require_number("tolerance", tolerance, above=0.0)
-    rays = _rays_for(full, max_path, nodes or MAX_FITTED_NODES)
+    judge: _Judge | _FilteredJudge
+    if behind is None:
+        judge, rays = _Judge(full, max_path), _rays_for(full, max_path, nodes or MAX_FITTED_NODES)
+    else:
+        full = _with_filter(full, mass_attenuation(behind[0], spectrum.energies[spectrum.weights > 0]))
+        judge = _FilteredJudge(full, max_path, behind)
+        rays = filtered_rays(full, max_path, behind, *_FIT_FILTERS).areal
     if nodes is not None:
         return judge(fit_nodes(*full, rays, nodes) if nodes < bins else full)
     for count in range(1, min(bins, MAX_FITTED_NODES + 1)):
         candidate = judge(fit_nodes(*full, rays, count))
-        if candidate.rms_error <= tolerance and candidate.slope_error <= _SLOPE_TOLERANCE:
+        if candidate.rms_error <= tolerance and candidate.slope_error <= judge.slopes:
             return candidate
     return judge(full)
 
@@ -183,6 +202,8 @@ def _rays_for(full: _Nodes, max_path: MaxPath, nodes: int) -> np.ndarray:
 class _Judge:
     """Puts the errors against the full spectrum on nodes."""
 
+    slopes = _SLOPE_TOLERANCE
+
     def __init__(self, full: _Nodes, max_path: MaxPath) -> None:
         self._rays = span_rays(*full, max_path, *_JUDGE_GRID)
         self._target = projection(self._rays, *full)
@@ -199,4 +220,32 @@ class _Judge:
             rms_error=float(np.sqrt(np.mean(errors**2))),
             slope_error=float(np.abs(slope / self._slope - 1.0).max()),
             max_path=self._range if len(self._range) > 1 else self._range[0],
+        )
+
+
+def _with_filter(full: _Nodes, curve: np.ndarray) -> _Nodes:
+    """The filter as one curve more, the last."""
+    return full[0], np.concatenate([full[1], curve[None]])
+
+
+class _FilteredJudge:
+    """As `_Judge`, behind a filter."""
+
+    slopes = _FILTERED_SLOPES
+
+    def __init__(self, full: _Nodes, max_path: MaxPath, behind: Behind) -> None:
+        self._rays = filtered_rays(full, max_path, behind, *_JUDGE_FILTERS)
+        self._target, self._slope = self._rays.seen(*full), self._rays.slopes(*full)
+        self._range = tuple(map(float, np.ravel(max_path)))
+
+    def __call__(self, nodes: _Nodes) -> Quadrature:
+        errors = self._rays.seen(*nodes) - self._target
+        return Quadrature(
+            nodes[0].copy(),
+            nodes[1][:-1].copy(),
+            error_bound=float(np.abs(errors).max()),
+            rms_error=float(np.sqrt(np.mean(errors**2))),
+            slope_error=float(np.abs(self._rays.slopes(*nodes) / self._slope - 1.0).max()),
+            max_path=self._range if len(self._range) > 1 else self._range[0],
+            filter=nodes[1][-1].copy(),
         )

@@ -123,7 +123,9 @@ def add_scatter(quadrature: Quadrature, scatter: float) -> Quadrature:
         return quadrature
     log_weights = np.append(quadrature.log_weights, np.log(scatter))
     attenuation = np.pad(quadrature.attenuation, ((0, 0), (0, 1)))
-    return replace(quadrature, log_weights=log_weights, attenuation=attenuation)
+    # Scatter comes from the object: no filter in front of it takes any away.
+    behind = None if quadrature.filter is None else np.append(quadrature.filter, 0.0)
+    return replace(quadrature, log_weights=log_weights, attenuation=attenuation, filter=behind)
 
 
 def without_scatter(values: torch.Tensor, scatter: float, largest: float) -> torch.Tensor:

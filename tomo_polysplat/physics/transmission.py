@@ -13,7 +13,9 @@ from tomo_polysplat.physics.quadrature import Quadrature
 __all__ = ["nodes_on", "polychromatic_projection"]
 
 
-def polychromatic_projection(areal: torch.Tensor, quadrature: Quadrature) -> torch.Tensor:
+def polychromatic_projection(
+    areal: torch.Tensor, quadrature: Quadrature, behind: torch.Tensor | None = None
+) -> torch.Tensor:
     r"""Projection values of rays from their areal densities.
 
     .. math:: P = -\log \sum_n w_n \exp(-\sum_k a_k b_{kn}), \qquad
@@ -29,6 +31,8 @@ def polychromatic_projection(areal: torch.Tensor, quadrature: Quadrature) -> tor
         the soft one alone.
     quadrature : Quadrature
         Nodes of the detected spectrum.
+    behind : (...) tensor, optional
+        Areal densities in g/cm2 of the filter that the nodes know, in a shape that goes with that of the rays.
 
     Returns
     -------
@@ -44,6 +48,10 @@ def polychromatic_projection(areal: torch.Tensor, quadrature: Quadrature) -> tor
     if areal.dtype not in (torch.float32, torch.float64):
         raise fail("areal", "float32 or float64", f"{areal.dtype}")
     log_weights, attenuation = nodes_on(quadrature, areal.dtype, areal.device)
+    if behind is not None:
+        assert quadrature.filter is not None
+        taken = torch.tensor(quadrature.filter[:, None], dtype=areal.dtype, device=areal.device)
+        log_weights = log_weights - taken * behind.expand(areal.shape[1:]).reshape(1, -1)
     return _Projection.apply(areal, log_weights, attenuation)
 
 

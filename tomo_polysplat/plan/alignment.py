@@ -170,7 +170,9 @@ class _Levels:
         voxels = [n if n == 1 else max(_FEWEST_VOXELS, n // factor) for n in problem.grid.shape]
         grid = VolumeGrid((voxels[0], voxels[1], voxels[2]), problem.grid.lower, problem.grid.upper)
         values = _joined(problem.projections, rows, factor)
-        return replace(problem, projections=values, geometry=geometry, grid=grid, margin=(0, 0)), rows
+        behind = None if problem.filter_map is None else problem.filter_map.joined(rows, factor)
+        whole = replace(problem, projections=values, geometry=geometry, grid=grid, margin=(0, 0))
+        return replace(whole, filter_map=behind), rows
 
     def _seeded(self, problem: Problem, factor: int) -> tuple[Gaussians, float, FitScene, Rays, Settings]:
         """Seeds of the start volume that the told geometry gives of projections as it would have seen them."""

@@ -164,6 +164,9 @@ def _digest(problem: Problem) -> str:
     arrays += [np.array(grid.shape), grid.lower, grid.upper, problem.centre]
     if spectrum is not None and materials is not None:
         arrays += [spectrum.energies, spectrum.weights, materials.mass_attenuation(spectrum.energies)]
+    if problem.filter_map is not None:
+        digest.update(problem.filter_map.material.encode())
+        arrays.append(problem.filter_map.areal)
     for array in arrays:
         digest.update(f"{array.shape}{array.dtype}".encode())
         digest.update(np.ascontiguousarray(array).data)

@@ -13,6 +13,8 @@ from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.kernels import select
 from tomo_polysplat.physics.base_materials import Materials
+from tomo_polysplat.physics.beer_lambert import projection
+from tomo_polysplat.physics.quadrature import Quadrature
 from tomo_polysplat.physics.solids import number_of_solid
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.spectral_model import spectral_model
@@ -52,7 +54,17 @@ def scene_of(problem: Problem, plan: Plan, settings: Settings, device: torch.dev
         pixel_rays=max(plan.pixel_rays, 1),
         light_u=settings.light_u if plan.fat else 0.0,
         solid_number=_solid_number(problem, plan, settings),
+        behind=None if straight else _behind(problem, quadrature, device),
     )
+
+
+def _behind(problem: Problem, quadrature: Quadrature | None, device: torch.device) -> torch.Tensor | None:
+    """(2, rows, columns) areal density of each pixel's filter, and P of the nodes through it alone."""
+    if problem.filter_map is None or quadrature is None or quadrature.filter is None:
+        return None
+    areal = problem.filter_map.areal
+    alone = projection(areal[None], quadrature.log_weights, quadrature.filter[None])
+    return torch.from_numpy(np.stack([areal, alone]).astype(np.float32)).to(device)
 
 
 def rays_of(problem: Problem, plan: Plan, settings: Settings, device: torch.device) -> Rays:
@@ -62,7 +74,8 @@ def rays_of(problem: Problem, plan: Plan, settings: Settings, device: torch.devi
     views = detector_views(problem.geometry, problem.planar)
     values = problem.measured(device)
     target = None if values.device.type == device.type else device
-    return Rays(values, views, photons, settings.model_error, settings.held_out, target)
+    dimmed = problem.dimmed(device)
+    return Rays(values, views, photons, settings.model_error, settings.held_out, target, dimmed)
 
 
 def _solid_number(

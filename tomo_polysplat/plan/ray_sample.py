@@ -84,12 +84,15 @@ def sample_rays(gaussians: Gaussians, scene: FitScene, rays: Rays, seed: int, mo
     for views, measured, weight, aside in batches_around(rays):
         areal, _ = project_gaussians(gaussians, weights, views, scene.kernel, scene.cutoff)
         weight = weight + aside
-        light = light_around(torch.where(weight > 0, measured, torch.nan))
+        areal = areal * scene.areal_scale
+        whole_beam = measured if rays.dimmed is None else measured + rays.dimmed
+        measured = scene.as_if_bare(areal, measured)
+        light = light_around(torch.where(weight > 0, whole_beam, torch.nan))
         used = (weight.reshape(-1) > 0).nonzero()[:, 0]
         many = min(len(used), -(-most * len(measured) // views_in_all))
         chosen = used[torch.from_numpy(rng.choice(len(used), many, replace=False)).to(used.device)]
         view, seen = seen + chosen // measured[0].numel(), seen + len(measured)
-        flat = [areal.reshape(len(areal), -1)[:, chosen] * scene.areal_scale]
+        flat = [areal.reshape(len(areal), -1)[:, chosen]]
         flat += [values.reshape(-1)[chosen] for values in (measured, weight, light)]
         parts.append([tensor.double().cpu().numpy() for tensor in (*flat, view)])
     whole = [np.concatenate(part, axis=-1) for part in zip(*parts)]

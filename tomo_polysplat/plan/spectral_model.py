@@ -9,6 +9,7 @@ import torch
 
 from tomo_polysplat.fit.problem import OPAQUE, Problem
 from tomo_polysplat.physics.base_materials import Materials
+from tomo_polysplat.physics.filtered_rays import Behind
 from tomo_polysplat.physics.material_range import LEAST_U, least_material_number
 from tomo_polysplat.physics.quadrature import Quadrature, fit_quadrature
 from tomo_polysplat.physics.scatter import add_scatter
@@ -51,7 +52,8 @@ def spectral_model(
     largest = max(most, 1.0 if plan.curves > 1 else _LEAST_PROJECTION)
     rounded = _RANGE_STEP ** math.ceil(math.log(largest, _RANGE_STEP))
     nodes = settings.spectral_nodes
-    quadrature = _fitted_nodes(spectrum, materials, min(rounded, OPAQUE), nodes, plan.curves)
+    behind = None if problem.filter_map is None else problem.filter_map.span
+    quadrature = _fitted_nodes(spectrum, materials, min(rounded, OPAQUE), nodes, plan.curves, behind)
     plan.note("spectrum", len(quadrature.weights), quadrature.describe())
     plan.note("hardening", most, quadrature.describe_hardening(most))
     lit_by_scatter = add_scatter(quadrature, problem.scatter_level(device))
@@ -66,9 +68,14 @@ def spectral_model(
 
 @lru_cache(maxsize=32)
 def _fitted_nodes(
-    spectrum: Spectrum, materials: Materials, largest: float, nodes: int | None, curves: int
+    spectrum: Spectrum,
+    materials: Materials,
+    largest: float,
+    nodes: int | None,
+    curves: int,
+    behind: Behind | None,
 ) -> Quadrature:
-    return fit_quadrature(spectrum, materials, largest, nodes, curves=curves)
+    return fit_quadrature(spectrum, materials, largest, nodes, curves=curves, behind=behind)
 
 
 def _relative(materials: Materials, energy: float, device: torch.device) -> torch.Tensor:

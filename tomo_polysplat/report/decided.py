@@ -53,6 +53,8 @@ _TOLD = {
     "spectrum": "The spectrum",
     "spectrum_doubt": "Whether the spectrum fits",
     "water_correction": "The scanner's water correction",
+    "filter_map": "The filter in front of each pixel",
+    "mended": "What was mended",
     "alignment": "The scanner's geometry",
     "scatter": "Scatter",
     "detector_blur": "The detector's blur",
@@ -65,6 +67,7 @@ _TOLD = {
     "soft_material": "The material number of soft matter",
     "light": "Less dense soft matter",
     "start": "The start",
+    "unseen": "The share of the volume that no ray sees",
     "window": "The edge of the volume",
     "edges": "Edges",
     "growth": "The number of Gaussians, in those of the seeds",
@@ -93,8 +96,14 @@ def found_about_the_scanner(plan: Mapping[str, Answer]) -> str:
     """One sentence on what the fit took from the rays about how they were measured."""
     values = _of_nuisances(plan)
     found = [words for kind in NUISANCES if (words := kind.told(values))]
-    if "water_correction" in plan:
-        found.insert(0, f"a water correction, undone ({plan['water_correction'].why})")
+    # Before what was fitted comes what was known or mended.
+    for name, what in (
+        ("filter_map", "a filter in front of each pixel"),
+        ("water_correction", "a water correction, undone"),
+        ("mended", "an axis that was off"),
+    ):
+        if name in plan:
+            found.insert(0, f"{what} ({plan[name].why})")
     if not found:
         return "About the scanner nothing was found that the geometry and the spectrum had not said."
     return f"About the scanner was found: {'; '.join(found)}."

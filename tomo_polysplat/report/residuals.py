@@ -14,6 +14,7 @@ from tomo_polysplat.kernels.select import choose, pick_fast_device
 from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.detector_blur import LARGEST_BLUR, blurred
+from tomo_polysplat.physics.filter_map import FilterMap
 from tomo_polysplat.physics.pixel_light import averaged_light
 from tomo_polysplat.physics.scatter import light_around
 from tomo_polysplat.render.renderer import detector_views
@@ -133,15 +134,20 @@ def residuals_of(
     seen = geometry if result.geometry is None else from_astra(result.geometry, scan.vol_geom)[0]
     some = seen.select(chosen)
     planar = is_planar_geometry(scan.proj_geom) or geometry.planar
-    model = _Model(result, detector_views(some, planar), pick_fast_device(device))
+    filters = None if spectrum is None or scan.filter_map is None else scan.filter_map
+    behind = None if filters is None else FilterMap.of(filters, scan.unit, *values.shape[1:])
+    model = _Model(result, detector_views(some, planar), pick_fast_device(device), behind)
     unseen = HeldOut(geometry, grid, values, float(result.settings.get("held_out", 0.0)))
-    return _collected(model, values, chosen, photons_per_ray(values), MisfitMap(some, grid), unseen)
+    photons = photons_per_ray(values, model.dimmed)
+    return _collected(model, values, chosen, photons, MisfitMap(some, grid), unseen)
 
 
 class _Model:
     """Predicts -log(I/I0) of some views from the Gaussians of a result."""
 
-    def __init__(self, result: Result, views: DetectorViews, device: torch.device) -> None:
+    def __init__(
+        self, result: Result, views: DetectorViews, device: torch.device, behind: FilterMap | None = None
+    ) -> None:
         self.views, self.device = views, device
         self.kernel, _ = choose(device)
         self.cutoff = float(result.settings.get("cutoff", _CUTOFF))
@@ -153,6 +159,12 @@ class _Model:
         arrays = (parts["position"], parts["scale"][:, :dims], parts["rotation"], density * shares)
         self.gaussians = [torch.from_numpy(np.ascontiguousarray(a, np.float32)).to(device) for a in arrays]
         self.lines = self._spectral_lines(result)
+        self.dimmed = None
+        self.behind: tuple[torch.Tensor, ...] = ()
+        if behind is not None and result.spectrum is not None:
+            self.dimmed = behind.dimmed(result.spectrum)
+            known = (behind.attenuation(result.spectrum.energies), behind.areal, self.dimmed)
+            self.behind = tuple(torch.from_numpy(np.asarray(a, np.float32)).to(device) for a in known)
 
     def _spectral_lines(self, result: Result) -> tuple[torch.Tensor, torch.Tensor] | None:
         """Logarithm of the weights, and attenuation (energies, curves) of densities times lengths in the unit."""
@@ -174,6 +186,12 @@ class _Model:
             values = areal[0]
         else:
             logs, curves = self.lines
+            if self.behind:
+                # One curve more, whose areal density each pixel tells.
+                filters = self.behind[1].repeat_interleave(fine.rows // views.rows, 0)
+                filters = filters.repeat_interleave(fine.columns // views.columns, 1)
+                areal = torch.cat([areal, filters.expand(1, *areal.shape[1:])])
+                curves = torch.cat([curves, self.behind[0][:, None]], dim=1)
             flat = areal.reshape(areal.shape[0], -1)
             # A few rays at a time, for each has a number for every energy.
             parted = flat.split(max(1, _NUMBERS // len(logs)), dim=1)
@@ -186,6 +204,9 @@ class _Model:
             values = -torch.log(torch.exp(-values) + scatter.clamp(min=0))
         if self.physics.beam != 1.0:
             values = values - float(np.log(self.physics.beam))
+        if self.behind:
+            # Relative to the open beam behind the filter.
+            values = values - self.behind[2]
         variance = values.new_tensor([min(max(self.physics.blur, 0.0), LARGEST_BLUR)])
         return blurred(values, variance) if self.physics.blur > 0 else values
 
@@ -231,7 +252,8 @@ def _scaled(
     """Residuals of some views in units of noise, 0 where a ray is not usable, and where one is."""
     measured = torch.from_numpy(np.ascontiguousarray(values)).to(model.device)
     predicted = model.predict(some, measured)
-    noise = torch.exp(0.5 * predicted) / photons**0.5 if np.isfinite(photons) else 1.0
+    depth = predicted + model.behind[2] if model.behind else predicted
+    noise = torch.exp(0.5 * depth) / photons**0.5 if np.isfinite(photons) else 1.0
     scaled = ((predicted - measured) / noise).cpu().numpy().astype(np.float64)
     good = np.isfinite(scaled)
     return np.where(good, scaled, 0.0), good

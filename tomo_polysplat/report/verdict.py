@@ -23,6 +23,8 @@ __all__ = ["distrusted", "explained", "verdict"]
 _ODD_VIEW, _ODD_PIXEL, _ODD_PLACE = 1.5, 2.0, 2.0
 # A larger share of rays without light, left out, or of pixels that stand out is told.
 _LIGHTLESS, _LEFT_OUT, _PIXELS = 1e-4, 0.02, 0.002
+# A larger share of the volume that no ray sees is told.
+_UNSEEN = 0.005
 # Pixels of a row that a pixel is compared with.
 _BESIDE = 9
 # Times its noise that a scan is explained to at best, for its pixels to be told.
@@ -64,6 +66,9 @@ def distrusted(result: Result, residuals: Residuals | None) -> str:
     found = doubts(result.plan)
     found += [] if residuals is None else _doubts_of_residuals(result, residuals)
     found += _doubts_of_counts(result)
+    if "unseen" in result.plan and float(result.plan["unseen"].value) > _UNSEEN:
+        share = float(result.plan["unseen"].value)
+        found.append(f"{share:.1%} of the volume, which no ray sees (Result.coverage tells where)")
     ended = how_it_ended(result.plan)
     if "interrupted" in ended or "time budget" in ended:
         found.append(f"all fine detail, for the run was cut short ({ended})")

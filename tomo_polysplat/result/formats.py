@@ -96,7 +96,13 @@ def format_of(path: str | bytes | os.PathLike, argument: str = "path") -> Format
 
 
 def save_as(
-    result: Result, path: str | os.PathLike, *, overwrite: bool = False, hu: bool = False, bits: int = 32
+    result: Result,
+    path: str | os.PathLike,
+    *,
+    overwrite: bool = False,
+    hu: bool = False,
+    bits: int = 32,
+    unseen_nan: bool = False,
 ) -> None:
     """See :meth:`Result.save`."""
     from importlib import import_module
@@ -105,4 +111,8 @@ def save_as(
     kind.require(hu=hu, bits=bits, voxels=result.basis[0].size)
     module, name = kind.write.split(".")
     write: Callable[..., Any] = getattr(import_module(f"tomo_polysplat.result.{module}"), name)
-    write(result if kind.everything else image_of(result, hu=hu, bits=bits), path, overwrite=overwrite)
+    if kind.everything and unseen_nan:
+        remedy = "Result.load reads it back, whose coverage tells"
+        raise fail("unseen_nan", "a file of the volume alone", os.fsdecode(path), remedy)
+    content = result if kind.everything else image_of(result, hu=hu, bits=bits, unseen_nan=unseen_nan)
+    write(content, path, overwrite=overwrite)

@@ -90,7 +90,7 @@ class Image:
         return json.dumps(self.about())
 
 
-def image_of(result: Result, *, hu: bool = False, bits: int = 32) -> Image:
+def image_of(result: Result, *, hu: bool = False, bits: int = 32, unseen_nan: bool = False) -> Image:
     """The volume of a result.
 
     Parameters
@@ -102,6 +102,8 @@ def image_of(result: Result, *, hu: bool = False, bits: int = 32) -> Image:
     bits : {32, 16}
         32 for floating point; 16 for whole numbers from 0 to 65535 that span the volume's range. The error of
         ``slope * number + offset`` is then at most half a `slope`.
+    unseen_nan : bool
+        NaN for the voxels that no ray sees; for floating point.
 
     Raises
     ------
@@ -111,6 +113,8 @@ def image_of(result: Result, *, hu: bool = False, bits: int = 32) -> Image:
     from tomo_polysplat.report.slices import display_window
 
     require_bits(bits)
+    if unseen_nan and bits == 16:
+        raise fail("unseen_nan", "32 bits, as whole numbers have no NaN", "16")
     volume = result.volume[None, ::-1] if result.flipped_2d else result.volume
     scale, shift, quantity = 1.0, 0.0, f"1/{result.unit}"
     window = display_window(volume)
@@ -122,6 +126,9 @@ def image_of(result: Result, *, hu: bool = False, bits: int = 32) -> Image:
     elif bits == 16:
         stored, slope, offset = _whole_numbers(volume)
         slope, offset = slope * scale, offset * scale + shift
+    if unseen_nan:
+        unseen = result.coverage[None, ::-1] if result.flipped_2d else result.coverage
+        stored = np.where(unseen == 0, np.float32(np.nan), stored)
     size = result.grid.voxel_size
     return Image(
         values=stored,

@@ -116,6 +116,24 @@ class Result:
             return self._public(self.basis[0].copy())
         return self._public(self._attenuation(self.energy_kev))
 
+    @cached_property
+    def coverage(self) -> np.ndarray:
+        """Share of the views that see each voxel, float32 from 0 to 1, shaped like :attr:`volume`.
+
+        What no ray sees, 0, is not measured, and is not air; told by 90 of the views and the voxels' centres.
+
+        Raises
+        ------
+        ValueError
+            For a result without its geometry.
+        """
+        from tomo_polysplat.scan.coverage import coverage
+        from tomo_polysplat.scan.geometry import geometry_from_astra
+
+        if self.geometry is None:
+            raise fail("coverage", "a result with its geometry", "none", "reconstruct anew")
+        return self._public(coverage(geometry_from_astra(self.geometry), self.grid))
+
     def attenuation(self, kev: float) -> np.ndarray:
         """Virtual monoenergetic volume: attenuation in 1/`unit`, float32, shaped like :attr:`volume`.
 
@@ -179,7 +197,13 @@ class Result:
         return np.ascontiguousarray(volume[0, ::-1]) if self.flipped_2d else volume
 
     def save(
-        self, path: str | os.PathLike, *, overwrite: bool = False, hu: bool = False, bits: int = 32
+        self,
+        path: str | os.PathLike,
+        *,
+        overwrite: bool = False,
+        hu: bool = False,
+        bits: int = 32,
+        unseen_nan: bool = False,
     ) -> None:
         """Write to a file of the kind that the name's ending stands for.
 
@@ -197,6 +221,8 @@ class Result:
             Hounsfield units at :attr:`energy_kev` instead of attenuation: water is 0, nothing is -1000.
         bits : {32, 16}
             16 for whole numbers; the file says their slope and offset.
+        unseen_nan : bool
+            NaN for the voxels that no ray sees (:attr:`coverage`); not in ``.h5``, and not in 16 bits.
 
         Raises
         ------
@@ -209,7 +235,7 @@ class Result:
         """
         from tomo_polysplat.result.formats import save_as
 
-        save_as(self, path, overwrite=overwrite, hu=hu, bits=bits)
+        save_as(self, path, overwrite=overwrite, hu=hu, bits=bits, unseen_nan=unseen_nan)
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> Result:

@@ -7,10 +7,12 @@ import numpy as np
 from tomo_polysplat.scan.view_geometry import Geometry
 from tomo_polysplat.scan.volume_grid import VolumeGrid
 
-__all__ = ["coverage"]
+__all__ = ["coverage", "unseen_share"]
 
 # Voxels that are looked at together, so that their coordinates stay in cache.
 _AT_ONCE = 1 << 16
+# Voxels along an axis, and views, that tell how much of a volume is seen.
+_FEW_VOXELS, _FEW_VIEWS = 24, 45
 
 
 def coverage(
@@ -44,6 +46,13 @@ def coverage(
         part = np.stack(np.meshgrid(z[first : first + layers], y, x, indexing="ij")[::-1], axis=-1)
         seen[first : first + layers] = _share(some, part.reshape(-1, 3), pixels).reshape(part.shape[:3])
     return seen
+
+
+def unseen_share(geometry: Geometry, grid: VolumeGrid, pixels: np.ndarray | None = None) -> float:
+    """Share of the volume that no view sees, by some voxels and views of it; see `coverage`."""
+    slices, rows, columns = (min(n, _FEW_VOXELS) for n in grid.shape)
+    coarse = VolumeGrid((slices, rows, columns), grid.lower, grid.upper)
+    return float(np.mean(coverage(geometry, coarse, pixels, _FEW_VIEWS) == 0))
 
 
 def _share(geometry: Geometry, points: np.ndarray, pixels: np.ndarray | None) -> np.ndarray:

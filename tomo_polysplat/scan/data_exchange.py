@@ -8,7 +8,8 @@ in a group of our own, ``/polysplat``:
   ymin, ymax, zmin, zmax);
 - ``spectrum``: datasets ``energies`` (keV) and ``weights``;
 - ``truth`` (z, y, x) in 1/unit with attribute ``energy_kev``; ``metal_mask`` (z, y, x);
-  ``valid`` (like data); ``water_correction``, the coefficients of ``Scan``;
+  ``valid`` (like data); ``water_correction``, the coefficients of ``Scan``; ``filter_thickness`` (rows, columns), with
+  attributes ``material`` and ``density`` (g/cm3);
 - ``scanner``: JSON text of what a scanner's folder told (``Scan.notes["scanner"]``).
 
 The attribute ``input`` of ``/exchange/data`` tells counts, transmission and attenuation apart.
@@ -27,6 +28,7 @@ from tomo_polysplat.scan.centre import estimate_centre
 from tomo_polysplat.scan.circular import parallel_geometry
 from tomo_polysplat.scan.defects import flat_and_dark
 from tomo_polysplat.scan.dxchange_host import read_block
+from tomo_polysplat.scan.filter_map_file import read_filter_map
 from tomo_polysplat.scan.hdf5 import (
     find_array,
     find_group,
@@ -92,6 +94,7 @@ def scan_from_hdf5(path: Path, options: ReadOptions) -> Scan:
             notes=notes,
             **geometry,
             **_knowledge(file, geometry["vol_geom"], options),
+            filter_map=read_filter_map(file, projections.shape),
         )
 
 

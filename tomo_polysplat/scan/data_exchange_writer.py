@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tomo_polysplat.scan.filter_map_file import write_filter_map
 from tomo_polysplat.scan.hdf5 import write_spectrum
 from tomo_polysplat.scan.hdf5_writer import new_hdf5
 from tomo_polysplat.scan.layout import vector_form, window_of
@@ -53,6 +54,7 @@ def _write_knowledge(group: h5py.Group, scan: Scan) -> None:
         group["valid"] = scan.valid.transpose(1, 0, 2)
     if scan.water_correction is not None:
         group["water_correction"] = np.array(scan.water_correction)
+    write_filter_map(group, scan)
     if scan.metal_mask is not None:
         group["metal_mask"] = scan.metal_mask
     if scan.truth is not None:

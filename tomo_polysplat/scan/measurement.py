@@ -29,6 +29,8 @@ class Measurement:
         Rays that may be used.
     water_correction : sequence of float or None
         Coefficients of the polynomial that the scanner has put the projections through.
+    filter_map : tuple or None
+        Material and thickness of a filter in front of each pixel.
     """
 
     projections: Any
@@ -38,6 +40,7 @@ class Measurement:
     spectrum: Spectrum | None
     valid: Any
     water_correction: Sequence[float] | None
+    filter_map: Sequence[Any] | None = None
 
     def filled(self) -> Measurement:
         """With what a `Scan` brings, where nothing else is named beside it.
@@ -58,6 +61,7 @@ class Measurement:
             spectrum,
             scan.usable if self.valid is None else self.valid,
             correction,
+            scan.filter_map if self.filter_map is None else self.filter_map,
         )
 
     def geometries(self) -> tuple[Mapping[str, Any], Mapping[str, Any]]:

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 
 import numpy as np
 
-from tomo_polysplat.scan.check import DEFECT, Finding, check_scan
+from tomo_polysplat.scan.check import DEFECT, Finding, asked, check_scan, nothing_to_see
 from tomo_polysplat.scan.layout import vector_form
+from tomo_polysplat.scan.probes.measured import Measured
+from tomo_polysplat.scan.probes.opposite import CENTRE, DIRECTION, probe_centre_and_direction
 from tomo_polysplat.scan.scan import Scan
 
 __all__ = ["mend_scan"]
 
+logger = logging.getLogger(__name__)
+
+# Whose defects leave nothing sure about the axis.
+_GRAVE = (DIRECTION, "logarithm", "order of axes", "order of views")
 # An axis is moved that is known to this standard error, in columns.
 _SURE_OF_AXIS = 0.1
 
@@ -33,9 +40,13 @@ def mend_scan(scan: Scan, findings: list[Finding] | None = None) -> tuple[Scan, 
     list of str
         What was done, a sentence each.
     """
-    for finding in check_scan(scan) if findings is None else findings:
-        sure = finding.uncertainty is not None and finding.uncertainty <= _SURE_OF_AXIS
-        if finding.probe == "centre" and finding.verdict == DEFECT and sure:
+    if findings is None:
+        # One question first, which is quick: most scans are good.
+        findings = check_scan(scan) if _axis_looks_off(scan) else []
+    if any(finding.probe != CENTRE and finding.misleading for finding in findings if finding.probe in _GRAVE):
+        return scan, []
+    for finding in findings:
+        if _is_sure(finding):
             offset = finding.values["offset"]
             geometry = dict(vector_form(scan.proj_geom))
             vectors = np.array(geometry["Vectors"], np.float64)
@@ -44,5 +55,20 @@ def mend_scan(scan: Scan, findings: list[Finding] | None = None) -> tuple[Scan, 
             done = (
                 f"the detector was moved by {-offset:.2f} columns (standard error {finding.uncertainty:.2g})"
             )
+            logger.warning("%s: %s; mend=False or --no-mend leaves it.", done.capitalize(), finding.text)
             return replace(scan, proj_geom=geometry), [f"{done}: {finding.text}"]
     return scan, []
+
+
+def _is_sure(finding: Finding) -> bool:
+    """Whether it is an axis that is off, and known well."""
+    known = finding.uncertainty is not None and finding.uncertainty <= _SURE_OF_AXIS
+    return finding.probe == CENTRE and finding.verdict == DEFECT and known
+
+
+def _axis_looks_off(scan: Scan) -> bool:
+    """What `check_scan` asks of the axis, without the questions before."""
+    measured = Measured(scan)
+    if nothing_to_see(measured):
+        return False
+    return any(map(_is_sure, asked(probe_centre_and_direction, (CENTRE, DIRECTION), measured)))

@@ -16,7 +16,9 @@ _BINS = 16
 _LARGEST_EXPONENT = 700.0
 
 
-def photons_per_ray(projections: np.ndarray | torch.Tensor) -> float:
+def photons_per_ray(
+    projections: np.ndarray | torch.Tensor, dimmed: np.ndarray | torch.Tensor | None = None
+) -> float:
     """Photons of an unattenuated ray, from the scatter of neighbouring pixels.
 
     Counts that are Poisson distributed give ``-log(I/I0)`` a variance ``exp(P) / I0``. The variance is taken
@@ -28,6 +30,8 @@ def photons_per_ray(projections: np.ndarray | torch.Tensor) -> float:
     ----------
     projections : (views, rows, columns) array or tensor
         -log(I/I0); NaN where a ray is unusable.
+    dimmed : (rows, columns) array or tensor, optional
+        -log of the share of the beam that reaches each pixel through a filter of its own.
 
     Returns
     -------
@@ -37,9 +41,13 @@ def photons_per_ray(projections: np.ndarray | torch.Tensor) -> float:
     if projections.shape[2] < 5:
         return float("inf")
     some = projections[:: max(1, len(projections) // _VIEWS)]
-    some = some[:, :: max(1, -(-math.prod(some.shape) // _MOST))]
+    rows = max(1, -(-math.prod(some.shape) // _MOST))
+    some = some[:, ::rows]
     some = torch.from_numpy(some.astype(np.float64)) if isinstance(some, np.ndarray) else some.double()
     difference = (some[..., 3:-1] - 2 * some[..., 2:-2] + some[..., 1:-3]).abs()
+    if dimmed is not None:
+        # As if the pixels had the whole beam: what bins go by is the object alone.
+        difference *= torch.exp(-0.5 * torch.as_tensor(dimmed)[::rows, 2:-2].to(difference))
     # Bins go by the pixels beside the three: if they went by a pixel's own value, its noise would be sorted away.
     middle = 0.5 * (some[..., 4:] + some[..., :-4])
     good = torch.isfinite(difference) & torch.isfinite(middle)

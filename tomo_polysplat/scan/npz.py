@@ -5,7 +5,8 @@
 ``vol_window`` (xmin, xmax, ymin, ymax, zmin, zmax); optional ``unit`` (cm if absent), ``energies`` (keV) with
 ``spectrum``, ``truth_mu`` and ``metal_mask`` (z, y, x), ``e_ref`` or ``e_eff`` (keV, energy of the truth) and
 ``valid`` (like the projections) and ``carries_water_correction`` (coefficients of ``Scan.water_correction``; a key
-``water_correction`` without "carries" is found in files whose correction was undone, and is not read).
+``water_correction`` without "carries" is found in files whose correction was undone, and is not read); and of
+``Scan.filter_map`` ``filter_thickness`` (rows, columns) in the unit, ``filter_material`` and ``filter_density``.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ __all__ = ["scan_from_npz", "write_npz"]
 # Numbers that those may have whose size does not go with the scan's.
 _MOST = {
     **dict.fromkeys(("astra_type", "unit", "spectrum_label", "e_ref", "e_eff"), 1),
+    **dict.fromkeys(("filter_material", "filter_density"), 1),
     "vol_shape": 3,
     "vol_window": 6,
     "carries_water_correction": 100,
@@ -77,6 +79,7 @@ def scan_from_npz(path: Path, options: ReadOptions) -> Scan:
         truth_energy_kev=archived_number(arrays, "e_ref", "e_eff"),
         name=path.stem,
         water_correction=_water_correction(arrays, options),
+        filter_map=_filter_map(arrays),
         notes={"input": "attenuation", "rays": counts},
         **_geometry(arrays, (rows, views, columns), options),
     )
@@ -87,7 +90,11 @@ def _sizes(arrays: dict[str, np.ndarray]) -> dict[str, int]:
     shape, projections = arrays.get("vol_shape"), arrays.get("projections")
     found = {}
     if projections is not None:
-        found = {"valid": projections.size, "vectors": _PER_VECTOR * len(np.atleast_1d(projections))}
+        found = {
+            "valid": projections.size,
+            "filter_thickness": projections.size,
+            "vectors": _PER_VECTOR * len(np.atleast_1d(projections)),
+        }
     if shape is not None and shape.dtype.kind in "iuf":
         voxels = math.prod(int(n) for n in shape.flat if 0 < n < 2**31)
         found |= dict.fromkeys(("truth_mu", "metal_mask"), voxels)
@@ -125,6 +132,14 @@ def _water_correction(arrays: dict[str, np.ndarray], options: ReadOptions) -> tu
     return tuple(arrays["carries_water_correction"]) if "carries_water_correction" in arrays else None
 
 
+def _filter_map(arrays: dict[str, np.ndarray]) -> tuple[Any, ...] | None:
+    material = archived_text(arrays, "filter_material")
+    if material is None or "filter_thickness" not in arrays:
+        return None
+    thickness, density = arrays["filter_thickness"], archived_number(arrays, "filter_density")
+    return (material, thickness) if density is None else (material, thickness, density)
+
+
 def write_npz(scan: Scan, path: str | Path, *, overwrite: bool = False) -> None:
     """Write a scan as ``.npz``; see the module's description for what it holds."""
     geometry = vector_form(scan.proj_geom)
@@ -144,6 +159,9 @@ def write_npz(scan: Scan, path: str | Path, *, overwrite: bool = False) -> None:
     if scan.spectrum is not None:
         content |= {"energies": scan.spectrum.energies, "spectrum": scan.spectrum.weights}
         content["spectrum_label"] = scan.spectrum.label
+    if scan.filter_map is not None:
+        names = ("filter_material", "filter_thickness", "filter_density")
+        content |= dict(zip(names, scan.filter_map))
     arrays = {name: np.asarray(value) for name, value in content.items() if value is not None}
     needed = sum(array.nbytes for array in arrays.values())
     with (

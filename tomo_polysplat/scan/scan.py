@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tomo_polysplat.checks import fail, require_array, require_choice, require_shape
+from tomo_polysplat.physics.filter_map import require_filter_map
 from tomo_polysplat.physics.water_correction import require_water_correction
 from tomo_polysplat.units import LENGTH_UNITS
 
@@ -51,6 +52,9 @@ class Scan:
     water_correction : tuple of float or None
         Coefficients c_0 = 0, c_1, ... of the polynomial in -log(I/I0) that the scanner has applied to
         ``projections``; None if it has applied none.
+    filter_map : (material, thickness) or (material, thickness, density), or None
+        Filter that is not everywhere as thick, such as a bowtie, with its thickness (rows, columns) in `unit`; see
+        :func:`tomo_polysplat.reconstruct`.
     notes : dict
         Counts and choices made while reading, such as the number of rays without light.
     """
@@ -66,6 +70,7 @@ class Scan:
     name: str = "scan"
     valid: np.ndarray | None = None
     water_correction: tuple[float, ...] | None = None
+    filter_map: tuple[Any, ...] | None = None
     notes: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -78,6 +83,8 @@ class Scan:
         if self.valid is not None:
             self.valid = np.ascontiguousarray(self.valid, bool)
             require_shape("valid", self.valid, self.projections.shape, "(rows, views, columns)")
+        if self.filter_map is not None:
+            self.filter_map = require_filter_map(self.filter_map)
         if self.water_correction is not None:
             self.water_correction = require_water_correction(self.water_correction)
         if self.truth is not None:

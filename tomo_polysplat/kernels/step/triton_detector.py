@@ -48,8 +48,9 @@ def _taps(index, count, STEP: tl.constexpr, variance):
 
 @triton.jit(do_not_specialize=SIZES)
 def _sharp_kernel(
-    raw, sharp, table, log_weights, attenuation, largest, area, columns, nodes, areal_scale,
-    CURVES: tl.constexpr, CONE: tl.constexpr, DOWN: tl.constexpr, ACROSS: tl.constexpr, BLOCK: tl.constexpr,
+    raw, sharp, table, log_weights, attenuation, behind, by_node, largest, area, columns, nodes, areal_scale,
+    CURVES: tl.constexpr, FILTERED: tl.constexpr, CONE: tl.constexpr, DOWN: tl.constexpr, ACROSS: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
     k = tl.program_id(1).to(tl.int64)
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -61,8 +62,9 @@ def _sharp_kernel(
             ray = (row * DOWN + i) * (columns * ACROSS) + column * ACROSS + j
             factor = pixel_factor(table, k, ray, columns * ACROSS, CONE) * areal_scale
             most, predicted, _, _, _ = sharp_projection(
-                raw, k * area * (DOWN * ACROSS) + ray, factor, log_weights, attenuation, nodes, CURVES
-            )
+                raw, k * area * (DOWN * ACROSS) + ray, factor, log_weights, attenuation, nodes,
+                behind, by_node, within, area, CURVES, FILTERED,
+            )  # fmt: skip
             tl.atomic_max(largest, tl.max(most, 0), sem="relaxed")
             if DOWN * ACROSS > 1:
                 before, largest_term = largest_term, tl.maximum(largest_term, -predicted)
@@ -74,9 +76,9 @@ def _sharp_kernel(
 
 @triton.jit(do_not_specialize=SIZES)
 def _blurred_kernel(
-    sharp, slopes, blur, grad_blur, chosen, projections, totals, sums,
+    sharp, slopes, blur, grad_blur, chosen, projections, totals, behind, sums,
     area, rows, columns, first, of_step, noise, held_out, corner,
-    HUBER: tl.constexpr, BLOCK: tl.constexpr,
+    FILTERED: tl.constexpr, HUBER: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     k = tl.program_id(1).to(tl.int64)
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -94,7 +96,7 @@ def _blurred_kernel(
             by_variance += (slope_v * along_u + along_v * slope_u) * beside
     slope = ray_misfit(
         predicted, projections, totals, chosen, sums, first + k, pixel, inside, area, of_step, noise, held_out,
-        corner, HUBER,
+        corner, behind, HUBER, FILTERED,
     )  # fmt: skip
     slope = tl.where(inside, slope, 0.0)
     total = tl.sum((slope * by_variance).to(tl.float64), 0)
@@ -104,10 +106,10 @@ def _blurred_kernel(
 
 @triton.jit(do_not_specialize=SIZES)
 def _gather_kernel(
-    raw, sharp, pixels, table, slopes, blur, log_weights, attenuation,
+    raw, sharp, pixels, table, slopes, blur, log_weights, attenuation, behind, by_node,
     area, rows, columns, room, beyond, many, nodes, areal_scale,
-    CURVES: tl.constexpr, CONE: tl.constexpr, FOLD: tl.constexpr, DOWN: tl.constexpr, ACROSS: tl.constexpr,
-    BLOCK: tl.constexpr,
+    CURVES: tl.constexpr, FILTERED: tl.constexpr, CONE: tl.constexpr, FOLD: tl.constexpr,
+    DOWN: tl.constexpr, ACROSS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     k = tl.program_id(1).to(tl.int64)
     ray = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -118,7 +120,10 @@ def _gather_kernel(
     pixel = row * columns + column
     factor = pixel_factor(table, k, ray, rays_across, CONE) * areal_scale
     at = k * rays + tl.minimum(ray, rays - 1)
-    _, predicted, d0, d1, d2 = sharp_projection(raw, at, factor, log_weights, attenuation, nodes, CURVES)
+    _, predicted, d0, d1, d2 = sharp_projection(
+        raw, at, factor, log_weights, attenuation, nodes, behind, by_node, tl.minimum(pixel, area - 1), area,
+        CURVES, FILTERED,
+    )  # fmt: skip
     gathered = tl.zeros([BLOCK], tl.float32)
     for i in tl.static_range(-1, 2):
         along_v, _, there_v = _taps(row, rows, i, variance)
@@ -147,27 +152,29 @@ def detected_misfit_gradient(splat: Splat, blur: torch.Tensor, grad_blur: torch.
     """
     views, measurement, pixels = splat.views, splat.measurement, splat.gradient()
     log_weights, attenuation, nodes = splat.spectrum()
+    (behind, by_node), filtered = splat.filters(), measurement.behind is not None
     down, across = splat.parts
     rows, columns = views.rows // down, views.columns // across
     size = (2, len(views) * splat.area)
     sharp, slopes = torch.empty(size, dtype=torch.float32, device=splat.raw.device)
     with on_device(splat.raw):
         _sharp_kernel[splat.blocks()](
-            splat.raw, sharp, splat.table, log_weights, attenuation, splat.largest,
+            splat.raw, sharp, splat.table, log_weights, attenuation, behind, by_node, splat.largest,
             splat.area, columns, nodes, measurement.areal_scale,
-            CURVES=measurement.curves, CONE=views.cone, DOWN=down, ACROSS=across, BLOCK=PIXELS_A_PROGRAM,
-            num_warps=4,
+            CURVES=measurement.curves, FILTERED=filtered, CONE=views.cone, DOWN=down, ACROSS=across,
+            BLOCK=PIXELS_A_PROGRAM, num_warps=4,
         )  # fmt: skip
         _blurred_kernel[splat.blocks()](
             sharp, slopes, blur, grad_blur, splat.chosen, measurement.projections, measurement.totals,
-            splat.sums, splat.area, rows, columns, splat.first, splat.of_step,
+            behind, splat.sums, splat.area, rows, columns, splat.first, splat.of_step,
             measurement.noise, measurement.held_out, measurement.corner,
-            HUBER=measurement.corner > 0, BLOCK=PIXELS_A_PROGRAM, num_warps=4,
+            FILTERED=filtered, HUBER=measurement.corner > 0, BLOCK=PIXELS_A_PROGRAM, num_warps=4,
         )  # fmt: skip
         _gather_kernel[splat.gradient_blocks()](
             splat.raw, sharp, pixels, splat.table, slopes, blur, log_weights, attenuation,
-            splat.area, rows, columns, *gradient_room(views), len(views), nodes,
-            measurement.areal_scale, CURVES=measurement.curves, CONE=views.cone, FOLD=folded(views),
+            behind, by_node, splat.area, rows, columns, *gradient_room(views), len(views), nodes,
+            measurement.areal_scale, CURVES=measurement.curves, FILTERED=filtered, CONE=views.cone,
+            FOLD=folded(views),
             DOWN=down, ACROSS=across, BLOCK=PIXELS_A_PROGRAM, num_warps=4,
         )  # fmt: skip
     return pixels

@@ -52,6 +52,11 @@ class Measurement:
         Line integral of the kernels to g/cm2, or to -log(I/I0) without nodes.
     nodes : pair of tensors or None
         (n, 1) log weights and (n, 3) or (n, 1) attenuation of the spectrum.
+    behind : tensor, optional
+        (3, rows, columns) float32: areal density of the filter that each pixel is behind, P of the nodes through it
+        alone, and -log of the share of the beam that passes it.
+    by_node : tensor, optional
+        (n,) attenuation of that filter at the nodes.
     """
 
     projections: torch.Tensor
@@ -61,6 +66,8 @@ class Measurement:
     corner: float
     areal_scale: float
     nodes: tuple[torch.Tensor, torch.Tensor] | None
+    behind: torch.Tensor | None = None
+    by_node: torch.Tensor | None = None
 
     @property
     def curves(self) -> int:
@@ -124,6 +131,11 @@ class Splat:
         log_weights, attenuation = self.measurement.nodes or (self.raw, self.raw)
         return log_weights, attenuation, 0 if self.measurement.nodes is None else len(log_weights)
 
+    def filters(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Filters of the pixels and their attenuation at the nodes; without them two tensors that are not read."""
+        behind, by_node = self.measurement.behind, self.measurement.by_node
+        return self.raw if behind is None else behind, self.raw if by_node is None else by_node
+
     def blocks(self) -> tuple[int, int]:
         """The grid of a kernel over the pixels of each view."""
         return triton.cdiv(self.area, PIXELS_A_PROGRAM), len(self.views)
@@ -134,22 +146,32 @@ class Splat:
 
 
 @triton.jit
-def _one_curve(a, log_weights, attenuation, nodes):
+def _log_weight(log_weights, k, filter, by_node, FILTERED: tl.constexpr):
+    """Of a node, behind the pixel's filter."""
+    weight = tl.load(log_weights + k)
+    if FILTERED:
+        weight -= filter * tl.load(by_node + k)
+    return weight
+
+
+@triton.jit
+def _one_curve(a, log_weights, attenuation, nodes, filter, by_node, FILTERED: tl.constexpr):
     """P and its derivative by the areal density of the first material."""
     largest = tl.full(a.shape, float("-inf"), tl.float32)
     for k in range(nodes):
-        largest = tl.maximum(largest, tl.load(log_weights + k) - a * tl.load(attenuation + k))
+        weight = _log_weight(log_weights, k, filter, by_node, FILTERED)
+        largest = tl.maximum(largest, weight - a * tl.load(attenuation + k))
     total, slope = tl.zeros_like(a), tl.zeros_like(a)
     for k in range(nodes):
         b = tl.load(attenuation + k)
-        term = tl.exp(tl.load(log_weights + k) - a * b - largest)
+        term = tl.exp(_log_weight(log_weights, k, filter, by_node, FILTERED) - a * b - largest)
         total += term
         slope += term * b
     return -(largest + tl.log(total)), slope / total
 
 
 @triton.jit
-def _beer_lambert(a0, a1, a2, log_weights, attenuation, nodes):
+def _beer_lambert(a0, a1, a2, log_weights, attenuation, nodes, filter, by_node, FILTERED: tl.constexpr):
     """P and its derivatives by the three areal densities."""
     largest = tl.full(a0.shape, float("-inf"), tl.float32)
     for k in range(nodes):
@@ -158,7 +180,8 @@ def _beer_lambert(a0, a1, a2, log_weights, attenuation, nodes):
             tl.load(attenuation + 3 * k + 1),
             tl.load(attenuation + 3 * k + 2),
         )
-        largest = tl.maximum(largest, tl.load(log_weights + k) - (a0 * b0 + a1 * b1 + a2 * b2))
+        weight = _log_weight(log_weights, k, filter, by_node, FILTERED)
+        largest = tl.maximum(largest, weight - (a0 * b0 + a1 * b1 + a2 * b2))
     total, d0, d1, d2 = tl.zeros_like(a0), tl.zeros_like(a0), tl.zeros_like(a0), tl.zeros_like(a0)
     for k in range(nodes):
         b0, b1, b2 = (
@@ -166,7 +189,8 @@ def _beer_lambert(a0, a1, a2, log_weights, attenuation, nodes):
             tl.load(attenuation + 3 * k + 1),
             tl.load(attenuation + 3 * k + 2),
         )
-        term = tl.exp(tl.load(log_weights + k) - (a0 * b0 + a1 * b1 + a2 * b2) - largest)
+        weight = _log_weight(log_weights, k, filter, by_node, FILTERED)
+        term = tl.exp(weight - (a0 * b0 + a1 * b1 + a2 * b2) - largest)
         total += term
         d0 += term * b0
         d1 += term * b1
@@ -183,28 +207,38 @@ def _is_held_out(view, pixel, held_out):
 
 
 @triton.jit
-def sharp_projection(raw, at, factor, log_weights, attenuation, nodes, CURVES: tl.constexpr):
+def sharp_projection(
+    raw, at, factor, log_weights, attenuation, nodes, behind, by_node, pixel, area,
+    CURVES: tl.constexpr, FILTERED: tl.constexpr,
+):  # fmt: skip
     """Largest number of the splat's image, P of the rays through pixels' centres, and its derivatives."""
+    filter, alone = 0.0, 0.0
+    if FILTERED:
+        filter, alone = tl.load(behind + pixel), tl.load(behind + area + pixel)
     if CURVES == 0:
         a0 = tl.load(raw + at)
         one = tl.full(a0.shape, 1.0, tl.float32)
         return a0, a0 * factor, one, one, one
     if CURVES == 1:
         a0 = tl.load(raw + at)
-        predicted, d0 = _one_curve(a0 * factor, log_weights, attenuation, nodes)
+        predicted, d0 = _one_curve(a0 * factor, log_weights, attenuation, nodes, filter, by_node, FILTERED)
+        if FILTERED:
+            predicted -= alone
         return a0, predicted, d0, d0, d0
     a0, a1, a2, _ = load_four(raw + 4 * at)
     most = tl.maximum(a0, tl.maximum(a1, a2))
     predicted, d0, d1, d2 = _beer_lambert(
-        a0 * factor, a1 * factor, a2 * factor, log_weights, attenuation, nodes
+        a0 * factor, a1 * factor, a2 * factor, log_weights, attenuation, nodes, filter, by_node, FILTERED
     )
+    if FILTERED:
+        predicted -= alone
     return most, predicted, d0, d1, d2
 
 
 @triton.jit
 def ray_misfit(
-    predicted, projections, totals, chosen, sums, k, pixel, inside, area, of_step, noise, held_out, corner,
-    HUBER: tl.constexpr,
+    predicted, projections, totals, chosen, sums, k, pixel, inside, area, of_step, noise, held_out, corner, behind,
+    HUBER: tl.constexpr, FILTERED: tl.constexpr,
 ):  # fmt: skip
     """Gradient of the misfit by the projection; what there is to read of it is added to ``sums``."""
     view, slot = tl.load(chosen + k).to(tl.int64), tl.load(chosen + of_step + k).to(tl.int64)
@@ -212,7 +246,10 @@ def ray_misfit(
     usable = tl.abs(value) < float("inf")
     value = tl.where(usable, value, 0.0)
     # The exponential of an opaque ray may be infinite, which is not to be multiplied by zero.
-    variance = tl.where(noise > 0, tl.exp(value) * noise, 0.0)
+    depth = value
+    if FILTERED:
+        depth += tl.load(behind + 2 * area + pixel, mask=inside, other=0.0)
+    variance = tl.where(noise > 0, tl.exp(depth) * noise, 0.0)
     weight = tl.where(usable, tl.math.rsqrt(1.0 + variance), 0.0)
     aside = _is_held_out(view, pixel, held_out)
     residual = predicted - value
@@ -245,21 +282,25 @@ def store_gradients(pixels, to, slope, d0, d1, d2, live, CURVES: tl.constexpr):
 
 @triton.jit(do_not_specialize=SIZES)
 def _misfit_kernel(
-    raw, pixels, table, chosen, projections, totals, log_weights, attenuation, sums, largest,
+    raw, pixels, table, chosen, projections, totals, log_weights, attenuation, behind, by_node, sums, largest,
     area, columns, room, beyond, many, first, of_step, nodes, noise, held_out, corner, areal_scale,
-    CURVES: tl.constexpr, CONE: tl.constexpr, HUBER: tl.constexpr, FOLD: tl.constexpr, BLOCK: tl.constexpr,
+    CURVES: tl.constexpr, FILTERED: tl.constexpr, CONE: tl.constexpr, HUBER: tl.constexpr, FOLD: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
     k = tl.program_id(1).to(tl.int64)
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = pixel < area
     live = pixel < room + tl.where(k == many - 1, beyond, 0)
     factor = pixel_factor(table, k, pixel, columns, CONE) * areal_scale
-    at = k * area + tl.minimum(pixel, area - 1)
-    most, predicted, d0, d1, d2 = sharp_projection(raw, at, factor, log_weights, attenuation, nodes, CURVES)
+    within = tl.minimum(pixel, area - 1)
+    most, predicted, d0, d1, d2 = sharp_projection(
+        raw, k * area + within, factor, log_weights, attenuation, nodes, behind, by_node, within, area,
+        CURVES, FILTERED,
+    )  # fmt: skip
     tl.atomic_max(largest, tl.max(most, 0), sem="relaxed")
     slope = ray_misfit(
         predicted, projections, totals, chosen, sums, first + k, pixel, inside, area, of_step, noise, held_out,
-        corner, HUBER,
+        corner, behind, HUBER, FILTERED,
     )  # fmt: skip
     to = k * room + place(pixel, columns, FOLD)
     store_gradients(pixels, to, slope * factor, d0, d1, d2, live, CURVES)
@@ -272,10 +313,11 @@ def misfit_gradient(splat: Splat) -> torch.Tensor:
     with on_device(splat.raw):
         _misfit_kernel[splat.gradient_blocks()](
             splat.raw, pixels, splat.table, splat.chosen, measurement.projections, measurement.totals,
-            log_weights, attenuation, splat.sums, splat.largest,
+            log_weights, attenuation, *splat.filters(), splat.sums, splat.largest,
             splat.area, splat.views.columns, *gradient_room(splat.views), len(splat.views), splat.first,
             splat.of_step, nodes, measurement.noise, measurement.held_out, measurement.corner, measurement.areal_scale,
-            CURVES=measurement.curves, CONE=splat.views.cone, HUBER=measurement.corner > 0,
+            CURVES=measurement.curves, FILTERED=measurement.behind is not None,
+            CONE=splat.views.cone, HUBER=measurement.corner > 0,
             FOLD=folded(splat.views), BLOCK=PIXELS_A_PROGRAM, num_warps=4,
         )  # fmt: skip
     return pixels

@@ -6,6 +6,9 @@ import numpy as np
 
 __all__ = ["Alike"]
 
+# Of the difference between pixels, so much is noise at least.
+_LEAST_NOISE = 0.3
+
 
 class Alike:
     """Views as a few hundred values each, taken twice from different pixels.
@@ -46,6 +49,12 @@ class Alike:
         products = self.first @ self.second.T / size
         own = np.diag(products)
         return own[:, None] + own[None] - products - products.T
+
+    def learn_noise(self, squared: np.ndarray) -> None:
+        """Take the noise from the scatter of what ought to be alike, where that is less: pixels' detail is no noise."""
+        scatter = 1.4826 * float(np.median(np.abs(squared - np.median(squared))))
+        learnt = max(0.5 * scatter * self.first.shape[1] ** 0.5, _LEAST_NOISE * self.noise)
+        self.noise = min(self.noise, learnt)
 
     def error(self, squared: np.ndarray | float) -> np.ndarray:
         """Standard error from noise of a squared difference."""

@@ -22,6 +22,8 @@ _FRAMES, _SAME = 0.05, 0.3
 _SATURATED = 0.01
 # Rays that tell whether there is noise: 1.4 of noise is new in the next view.
 _FEWEST, _NEW = 50, 0.8
+# Largest numbers of cameras with 8 to 16 bits.
+_LIMITS = 2.0 ** np.array([8, 10, 12, 14, 16]) - 1
 
 
 def probe_beam(measured: Measured) -> Finding:
@@ -36,7 +38,7 @@ def probe_beam(measured: Measured) -> Finding:
     numbers = {"level": air.level, "same": air.share}
     if abs(air.level) > _TOLERATED + _SURE * air.error:
         factor = np.exp(-air.level)
-        text = f"the rays beside the object hold {air.level:+.3f} instead of 0: {factor:.3g} times the flats' light"
+        text = f"beside the object -log(I/I0) is {air.level:+.3f} instead of 0: {factor:.3g} times the flats' light"
         remedy = "take flats at the projections' exposure, or subtract what the rays beside the object hold"
         return Finding(BEAM, DEFECT, text, remedy, numbers, air.error)
     drift, error = _common_change(air)
@@ -49,7 +51,11 @@ def probe_beam(measured: Measured) -> Finding:
         return Finding(
             BEAM, UNKNOWN, "the rays beside the object are too few or noisy", "more light", numbers, error
         )
-    return Finding(BEAM, OK, f"the rays beside the object hold {air.level:+.2g}", "", numbers, air.error)
+    share = 100 * -np.expm1(-abs(air.level))
+    side = "less" if air.level > 0 else "more"
+    right = f"up to {100 * _TOLERATED:g} % is right"
+    text = f"beside the object there is {share:.2g} % {side} light than in the flats ({right})"
+    return Finding(BEAM, OK, text, "", numbers, air.error)
 
 
 def _frames(notes: dict[str, Any]) -> tuple[str, str] | None:
@@ -85,7 +91,9 @@ def _saturated(measured: Measured) -> tuple[str, str] | None:
     if air is None or air.share < _SAME:
         return None
     # Air without noise is the same everywhere.
-    if not _noisy(measured):
+    white = np.asarray(measured.scan.notes.get("white_frames", ()), np.float64)
+    at_limit = len(white) > 0 and bool(np.isin(white, _LIMITS).all())
+    if not (at_limit or _noisy(measured)):
         return None
     text = f"{100 * air.share:.0f} % of the rays beside the object hold the very same value: saturated"
     return text, remedy

@@ -25,6 +25,10 @@ _SURE = 4.0
 _FURTHER, _FAR, _ELSEWHERE = 2.5, 0.3, 0.5
 # The share is less where neighbours hardly differ: so many times their median, but not less than the second.
 _TIMES, _LEAST = 10.0, 0.05
+# Share of the views that have to stand out in other places, for the order to be right.
+_POWER = 0.2
+# Views are in one place that are closer than this share of a step.
+_ONE_PLACE = 0.1
 
 
 def probe_order(measured: Measured) -> Finding:
@@ -43,6 +47,7 @@ def probe_order(measured: Measured) -> Finding:
     count = len(chosen)
     usual = float(squared.sum() / (count * (count - 1)))
     by_place = squared[np.arange(count), near[:, 0]]
+    views.learn_noise(by_place)
     if usual < _SURE * max(float(views.error(usual)) / np.sqrt(count), 1e-12):
         text = "the views do not differ beyond their noise: any order is as good"
         return Finding(ORDER, UNKNOWN, text, "more light, or an object that is not round")
@@ -63,9 +68,23 @@ def probe_order(measured: Measured) -> Finding:
         text = f"views {named} do not look like their neighbours, but like views from elsewhere"
         return Finding(ORDER, DEFECT, text, "leave them out, or mend their order or angle", numbers, doubt)
     text = f"views from neighbouring places differ {100 * max(ratio, 0):.2g} % as much as any two views"
+    if _ends_where_it_began(measured):
+        text += "; the last view is told to be where the first is"
+        remedy = "right if the stage went there; else the angles want numpy.linspace(..., endpoint=False)"
+        return Finding(ORDER, UNKNOWN, text, remedy, numbers, doubt)
+    if ratio < _UNLIKE and rank < _RANDOM and _would_show(views, squared, near, usual) < _POWER:
+        text += ", but many would not stand out elsewhere either"
+        return Finding(ORDER, UNKNOWN, text, "more light, or an object that is not round", numbers, doubt)
     if ratio < _UNLIKE and rank < _RANDOM:
         return Finding(ORDER, OK, text, "", numbers, doubt)
     return Finding(ORDER, UNKNOWN, text, "more views, or more light", numbers, doubt)
+
+
+def _ends_where_it_began(measured: Measured) -> bool:
+    """Whether the first and the last view are told to be in one place."""
+    steps = np.linalg.norm(np.diff(measured.places, axis=0), axis=1)
+    apart = float(np.linalg.norm(measured.places[-1] - measured.places[0]))
+    return apart < _ONE_PLACE * float(np.median(steps))
 
 
 def blurred_views(measured: Measured, chosen: np.ndarray, step: float) -> Alike:
@@ -92,12 +111,39 @@ def _misplaced(views: Alike, squared: np.ndarray, near: np.ndarray, usual: float
     """Views unlike both of their neighbours, which are like each other, and like views from elsewhere."""
     own = np.arange(len(near))
     nearer = np.minimum(squared[own, near[:, 0]], squared[own, near[:, 1]])
-    between = squared[near[:, 0], near[:, 1]]
-    error = views.error(nearer)
-    apart = nearer - _FURTHER * np.maximum(between, 0) > _SURE * error
-    apart &= nearer > np.clip(_TIMES * float(np.median(nearer)), _LEAST * usual, _FAR * usual)
     elsewhere = squared.copy()
     elsewhere[own[:, None], near] = elsewhere[own, own] = np.inf
+    typical = float(np.median(nearer))
+    return np.flatnonzero(
+        _shows(views, nearer, squared[near[:, 0], near[:, 1]], elsewhere.min(axis=1), typical, usual)
+    )
+
+
+def _would_show(views: Alike, squared: np.ndarray, near: np.ndarray, usual: float) -> float:
+    """Share of the views that would be seen to be misplaced, were each half a scan away."""
+    own = np.arange(len(near))
+    there = np.roll(near, len(near) // 2, axis=0)
+    nearer = np.minimum(squared[own, there[:, 0]], squared[own, there[:, 1]])
+    at_home = np.minimum(squared[own, near[:, 0]], squared[own, near[:, 1]])
+    between = squared[there[:, 0], there[:, 1]]
+    return float(_shows(views, nearer, between, at_home, float(np.median(at_home)), usual).mean())
+
+
+def _shows(
+    views: Alike, nearer: np.ndarray, between: np.ndarray, like: np.ndarray, typical: float, usual: float
+) -> np.ndarray:
+    """Whether views that differ so much from the nearer neighbour, and less from another view, are misplaced.
+
+    Parameters
+    ----------
+    nearer, between, like : (views,) arrays
+        Squared difference of a view from the nearer of its neighbours, of these from each other, and of the view from
+        the one it is most like.
+    typical, usual : float
+        Median of the first over a scan in order, and mean of any two views.
+    """
+    error = views.error(nearer)
+    apart = nearer - _FURTHER * np.maximum(between, 0) > _SURE * error
+    apart &= nearer > np.clip(_TIMES * typical, _LEAST * usual, _FAR * usual)
     # The best of many: chance finds one more easily.
-    like = elsewhere.min(axis=1)
-    return np.flatnonzero(apart & (like < _ELSEWHERE * nearer) & (nearer - like > _SURE * 1.5 * error))
+    return apart & (like < _ELSEWHERE * nearer) & (nearer - like > _SURE * 1.5 * error)

@@ -30,13 +30,12 @@ def probe_coverage(measured: Measured) -> Finding:
     text = f"no ray sees {100 * unseen:.2g} % of the volume: what is there is not measured, which is not air"
     remedy = "make the volume no larger than the view, or move the detector"
     for name, row in (("first", 0), ("last", measured.scan.rows - 1)):
-        good = measured.valid[row]
-        values = np.where(good, measured.scan.projections[row], np.nan)
-        if measured.scan.rows < 2 or not good.any():
-            continue
+        values = np.where(measured.valid[row], measured.scan.projections[row], np.nan)
         # The middle half: what is truncated in rows goes on over the axis.
         quarter = values.shape[1] // 4
         middle = values[:, quarter : values.shape[1] - quarter]
+        if measured.scan.rows < 2 or not np.isfinite(middle).any():
+            continue
         if np.nanmedian(middle) > _MATTER * measured.level:
             text += f"; the object goes on beyond the {name} row"
             return Finding(COVERAGE, DEFECT, text, remedy, numbers)

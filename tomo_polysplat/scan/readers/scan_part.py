@@ -32,6 +32,11 @@ def scan_part(scan: Scan, part: Part) -> Scan:
         with np.errstate(divide="ignore"):
             projections = -np.log(part.averaged(light))
         valid = None if valid is None else part.averaged(valid.astype(np.float32)) == 1
+    filters = scan.filter_map
+    if filters is not None:
+        of_pixels = np.broadcast_to(filters[1], (scan.rows, scan.columns))[slice(*rows), slice(*columns)]
+        whole = part.averaged(of_pixels[None])[0] if part.binning > 1 else of_pixels
+        filters = (filters[0], np.array(whole), *filters[2:])
     seen = part.of(geometry_from_astra(scan.proj_geom), (rows, columns))
     proj_geom, _ = to_astra(seen, VolumeGrid((1, 1, 1), np.zeros(3), np.ones(3)))
     same = (part.rows, part.columns, part.binning) == (None, None, 1)
@@ -41,5 +46,6 @@ def scan_part(scan: Scan, part: Part) -> Scan:
         projections=projections.transpose(1, 0, 2),
         valid=None if valid is None else valid.transpose(1, 0, 2),
         proj_geom=proj_geom,
+        filter_map=filters,
         **kept,
     )

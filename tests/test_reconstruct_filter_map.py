@@ -1,0 +1,107 @@
+"""Scans behind a bowtie, through the public calls."""
+
+import astra
+import numpy as np
+import pytest
+import small_scans
+
+import tomo_polysplat as tps
+from tomo_polysplat.cli.main import main
+from tomo_polysplat.physics.beer_lambert import projection
+from tomo_polysplat.physics.materials import density, mass_attenuation
+from tomo_polysplat.scan.io import load_scan, save_scan
+from tomo_polysplat.scan.scan import Scan
+
+SPECTRUM = tps.Spectrum.from_tube(70, filters={"Al": 0.05})
+COLUMNS, VIEWS, HALF = 61, 60, 0.5
+BOWTIE = ((np.arange(COLUMNS) - 30) / 30) ** 2
+
+
+def disc(bowtie):
+    """Bone in water, one row of a parallel beam in closed form, behind so many cm of aluminium."""
+    width = 2.4 * HALF / COLUMNS
+    geometry = astra.create_proj_geom(
+        "parallel3d", width, width, 1, COLUMNS, np.arange(VIEWS) * np.pi / VIEWS
+    )
+    window = (-HALF, HALF, -HALF, HALF, -width / 2, width / 2)
+    across = (np.arange(COLUMNS) - 30) * width
+    outer, inner = (2 * HALF * np.sqrt(np.clip(r**2 - (across / HALF) ** 2, 0, None)) for r in (0.9, 0.4))
+    curves = np.stack([mass_attenuation(m, SPECTRUM.energies) for m in ("water", "bone", "Al")])
+    paths = np.stack([outer - inner, 1.9 * inner, density("Al") * bowtie])
+    logs = np.log(np.maximum(SPECTRUM.weights, 1e-30))
+    row = projection(paths, logs, curves) - projection(paths * [[0], [0], [1]], logs, curves)
+    values = np.broadcast_to(row, (1, VIEWS, COLUMNS)).astype(np.float32)
+    return Scan(values, geometry, astra.create_vol_geom(45, 45, 1, *window), spectrum=SPECTRUM)
+
+
+def bias(result):
+    """Of water, and of bone, relative."""
+    volume = np.asarray(result.volume).reshape(45, 45)
+    place = (np.arange(45) - 22) / 22.5
+    radius = np.hypot(place, place[:, None])
+    parts = ("water", (radius > 0.5) & (radius < 0.8), 1.0), ("bone", radius < 0.3, 1.9)
+    truth = [grams * mass_attenuation(material, SPECTRUM.effective_energy) for material, _, grams in parts]
+    return np.array([volume[inside].mean() / value - 1 for (_, inside, _), value in zip(parts, truth)])
+
+
+def reconstructed(scan, **options):
+    return tps.reconstruct(scan, settings=small_scans.QUICK | {"passes": 6.0}, **options)
+
+
+def test_a_bowtie_that_is_told_does_no_harm():
+    plain, behind = reconstructed(disc(0 * BOWTIE)), disc(BOWTIE)
+    untold = reconstructed(behind)
+    behind.filter_map = ("Al", BOWTIE)
+    told = reconstructed(behind)
+    off = np.abs(bias(told) - bias(plain))
+    assert off.max() < 0.03, (bias(told), bias(plain))
+    assert np.abs(bias(untold)).max() > 5 * off.max(), "the bowtie must be thick enough to matter"
+    assert "cm of Al" in told.plan["filter_map"].why
+
+
+def test_the_report_and_the_usual_methods_know_of_it(tmp_path):
+    from tomo_polysplat.baselines.of_scan import water_bhc
+    from tomo_polysplat.report.residuals import residuals_of
+
+    behind = disc(BOWTIE)
+    untold = bias(water_bhc(behind))
+    behind.filter_map = ("Al", BOWTIE)
+    np.testing.assert_allclose(bias(water_bhc(behind))[0], bias(water_bhc(disc(0 * BOWTIE)))[0], atol=0.02)
+    assert untold[0] < bias(water_bhc(behind))[0] - 0.05
+    result = reconstructed(behind)
+    wrong = Scan(behind.projections, behind.proj_geom, behind.vol_geom, spectrum=SPECTRUM)
+    assert residuals_of(result, behind).rms < 0.3 * residuals_of(result, wrong).rms
+
+
+@pytest.mark.parametrize("ending", ["npz", "h5"])
+def test_files_and_their_parts_carry_it(tmp_path, ending):
+    scan = disc(BOWTIE)
+    scan.filter_map = ("Al", np.stack([BOWTIE]), 2.6)
+    save_scan(scan, tmp_path / f"scan.{ending}")
+    material, thickness, grams = load_scan(tmp_path / f"scan.{ending}").filter_map
+    assert (material, grams) == ("Al", 2.6)
+    np.testing.assert_allclose(thickness, BOWTIE[None], rtol=1e-6)
+    part = load_scan(tmp_path / f"scan.{ending}", columns=(10, 50))
+    np.testing.assert_allclose(part.filter_map[1], BOWTIE[None, 10:50], rtol=1e-6)
+
+
+def test_the_command_line_takes_it(tmp_path):
+    scan = disc(BOWTIE)
+    save_scan(scan, tmp_path / "scan.npz")
+    np.savetxt(tmp_path / "bowtie.txt", BOWTIE[None])
+    asked = ["recon", str(tmp_path / "scan.npz"), "-o", str(tmp_path / "out.npy"), "--set", "passes=1"]
+    assert (
+        main([*asked, "--filter-map", f"Al:{tmp_path / 'bowtie.txt'}", "--json", str(tmp_path / "plan.json")])
+        == 0
+    )
+    assert "cm of Al" in (tmp_path / "plan.json").read_text()
+    assert main([*asked, "--filter-map", "Al", "--overwrite"]) == 2
+
+
+def test_one_energy_is_dimmed_and_not_hardened():
+    scan = disc(BOWTIE)
+    quick = {"settings": small_scans.QUICK}
+    parts = (scan.projections, scan.proj_geom, scan.vol_geom)
+    alone = tps.reconstruct(*parts, **quick)
+    same = tps.reconstruct(*parts, filter_map=("Al", BOWTIE), **quick)
+    np.testing.assert_array_equal(np.asarray(alone.volume), np.asarray(same.volume))

@@ -1,0 +1,59 @@
+"""Do the lengths make an object of possible matter?"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from tomo_polysplat.scan.probes.finding import DEFECT, OK, UNKNOWN, Finding
+from tomo_polysplat.scan.probes.measured import Measured
+from tomo_polysplat.units import cm_per
+
+__all__ = ["LENGTHS", "probe_lengths"]
+
+LENGTHS = "unit of length"
+# Densities of water, in g/cm3, that attenuate as solid objects usually do, and as any matter at all may: aerogel and
+# platinum.
+_USUAL, _POSSIBLE = (0.3, 10.0), (0.003, 1000.0)
+# Rays that show more than this share of the large values pass the object.
+_OBJECT = 0.1
+_NEEDS = "the unit and the size of a pixel, as the scanner has them"
+
+
+def probe_lengths(measured: Measured) -> Finding:
+    """How dense water would be that attenuates as the object does, whose size its shadow tells."""
+    scan = measured.scan
+    if scan.unit == "pixel" or scan.spectrum is None:
+        text = "without a spectrum and a unit of length there is no density to look at"
+        return Finding(LENGTHS, UNKNOWN, text, "a spectrum, and the size of a pixel")
+    if measured.air is None:
+        text = "without air on both sides the size of the object is not told"
+        return Finding(LENGTHS, UNKNOWN, text, _NEEDS)
+    density = _as_water(measured)
+    numbers = {"density": density}
+    text = f"the object attenuates like water of {density:.2g} g/cm3 would"
+    if not _POSSIBLE[0] < density < _POSSIBLE[1]:
+        factor = 10.0 ** round(math.log10(density))
+        text += ", which no matter does"
+        remedy = f"check the unit: lengths look {factor:.0e} times too {'small' if density > 1 else 'large'}"
+        return Finding(LENGTHS, DEFECT, text, remedy, numbers)
+    if not _USUAL[0] < density < _USUAL[1]:
+        text += ": right for foam or lung" if density < 1 else ": right for metal"
+        return Finding(LENGTHS, UNKNOWN, text, _NEEDS, numbers)
+    return Finding(LENGTHS, OK, text, "", numbers)
+
+
+def _as_water(measured: Measured) -> float:
+    """Mass of water in the slices with most matter, over the area of a disc as wide as their shadow, in g/cm3."""
+    # Not needed by the other probes.
+    from tomo_polysplat.physics.water import areal_density
+
+    values, spectrum = measured.filled, measured.scan.spectrum
+    assert spectrum is not None and measured.air is not None
+    most = np.argsort(values.mean(axis=(1, 2)))[-max(1, len(values) // 8) :]
+    areal = areal_density(values[most] - measured.air.level, spectrum)
+    pixel = float(measured.geometry.pixel_size_at(measured.grid.centre)[0]) * cm_per(measured.scan.unit)
+    inside = areal > _OBJECT * np.percentile(areal, 99)
+    width = pixel * inside.sum(axis=2).mean(axis=1)
+    return float(np.median(pixel * areal.sum(axis=2).mean(axis=1) / (0.25 * math.pi * width**2)))
