@@ -39,7 +39,7 @@ def problem(
     corner = -0.5 * (columns - 1) * u - 0.5 * (rows - 1) * v + [0, 0, height]
     geometry = Geometry("parallel", origin, corner * factor, u * factor, v * factor, rows, columns)
     grid = VolumeGrid(shape, -half * factor, half * factor)
-    spectrum = Spectrum.from_tube(90, filters={}) if polychromatic else None
+    spectrum = Spectrum.from_tube(90, filters={}, detector="counting") if polychromatic else None
     values = np.ones((views, rows, columns), np.float32)
     return Problem.of(values, geometry, grid, unit, spectrum, Materials() if polychromatic else None)
 

@@ -60,7 +60,8 @@ def test_room_for_gaussians_is_what_would_not_be_refused(monkeypatch):
         memory.require_room(GPU, **(SCENE | {"gaussians": int(most) + 1}))
     assert memory.room_for_gaussians(GPU, **(all_else | {"voxels": 4096**3})) == 0.0
     monkeypatch.setattr(memory, "available_memory", lambda: int(5e9))
-    assert memory.room_for_gaussians(CPU, **all_else) == most
+    # A CPU holds the footprints of all views of a step, a GPU those of a few.
+    assert 0 < memory.room_for_gaussians(CPU, **all_else) < most
     monkeypatch.setattr(memory, "available_memory", lambda: None)
     assert memory.room_for_gaussians(CPU, **all_else) == np.inf
 

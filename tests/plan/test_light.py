@@ -1,6 +1,5 @@
 """Whether light matter is fat: who wins, that the loser leaves no trace, and when nobody asks."""
 
-import time
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -14,6 +13,7 @@ from planned import planned
 import tomo_polysplat as tps
 from tomo_polysplat.fit.optimise import Run
 from tomo_polysplat.fit.stopping import Clock
+from tomo_polysplat.kernels.compile_time import working_time
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.plan.answer import Status
 from tomo_polysplat.plan.decisions import light
@@ -177,11 +177,11 @@ def much_light(monkeypatch):
 @pytest.mark.parametrize("made", [[], [(0.2, 0.3, 1)]])
 def test_a_budget_that_ends_amid_the_question_leaves_the_run_as_it_was(much_light, made):
     def slowly(clock, passes):
-        clock.deadline = time.perf_counter() - 1
+        clock.deadline = working_time() - 1
         return made
 
     fitter = fake_fitter(slowly)
-    answer, run = amid(fitter, Clock(10, time.perf_counter() + 3600))
+    answer, run = amid(fitter, Clock(10, working_time() + 3600))
     assert run.fitter is fitter and run.made == (made[0] if made else None)
     assert answer.value == "soft" and "time budget" in answer.why
 
@@ -191,8 +191,8 @@ def test_a_budget_that_the_fit_needs_is_not_spent_on_it(much_light):
         raise AssertionError("asked all the same")
 
     # Half of the time is gone, and of the steps there are 990 to make.
-    clock = Clock(1000, time.perf_counter() + 10)
-    clock.done, clock.begun = 10, time.perf_counter() - 10
+    clock = Clock(1000, working_time() + 10)
+    clock.done, clock.begun = 10, working_time() - 10
     fitter = fake_fitter(ahead)
     answer, run = amid(fitter, clock)
     assert (run.fitter, run.made) == (fitter, None)
@@ -224,7 +224,7 @@ def test_each_way_has_a_hundred_steps_but_no_more_than_a_quarter_of_the_run(much
 
     def ahead(clock, some):
         asked.append(some)
-        clock.deadline = time.perf_counter() - 1
+        clock.deadline = working_time() - 1
         return []
 
     amid(fake_fitter(ahead, steps))

@@ -74,8 +74,8 @@ def test_a_tenth_of_the_attenuation_and_of_the_noise_gives_a_tenth_of_the_volume
         scan = slice_of(discs, 0.002 * denser, denser)
         errors.append(relative_error(fitted(scan, passes=passes).volume, scan[3]))
     assert errors[1] < 1.5 * errors[0]
-    # What the usual weight makes of it.
-    assert relative_error(fitted(scan, passes=passes, tv_factor=1).volume, scan[3]) > 2 * errors[1]
+    # What the usual weight makes of it, or the start if that is worse.
+    assert relative_error(fitted(scan, passes=passes, tv_factor=1).volume, scan[3]) > 1.5 * errors[1]
 
 
 def test_where_smooth_things_are_thin_held_out_rays_keep_the_usual_weight():

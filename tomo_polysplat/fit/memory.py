@@ -106,7 +106,8 @@ def require_room(
     MemoryError
         If the host has too little memory left for the Gaussians of a fit on a CPU.
     """
-    of_a_gaussian = _of_a_gaussian(views_at_once(views, gaussians))
+    # A CPU holds the footprints of all views of a step.
+    of_a_gaussian = _of_a_gaussian(views if device.type == "cpu" else views_at_once(views, gaussians))
     parts = {"Gaussians": gaussians * of_a_gaussian} | _of_all(views, pixels, voxels)
     need = sum(parts.values())
     words = ", ".join(f"{name} {in_gigabytes(size)}" for name, size in parts.items())
@@ -143,7 +144,9 @@ def room_for_gaussians(device: torch.device, *, views: int, pixels: int, voxels:
         return math.inf
     left = max(_SHARE * free - sum(_of_all(views, pixels, voxels).values()), 0.0)
     few = left / _of_a_gaussian(views)
-    return few if few < MANY else max(left / _of_a_gaussian(views_at_once(views, MANY)), float(MANY - 1))
+    if few < MANY or device.type == "cpu":
+        return few
+    return left / _of_a_gaussian(views_at_once(views, MANY))
 
 
 def most_gaussians(device: torch.device) -> float:

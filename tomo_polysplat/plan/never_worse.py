@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from dataclasses import replace
 
 import torch
 
@@ -13,6 +14,7 @@ from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.decision import is_number
+from tomo_polysplat.plan.model import scene_of
 from tomo_polysplat.plan.one_energy import doubt_spectrum
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.preparation import PreparedFit, RunOptions
@@ -56,7 +58,9 @@ def judge(outcome: FitOutcome, prepared: PreparedFit, problem: Problem, run_opti
     if not len(outcome.gaussians):
         return False
     plan = prepared.plan
-    found = _misses(outcome.gaussians, prepared, problem, run_options)
+    # By what was answered during the run as well.
+    scene = scene_of(problem, plan, run_options.settings, run_options.device)
+    found = _misses(outcome.gaussians, replace(prepared, scene=scene), problem, run_options)
     first = plan.facts["rays_at_start"].value if "rays_at_start" in plan.facts else math.inf
     left = _left(found, first if is_number(first, 0.0) else math.inf)
     words = f"{found.describe()}, and {left:.2g} of the first Gaussians' misfit is left"
@@ -71,8 +75,10 @@ def judge(outcome: FitOutcome, prepared: PreparedFit, problem: Problem, run_opti
     value = found.allowed if math.isinf(found.times) else found.times
     plan.facts["rays"] = Answer(value, words, Status.FOUND, evidence | {"far": float(far)})
     assert outcome.stop is not None
-    # Few rays are missed by more or less by chance.
-    return left > (_REGAINED if outcome.stop.by_time else 1.0 + _CHANCE / math.sqrt(max(found.rays, 1)))
+    if outcome.stop.by_time:
+        return left > _REGAINED
+    # Where the seeds leave little but noise, the share of the rest says nothing.
+    return is_number(first, 0.0) and found.misfit > first * (1.0 + _CHANCE / math.sqrt(max(found.rays, 1)))
 
 
 def densities_of_start(

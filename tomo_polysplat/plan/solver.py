@@ -88,7 +88,10 @@ class Solver:
         outcome = self._fit(prepared, problem, ask_scatter)
         if outcome.restart is not None:
             problem, prepared, outcome = self._anew(problem, prepared, outcome)
-        self._judge(problem, prepared, outcome)
+        try:
+            self._judge(problem, prepared, outcome)
+        except KeyboardInterrupt:
+            logger.warning("Interrupted: how the rays are missed is not told.")
         return problem, prepared, outcome
 
     def _judge(self, problem: Problem, prepared: PreparedFit, outcome: FitOutcome) -> None:
@@ -141,7 +144,11 @@ class Solver:
 
     def _fit(self, prepared: PreparedFit, problem: Problem, ask_scatter: bool) -> FitOutcome:
         plan, scene, run_options = prepared.plan, prepared.scene, self.run_options
-        note_seeds(prepared, problem, run_options)
+        try:
+            note_seeds(prepared, problem, run_options)
+        except KeyboardInterrupt:
+            logger.warning("Interrupted before the first step; what it would have begun with is returned.")
+            return FitOutcome(prepared.gaussians, stop=Stop(StopReason.INTERRUPTED, "interrupted"))
         settings = plan.adapted(plan.with_agent(run_options.settings))
         return fit(
             prepared.gaussians,
