@@ -23,8 +23,8 @@ OPTIONS = {
     "--kvp 90 --detector csi:0.6": "expected a thickness with its unit, got 'csi:0.6'; write csi:0.6mm",
     "--kvp 90 --anode Fe": "anode: expected one of W, Mo, Rh, Ag, Cu, Au, got 'Fe'; else pass Spectrum",
     "--kvp 120 --anode Mo": "<= 50, got 120.0; the tables of anode Mo cover 20-50 kVp",
-    "--spectrum words.txt": "--spectrum: expected two columns of numbers: keV and weight, got words.txt",
-    "--spectrum three.txt": "--spectrum: expected two columns: keV and weight, got 3 columns",
+    "--spectrum words.txt": "--spectrum: expected two numbers a line, got '20 one' in line 2 of words.txt",
+    "--spectrum three.txt": "--spectrum: expected two numbers a line, got '20 1 1' in line 1 of three.txt",
     "--spectrum none.txt": "--spectrum: expected an existing file, got none.txt",
     "--spectrum three.txt --kvp 90": "--spectrum: expected none of --kvp",
     "--energy 60000": "--energy: expected keV between 0.1 and 800, got 60000",
@@ -99,7 +99,7 @@ def folder(tmp_path_factory):
     assert main(["simulate", "pins", "--size", "8", "--views", "6", "-o", str(folder / "scan.h5")]) == 0
     write_folder("tiffs", folder / "tiffs", marked_scan(4, 9, 9))
     (folder / "empty").mkdir()
-    (folder / "words.txt").write_text("keV weight\n20 1\n")
+    (folder / "words.txt").write_text("keV weight\n20 one\n")
     (folder / "three.txt").write_text("20 1 1\n30 2 2\n")
     tifffile.imwrite(folder / "slice.tif", np.full((5, 6), 9, np.uint16))
     tifffile.imwrite(folder / "rgb.tif", np.zeros((5, 6, 3), np.uint8), photometric="rgb")
