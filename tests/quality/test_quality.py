@@ -8,7 +8,7 @@ from small_scans import cone, fan, reconstruct
 
 import tomo_polysplat as tps
 from tomo_polysplat.plan.answer import Answer, Status
-from tomo_polysplat.quality.again import settings_of
+from tomo_polysplat.quality.again import fit_again, settings_of
 from tomo_polysplat.quality.halves import compared
 from tomo_polysplat.quality.inserts import ball_in_voxels, paths_through_balls, places_for_balls, with_balls
 from tomo_polysplat.scan.geometry import from_astra
@@ -54,6 +54,22 @@ def test_what_was_decided_is_not_asked_again(result):
     again = reconstruct(fan(), settings=settings_of(result))
     assert np.array_equal(again.volume, result.volume)
     assert all(again.plan[name].status is Status.GIVEN for name in ("seed_spacing", "passes", "tv_factor"))
+
+
+def test_the_scanner_is_the_one_that_the_result_was_made_with(result, monkeypatch):
+    """Where the axis was mended, and behind the scan's filter."""
+    told = {}
+
+    def remember(_, proj_geom, *__, **options):
+        told.update(options, proj_geom=proj_geom)
+        return result
+
+    monkeypatch.setattr("tomo_polysplat.quality.again.reconstruct", remember)
+    scan = replace(fan(), filter_map=("Al", np.full((1, fan().projections.shape[2]), 0.1)))
+    fit_again(result, scan)
+    assert told["filter_map"] is scan.filter_map and told["proj_geom"] is scan.proj_geom
+    fit_again(replace(result, plan=result.plan | {"mended": Answer.found("the axis", "")}), scan)
+    assert told["proj_geom"] is result.geometry is not None
 
 
 def test_faint_balls_keep_a_share_of_their_contrast(result):

@@ -89,11 +89,9 @@ class FusedStep:
         bounds = log_scale_bounds(scene, spacing, gaussians.planar, settings)
         self._bounds = Bounds(bounds, (scene.least_u, 1.0), LARGEST_BLUR, EPSILON)
         fine = scene.fine(rays.views)
-        # Only the shape of the portions' views counts.
-        self._table, self._portions = (
-            fine.host_table(),
-            portions(fine.select(np.arange(batch)), len(gaussians)),
-        )
+        self._table = fine.host_table()
+        # Only the shape of these views counts.
+        self._portions = portions(fine.select(np.arange(batch)), len(gaussians))
         self._parts = (fine.rows // rays.views.rows, fine.columns // rays.views.columns)
         self._sums = torch.zeros(3, dtype=torch.float64, device=device)
         self._skipped = torch.zeros((), dtype=torch.int64, device=device)

@@ -21,8 +21,6 @@ __all__ = ["GraphStep"]
 _AHEAD = 4
 # CUDA graphs of one process can be recorded only one after the other.
 _recording = threading.Lock()
-
-
 # Of the device's memory, what torch may keep unused while a step is recorded.
 _UNUSED = 0.02
 

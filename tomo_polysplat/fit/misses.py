@@ -9,15 +9,15 @@ import numpy as np
 import torch
 
 from tomo_polysplat.fit.loss import misfit
-from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.rays import Rays, batches_around
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 
 __all__ = ["Misses", "misses"]
 
-# Rays that tell it to a few per cent, views looked at for them at least, and views looked at together.
-_ENOUGH, _VIEWS, _AT_ONCE = 1000, 24, 4
+# Rays that tell it to a few per cent, and views looked at for them at least.
+_ENOUGH, _VIEWS = 1000, 24
 # Where fewer are held out, the fitted ones are taken.
 _FEWEST = 20
 
@@ -74,7 +74,11 @@ def misses(gaussians: Gaussians, scene: FitScene, rays: Rays, photons: float, se
         For the misfit, and the model's error.
     """
     held_out = rays.held_out * len(rays.views) * _pixels(rays) >= _FEWEST
-    seen = [_some(gaussians, scene, rays, views, held_out) for views in _views(rays)]
+    seen = []
+    for views, measured, fitted, aside in batches_around(rays, _views(rays)):
+        predicted, _ = scene.projections(gaussians, views)
+        weight = aside if held_out else fitted
+        seen.append([part[weight > 0].cpu() for part in (predicted, measured, weight)])
     predicted, measured, weight = (torch.cat(parts) for parts in zip(*seen))
     variance = torch.exp(measured) / photons
     drawn = torch.from_numpy(np.random.default_rng(0).standard_normal(len(measured), np.float32))
@@ -94,23 +98,10 @@ def _pixels(rays: Rays) -> int:
     return rays.views.rows * rays.views.columns
 
 
-def _views(rays: Rays) -> list[np.ndarray]:
-    """Numbers of views that hold enough rays of those held out, a few at a time."""
+def _views(rays: Rays) -> int:
+    """How many views hold enough rays of those held out."""
     a_view = max(rays.held_out, 1e-6) * _pixels(rays)
-    most = min(max(_VIEWS, math.ceil(_ENOUGH / a_view)), len(rays.views))
-    chosen = np.unique(np.linspace(0, len(rays.views) - 1, most).astype(int))
-    return [chosen[first : first + _AT_ONCE] for first in range(0, len(chosen), _AT_ONCE)]
-
-
-def _some(
-    gaussians: Gaussians, scene: FitScene, rays: Rays, views: np.ndarray, held_out: bool
-) -> list[torch.Tensor]:
-    """Predicted and measured values and weights of the rays of some views that are asked, on the host."""
-    chosen, measured, fitted, aside = rays.batch(views)
-    predicted, _ = scene.projections(gaussians, chosen)
-    weight = aside if held_out else fitted
-    used = weight > 0
-    return [part[used].cpu() for part in (predicted, measured, weight)]
+    return max(_VIEWS, math.ceil(_ENOUGH / a_view))
 
 
 def _root(squares: torch.Tensor) -> float:

@@ -47,8 +47,7 @@ def note_seeds(prepared: PreparedFit, problem: Problem, run_options: RunOptions)
     plan.note("rays_at_start", found.misfit, f"misfit of the first Gaussians; {found.describe()}")
     doubt = None
     if run_options.time_budget is None:
-        options = (run_options.settings, run_options.device, run_options.seed)
-        doubt = doubt_spectrum(problem, found.misfit, *options)
+        doubt = doubt_spectrum(problem, found.misfit, run_options)
     if doubt is not None:
         plan.facts["spectrum_doubt"] = doubt
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-
-import torch
+from dataclasses import replace
 
 from tomo_polysplat.fit.misses import misses
 from tomo_polysplat.fit.problem import Problem
@@ -15,7 +14,6 @@ from tomo_polysplat.plan.lab import Lab
 from tomo_polysplat.plan.means import Means
 from tomo_polysplat.plan.order import decide_start
 from tomo_polysplat.plan.short_fit import short_fit
-from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.initial import initial_volume_on
 
 __all__ = ["doubt_spectrum"]
@@ -31,9 +29,7 @@ _CLEARLY = 0.9
 _MOST_VOXELS = 1 << 24
 
 
-def doubt_spectrum(
-    problem: Problem, misfit: float, settings: Settings, device: torch.device, seed: int
-) -> Answer | None:
+def doubt_spectrum(problem: Problem, misfit: float, means: Means) -> Answer | None:
     """What to do about a spectrum that fits rays clearly worse than one energy does; None for no doubt.
 
     Parameters
@@ -41,17 +37,16 @@ def doubt_spectrum(
     problem : Problem
     misfit : float
         Of its first Gaussians.
-    settings : Settings
-    device : torch.device
-    seed : int
+    means : Means
+        Of the fit to come.
     """
     if not problem.polychromatic or math.prod(problem.grid.shape) > _MOST_VOXELS or misfit <= 0:
         return None
     one = problem.with_one_energy()
     try:
-        if _by_seeds(one, settings, device) >= _CLEARLY * misfit:
+        if _by_seeds(one, means) >= _CLEARLY * misfit:
             return None
-        left = [_after_short_fit(of, settings, device, seed) for of in (one, problem)]
+        left = [_after_short_fit(of, means) for of in (one, problem)]
     except (ValueError, RuntimeError, MemoryError) as error:  # no room for it, or no such start
         logger.info("The spectrum is not compared with one energy: %s", error)
         return None
@@ -67,14 +62,16 @@ def doubt_spectrum(
     return Answer("doubted", words, Status.FOUND, {"left by one energy": ratio})
 
 
-def _by_seeds(one: Problem, settings: Settings, device: torch.device) -> float:
+def _by_seeds(one: Problem, means: Means) -> float:
     """Misfit of the first Gaussians, of a start that bridges no metal: that takes longer, and is for the short fit."""
+    # How a volume is smoothed is nothing to its seeds, and takes two more volumes to decide.
+    settings, device = replace(means.settings, tv_weight=0.0), means.device
     start, _ = initial_volume_on(one.primary(device), one.geometry, one.grid)
     lab = Lab(one, start, settings, device)
     decide_start(lab)
     return misses(lab.seeds(), lab.scene, lab.rays, one.photons(device), settings).misfit
 
 
-def _after_short_fit(of: Problem, settings: Settings, device: torch.device, seed: int) -> float:
-    start, _ = first_volume(of, device, settings)
-    return short_fit(of, start, {}, Means(settings, None, seed, device)).held_out
+def _after_short_fit(of: Problem, means: Means) -> float:
+    start, _ = first_volume(of, means.device, means.settings)
+    return short_fit(of, start, {}, means).held_out

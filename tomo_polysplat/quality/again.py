@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from tomo_polysplat.checks import fail
 from tomo_polysplat.plan.answer import Status
 from tomo_polysplat.reconstruction import reconstruct
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.scan import Scan
+from tomo_polysplat.scan.volume_grid import VolumeGrid
 from tomo_polysplat.settings import Settings
 
-__all__ = ["Levels", "fit_again", "levels_of", "settings_of"]
+__all__ = ["Levels", "fit_again", "geometry_of", "levels_of", "require_scan_of", "settings_of", "voxel_edge"]
 
 # Decisions whose answer is no setting of that kind, or which the number of views or rays may change.
 _FREE = ("tv_corner", "agent")
@@ -52,6 +55,23 @@ def settings_of(result: Result) -> dict[str, Any]:
     return chosen
 
 
+def require_scan_of(result: Result, scan: Scan) -> None:
+    """Raise ValueError unless the scan has the volume of the result."""
+    if scan.volume_shape != result.grid.shape:
+        raise fail("scan", f"the scan of the result, {result.grid.shape}", f"a volume of {scan.volume_shape}")
+
+
+def geometry_of(result: Result, scan: Scan) -> Mapping[str, Any]:
+    """ASTRA's geometry of the projections as the result was made with it: moved where that was found."""
+    moved = any(name in result.plan and result.plan[name].value for name in ("alignment", "mended"))
+    return result.geometry if moved and result.geometry is not None else scan.proj_geom
+
+
+def voxel_edge(grid: VolumeGrid) -> float:
+    """Longest edge of a voxel, in a slice within its plane."""
+    return float(max(edge for edge, n in zip(grid.voxel_size, grid.shape[::-1]) if n > 1))
+
+
 def fit_again(
     result: Result,
     scan: Scan,
@@ -62,8 +82,7 @@ def fit_again(
     progress: Any = None,
 ) -> np.ndarray:
     """(z, y, x) volume of a fit of other ``projections``, of some ``views``, or both, else as the result was made."""
-    aligned = "alignment" in result.plan and result.plan["alignment"].value
-    proj_geom = result.geometry if aligned and result.geometry is not None else scan.proj_geom
+    proj_geom = geometry_of(result, scan)
     values = scan.projections if projections is None else projections
     valid, spectrum = scan.usable, result.spectrum if result.materials is not None else None
     if views is not None:
@@ -79,16 +98,17 @@ def fit_again(
         unit=scan.unit,
         valid=valid,
         water_correction=scan.water_correction if spectrum is not None else None,
+        filter_map=scan.filter_map,
         calibrate="scatter" if scattered and spectrum is not None else False,
         seed=int(result.settings.get("seed", 0)),
         settings=settings_of(result),
         device=device,
         progress=progress,
     )
-    return again.volume[None, ::-1] if again.flipped_2d else again.volume
+    return again.volume_zyx
 
 
-def _of_views(proj_geom: dict[str, Any], views: np.ndarray) -> dict[str, Any]:
+def _of_views(proj_geom: Mapping[str, Any], views: np.ndarray) -> dict[str, Any]:
     """An ASTRA geometry of some of its views."""
     name = "Vectors" if "Vectors" in proj_geom else "ProjectionAngles"
     return {**proj_geom, name: np.ascontiguousarray(np.asarray(proj_geom[name])[views])}

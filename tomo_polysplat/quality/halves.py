@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.quality.again import fit_again, levels_of
+from tomo_polysplat.quality.again import fit_again, levels_of, require_scan_of, voxel_edge
 from tomo_polysplat.quality.fourier_shell import HALVES, ShellCorrelation, first_below, shell_correlation
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import from_astra
@@ -90,8 +90,7 @@ def resolution(result: Result, scan: Scan, *, device: str = "auto", progress: An
     ValueError
         If the scan has another volume than the result, or too few views.
     """
-    if scan.volume_shape != result.grid.shape:
-        raise fail("scan", f"the scan of the result, {result.grid.shape}", f"a volume of {scan.volume_shape}")
+    require_scan_of(result, scan)
     geometry, _ = from_astra(scan.proj_geom, scan.vol_geom)
     places = places_of_views(geometry)
     halves = [np.flatnonzero(places % 2 == half) for half in (0, 1)]
@@ -109,7 +108,7 @@ def compared(result: Result, volumes: list[np.ndarray], seconds: float) -> Resol
     """What two volumes of half the views each, (z, y, x), tell of the result of all of them."""
     from scipy import ndimage
 
-    voxel = float(max(edge for edge, n in zip(result.grid.voxel_size, result.grid.shape[::-1]) if n > 1))
+    voxel = voxel_edge(result.grid)
     ceiling = levels_of(result).metal
     clipped = [np.minimum(volume, ceiling) for volume in volumes]
     middle = tuple(slice(max(0, (n - _LONGEST) // 2), (n + _LONGEST) // 2) for n in result.grid.shape)

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from tomo_polysplat.checks import fail, require_number
+from tomo_polysplat.checks import require_number
 from tomo_polysplat.physics.beer_lambert import projection
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.physics.water import areal_density
-from tomo_polysplat.quality.again import fit_again, levels_of
+from tomo_polysplat.quality.again import fit_again, geometry_of, levels_of, require_scan_of, voxel_edge
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, from_astra
 from tomo_polysplat.scan.scan import Scan
@@ -112,17 +112,15 @@ def contrast(
     """
     added = require_number("added", added, above=0, at_most=1)
     sizes = [require_number("diameters", one, above=0) for one in diameters]
-    if scan.volume_shape != result.grid.shape:
-        raise fail("scan", f"the scan of the result, {result.grid.shape}", f"a volume of {scan.volume_shape}")
-    without = result.volume[None, ::-1] if result.flipped_2d else result.volume
-    voxel = _voxel(result.grid)
+    require_scan_of(result, scan)
+    without, voxel = result.volume_zyx, voxel_edge(result.grid)
     radii = 0.5 * voxel * np.array(sizes)
     balls = places_for_balls(without, result, radii, seed)
     kept, error = (np.full(len(sizes), np.nan) for _ in range(2))
     begun = time.perf_counter()
     if balls:
         logger.info("A fit with %d faint balls will take about as long as the result did.", len(balls))
-        geometry, _ = from_astra(scan.proj_geom, scan.vol_geom)
+        geometry, _ = from_astra(geometry_of(result, scan), scan.vol_geom)
         level = added * levels_of(result).soft
         rays = with_balls(scan, result, paths_through_balls(geometry, balls), level)
         found = fit_again(result, scan, projections=rays, device=device, progress=progress)
@@ -137,10 +135,6 @@ def contrast(
                     error[k] = np.std(shares[radius], ddof=1) / len(shares[radius]) ** 0.5
     seconds = time.perf_counter() - begun
     return Contrast(2 * radii, kept, error, added, voxel, result.unit, seconds)
-
-
-def _voxel(grid: VolumeGrid) -> float:
-    return float(max(edge for edge, n in zip(grid.voxel_size, grid.shape[::-1]) if n > 1))
 
 
 def places_for_balls(

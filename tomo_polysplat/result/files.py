@@ -81,7 +81,7 @@ def write_json(path: str | os.PathLike, content: Any, *, overwrite: bool) -> Non
 
 def save_hdf5(result: Result, path: str | os.PathLike, *, overwrite: bool = False) -> None:
     """See :meth:`Result.save`."""
-    volume = result.volume[None, ::-1] if result.flipped_2d else result.volume
+    volume = result.volume_zyx
     arrays = [result.basis, volume, *result.gaussians.values()]
     needed = sum(np.asarray(array).nbytes for array in arrays)
     with new_hdf5(path, overwrite=overwrite, needed_bytes=needed) as file:

@@ -115,7 +115,7 @@ def image_of(result: Result, *, hu: bool = False, bits: int = 32, unseen_nan: bo
     require_bits(bits)
     if unseen_nan and bits == 16:
         raise fail("unseen_nan", "32 bits, as whole numbers have no NaN", "16")
-    volume = result.volume[None, ::-1] if result.flipped_2d else result.volume
+    volume = result.volume_zyx
     scale, shift, quantity = 1.0, 0.0, f"1/{result.unit}"
     window = display_window(volume)
     if hu:

@@ -192,6 +192,11 @@ class Result:
         if self.materials is None:
             raise fail(name, "a polychromatic result", "a monochromatic one", "reconstruct with a spectrum")
 
+    @property
+    def volume_zyx(self) -> np.ndarray:
+        """The volume as (z, y, x) with y ascending, whatever order the caller's geometry has."""
+        return self.volume[None, ::-1] if self.flipped_2d else self.volume
+
     def _public(self, volume: np.ndarray) -> np.ndarray:
         """In the order of the caller's geometry."""
         return np.ascontiguousarray(volume[0, ::-1]) if self.flipped_2d else volume

@@ -65,20 +65,17 @@ class _Project(torch.autograd.Function):
         position, scale, rotation, weight = (
             t.detach().contiguous() for t in (position, scale, rotation, weight)
         )
-        table = views.table(position.device)
         skipped = torch.zeros((), dtype=torch.int64, device=position.device)
+        ctx.mark_non_differentiable(skipped)
         scene = (position, scale, rotation, weight)
         if not any(ctx.needs_input_grad):
             images = [_image(scene, part, cutoff, skipped)[0] for part in portions(views, len(position))]
-            image = images[0] if len(images) == 1 else torch.cat(images, dim=1)
-            ctx.mark_non_differentiable(skipped)
-            return image, skipped
+            return images[0] if len(images) == 1 else torch.cat(images, dim=1), skipped
         image, record = _image(scene, views, cutoff, skipped)
         # The image is read again only for what the factor of its pixels adds to the gradient of the vectors.
         kept = image if ctx.needs_input_grad[6] else None
-        ctx.save_for_backward(position, scale, rotation, weight, table, record, kept)
+        ctx.save_for_backward(*scene, views.table(position.device), record, kept)
         ctx.views = views
-        ctx.mark_non_differentiable(skipped)
         return image, skipped
 
     @staticmethod
