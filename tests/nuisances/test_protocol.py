@@ -4,11 +4,10 @@ import importlib
 import inspect
 import math
 import pkgutil
-import re
 from collections import defaultdict
-from pathlib import Path
 
 import pytest
+from docs_examples import run_page
 
 from tomo_polysplat import nuisances
 from tomo_polysplat.nuisances.detector_blur import BlurOfDetector
@@ -20,8 +19,6 @@ from tomo_polysplat.nuisances.pixel_light import PixelLight
 from tomo_polysplat.nuisances.scatter import ScatteredLight
 from tomo_polysplat.nuisances.tube_voltage import TubeVoltage
 from tomo_polysplat.physics.spectrum import Spectrum
-
-PAGE = Path(__file__).parents[2] / "docs" / "nuisances.md"
 
 
 def test_every_nuisance_is_listed_and_no_two_share_a_parameter():
@@ -95,9 +92,6 @@ def test_reports_tell_of_each():
 
 
 def test_the_example_of_the_docs_runs():
-    names = {}
-    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    blocks, names = run_page("nuisances.md")
     assert len(blocks) == 2
-    for block in blocks:
-        exec(block, names)
     names["test_a_lag_is_kept_where_the_held_out_rays_fit_better"]()

@@ -23,6 +23,8 @@ from tomo_polysplat.scan.hdf5 import (
     text_attribute,
 )
 from tomo_polysplat.scan.readers.acquisition import Acquisition
+from tomo_polysplat.scan.readers.files_of_scans import hdf5_files, the_one
+from tomo_polysplat.scan.readers.frames import Hdf5Array
 from tomo_polysplat.scan.readers.stated import require_known, stated_over
 
 if TYPE_CHECKING:
@@ -42,33 +44,22 @@ class _Frames:
     def __init__(
         self, path: Path, name: str, labels: tuple[str, ...], packing: tuple[float, float] | None
     ) -> None:
-        self._path, self._name, self._labels, self._packing = path, name, labels, packing
-        self._array: Any = None
-        sizes = dict(zip(labels, self._opened().shape))
+        self._array, self._labels, self._packing = Hdf5Array(path, name), labels, packing
+        opened = self._array.opened()
+        sizes = dict(zip(labels, opened.shape))
         self.shape = (sizes["angle"], sizes.get("vertical", 1), sizes["horizontal"])
-        self.dtype = np.dtype(np.float32) if packing else np.dtype(self._opened().dtype)
+        self.dtype = np.dtype(np.float32) if packing else np.dtype(opened.dtype)
 
     def read(self, index: int, rows: slice, columns: slice) -> np.ndarray:
         """Part of one picture."""
         where: dict[str, Any] = {"angle": index, "vertical": rows, "horizontal": columns}
-        try:
-            part = np.asarray(self._opened()[tuple(where[label] for label in self._labels)])
-        except (OSError, RuntimeError) as error:
-            raise fail("path", "a readable HDF5 file", f"{self._path} ({error})", "copy it again") from error
+        part = self._array.read(tuple(where[label] for label in self._labels))
         left = [label for label in self._labels if label != "angle"]
         picture = part[None] if len(left) == 1 else part if left[0] == "vertical" else part.T
         if self._packing is None:
             return picture
         scale, offset = self._packing
         return ((picture.astype(np.float64) - offset) / scale).astype(np.float32)
-
-    def _opened(self) -> Any:
-        if self._array is None:
-            import h5py
-
-            # Closed with the last reference to its dataset.
-            self._array = h5py.File(self._path, "r")[self._name]
-        return self._array
 
 
 def recognises(path: Path) -> bool:
@@ -78,36 +69,29 @@ def recognises(path: Path) -> bool:
 
 def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     """See `tomo_polysplat.load_scan`; `stated` has its ``scanner``."""
-    files = _files(path)
-    if len(files) > 1:
-        raise fail("path", "one scan in the folder", ", ".join(file.name for file in files), "name the file")
+    file_of_scan = the_one(_files(path))
     known = require_known(stated, "scanner")
-    with opened(files[0]) as file:
+    with opened(file_of_scan) as file:
         entry = find_group(file, _ENTRY)
         assert entry is not None  # it was recognised by that
-        told = _told(files[0], entry)
+        told = _told(file_of_scan, entry)
     if "input" not in known:
         told = told.saying("the numbers are taken to be line integrals; give input= if they are not")
     if "unit" not in known:
         told = told.saying("the file states no unit of length: mm is taken; give unit=")
-    return stated_over(told, known, files[0].parent)
+    return stated_over(told, known, file_of_scan.parent)
 
 
 def _files(path: Path) -> list[Path]:
-    inside = [path] if path.is_file() else sorted(path.iterdir())
-    return [f for f in inside if f.is_file() and (f == path or f.suffix.lower() in _SUFFIXES) and _is_cil(f)]
+    return hdf5_files(path, _SUFFIXES, _is_cil)
 
 
-def _is_cil(file: Path) -> bool:
-    with open(file, "rb") as stream:
-        if stream.read(4) != b"\x89HDF":
-            return False
-    with opened(file) as handle:
-        try:
-            entry = find_group(handle, _ENTRY)
-            return entry is not None and find_group(entry, "config") is not None
-        except ValueError:
-            return False
+def _is_cil(file: h5py.File) -> bool:
+    try:
+        entry = find_group(file, _ENTRY)
+        return entry is not None and find_group(entry, "config") is not None
+    except ValueError:
+        return False
 
 
 def _told(path: Path, entry: h5py.Group) -> Acquisition:

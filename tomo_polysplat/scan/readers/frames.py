@@ -12,7 +12,7 @@ import numpy as np
 from tomo_polysplat.checks import fail
 from tomo_polysplat.files import existing_file, require_plausible_size
 
-__all__ = ["ArrayFrames", "Frames", "Hdf5Frames", "TiffFrames"]
+__all__ = ["ArrayFrames", "Frames", "Hdf5Array", "Hdf5Frames", "TiffFrames"]
 
 
 class Frames(Protocol):
@@ -47,6 +47,31 @@ class ArrayFrames:
         return np.asarray(self._array[int(self._chosen[index]), rows, columns])
 
 
+class Hdf5Array:
+    """A dataset of an HDF5 file that has been looked through already; the file is opened when it is asked for."""
+
+    def __init__(self, path: Path, name: str) -> None:
+        self._path, self._name = path, name
+        self._array: Any = None
+
+    def opened(self) -> Any:
+        """The dataset itself."""
+        if self._array is None:
+            import h5py
+
+            # Closed with the last reference to its dataset.
+            self._array = h5py.File(self._path, "r")[self._name]
+        return self._array
+
+    def read(self, where: tuple[Any, ...]) -> np.ndarray:
+        """Part of it."""
+        try:
+            return np.asarray(self.opened()[where])
+        except (OSError, RuntimeError) as error:
+            remedy = "it is damaged, or needs a compression plugin (python -m pip install hdf5plugin)"
+            raise fail("path", "a readable HDF5 file", f"{self._path} ({error})", remedy) from error
+
+
 class Hdf5Frames:
     """Some pictures of a dataset (pictures, rows, columns) of an HDF5 file, which is opened when they are asked for.
 
@@ -60,26 +85,13 @@ class Hdf5Frames:
     """
 
     def __init__(self, path: Path, name: str, chosen: np.ndarray) -> None:
-        self._path, self._name, self._chosen = path, name, chosen
-        self._frames: ArrayFrames | None = None
-        opened = self._opened()
-        self.shape, self.dtype = opened.shape, opened.dtype
+        self._array, self._chosen = Hdf5Array(path, name), chosen
+        frames = ArrayFrames(self._array.opened(), chosen)
+        self.shape, self.dtype = frames.shape, frames.dtype
 
     def read(self, index: int, rows: slice, columns: slice) -> np.ndarray:
         """Part of one picture."""
-        try:
-            return self._opened().read(index, rows, columns)
-        except (OSError, RuntimeError) as error:
-            remedy = "it is damaged, or needs a compression plugin (python -m pip install hdf5plugin)"
-            raise fail("path", "a readable HDF5 file", f"{self._path} ({error})", remedy) from error
-
-    def _opened(self) -> ArrayFrames:
-        if self._frames is None:
-            import h5py
-
-            # Closed with the last reference to its dataset.
-            self._frames = ArrayFrames(h5py.File(self._path, "r")[self._name], self._chosen)
-        return self._frames
+        return self._array.read((int(self._chosen[index]), rows, columns))
 
 
 class TiffFrames:

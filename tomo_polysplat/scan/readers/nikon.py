@@ -17,6 +17,7 @@ import numpy as np
 from tomo_polysplat.checks import fail
 from tomo_polysplat.physics.filter_text import filters_of
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
+from tomo_polysplat.scan.readers.files_of_scans import the_one
 from tomo_polysplat.scan.readers.frames import TiffFrames
 from tomo_polysplat.scan.readers.ini_text import IniText
 from tomo_polysplat.scan.readers.picture_names import has_word, in_order, tiffs_in
@@ -37,12 +38,9 @@ def recognises(path: Path) -> bool:
 
 def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     """See `tomo_polysplat.load_scan`; `stated` has its ``scanner``."""
-    texts = _texts(path)
-    if len(texts) > 1:
-        got = ", ".join(text.name for text in texts)
-        raise fail("path", "one scan in the folder", got, "name its .xtekct file")
-    folder, text = texts[0].parent, IniText(texts[0])
-    name = text.text("Name", otherwise=texts[0].stem)
+    file = the_one(_texts(path), remedy="name its .xtekct file")
+    folder, text = file.parent, IniText(file)
+    name = text.text("Name", otherwise=file.stem)
     frames = TiffFrames(_pictures(folder, text, name))
     expected = int(text.number("Projections", otherwise=frames.shape[0]))
     said = []

@@ -16,6 +16,7 @@ import numpy as np
 from tomo_polysplat.checks import fail
 from tomo_polysplat.scan.hdf5 import find_array, find_group, opened, read_numbers, read_text, text_attribute
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup
+from tomo_polysplat.scan.readers.files_of_scans import hdf5_files, the_one
 from tomo_polysplat.scan.readers.frames import Hdf5Frames
 from tomo_polysplat.scan.readers.stated import require_known, stated_over
 
@@ -42,29 +43,16 @@ def recognises(path: Path) -> bool:
 
 def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     """See `tomo_polysplat.load_scan`; `stated` has its ``scanner``."""
-    files = _files(path)
-    if len(files) > 1:
-        raise fail("path", "one scan in the folder", ", ".join(file.name for file in files), "name the file")
-    with opened(files[0]) as file:
+    file_of_scan = the_one(_files(path))
+    with opened(file_of_scan) as file:
         entry = _entry(file)
         assert entry is not None  # it was recognised by that
-        told = _told(files[0], entry)
-    return stated_over(told, require_known(stated, "scanner"), files[0].parent)
+        told = _told(file_of_scan, entry)
+    return stated_over(told, require_known(stated, "scanner"), file_of_scan.parent)
 
 
 def _files(path: Path) -> list[Path]:
-    if path.is_file():
-        return [path] if _is_nxtomo(path) else []
-    inside = [file for file in sorted(path.iterdir()) if file.suffix.lower() in _SUFFIXES and file.is_file()]
-    return [file for file in inside if _is_nxtomo(file)]
-
-
-def _is_nxtomo(file: Path) -> bool:
-    with open(file, "rb") as stream:
-        if stream.read(4) != b"\x89HDF":
-            return False
-    with opened(file) as handle:
-        return _entry(handle) is not None
+    return hdf5_files(path, _SUFFIXES, lambda file: _entry(file) is not None)
 
 
 def _entry(file: h5py.File) -> h5py.Group | None:

@@ -18,6 +18,7 @@ import numpy as np
 from tomo_polysplat.checks import fail, require_number
 from tomo_polysplat.scan.geometry import Geometry
 from tomo_polysplat.scan.readers.acquisition import Acquisition
+from tomo_polysplat.scan.readers.files_of_scans import the_one
 from tomo_polysplat.scan.readers.frames import Frames, TiffFrames
 from tomo_polysplat.scan.readers.itk_frames import ITK_SUFFIXES, ItkFrames
 from tomo_polysplat.scan.readers.picture_names import has_word, named_files, tiffs_in
@@ -43,13 +44,11 @@ def recognises(path: Path) -> bool:
 
 def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     """See `tomo_polysplat.load_scan`; `stated` has its ``scanner``."""
-    texts = _texts(path)
-    if len(texts) > 1:
-        raise fail("path", "one geometry in the folder", ", ".join(text.name for text in texts), "name it")
-    folder, known = texts[0].parent, require_known(stated, "scanner")
+    text = the_one(_texts(path), "one geometry in the folder", "name it")
+    folder, known = text.parent, require_known(stated, "scanner")
     frames, origin, spacing, said = _pictures(folder, known)
     known.pop("pixel", None)
-    table = _table(texts[0])
+    table = _table(text)
     if len(table["GantryAngle"]) != frames.shape[0]:
         got = f"{len(table['GantryAngle'])} views for {frames.shape[0]} pictures"
         raise fail("path", "a view in the geometry for each picture", got)

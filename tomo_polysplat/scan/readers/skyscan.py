@@ -19,6 +19,7 @@ import numpy as np
 from tomo_polysplat.checks import fail
 from tomo_polysplat.physics.filter_text import filters_of
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
+from tomo_polysplat.scan.readers.files_of_scans import the_one
 from tomo_polysplat.scan.readers.frames import TiffFrames
 from tomo_polysplat.scan.readers.ini_text import IniText
 from tomo_polysplat.scan.readers.picture_names import has_word, in_order, tiffs_in
@@ -38,13 +39,9 @@ def recognises(path: Path) -> bool:
 
 def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     """See `tomo_polysplat.load_scan`; `stated` has its ``scanner``."""
-    logs = _logs(path)
-    if len(logs) > 1:
-        raise fail(
-            "path", "one scan in the folder", ", ".join(log.name for log in logs), "name its .log file"
-        )
-    folder, log = logs[0].parent, IniText(logs[0])
-    files = _pictures(folder, log, logs[0].stem)
+    file = the_one(_logs(path), remedy="name its .log file")
+    folder, log = file.parent, IniText(file)
+    files = _pictures(folder, log, file.stem)
     expected = int(log.number("Number of Files", otherwise=len(files)))
     said = []
     if len(files) != expected:
@@ -58,7 +55,7 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
         KIND,
         frames,
         setup,
-        name=log.text("Filename Prefix", otherwise=logs[0].stem).rstrip("_~ "),
+        name=log.text("Filename Prefix", otherwise=file.stem).rstrip("_~ "),
         from_detector=True,
         tube=Tube(log.number("Source Voltage (kV)"), _filters(log)),
         exposure=log.number("Exposure (ms)", otherwise=0.0) / 1000 or None,
