@@ -56,4 +56,16 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"{SIGNS[finding.verdict]:4}  {finding.probe:{width}}  {finding.text}")
         if finding.remedy:
             print(f"{'':4}  {'':{width}}  -> {finding.remedy}")
-    return DEFECT_STATUS if any(finding.verdict == "defect" for finding in findings) else 0
+    defects, unknown = (
+        sum(finding.verdict == verdict for finding in findings) for verdict in ("defect", "unknown")
+    )
+    print(f"\n{_summary(defects, unknown)}")
+    return DEFECT_STATUS if defects else 0
+
+
+def _summary(defects: int, unknown: int) -> str:
+    """What to do about all of the answers, in a sentence or two."""
+    text = f"Mend {defects} of them before recon." if defects else "Nothing to mend: recon can begin."
+    if unknown:
+        text += f" This scan cannot answer {unknown} of the questions; that alone is no fault."
+    return text
