@@ -279,6 +279,7 @@ class Result:
 
         write_npy(image_of(self), path, overwrite=overwrite)
 
+    # One parameter for each option that a caller names.
     def report(
         self,
         path: str | os.PathLike,
