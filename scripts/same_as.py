@@ -24,7 +24,12 @@ def digests(tree: Path, cases: list[str]) -> dict[str, dict[str, str]]:
     fixed = dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     environment = os.environ | fixed | {"PYTHONPATH": str(tree), "SAME_AS_TREE": str(tree)}
     command = [sys.executable, str(CASES), *cases]
-    done = subprocess.run(command, env=environment, cwd=tree, stdout=subprocess.PIPE, text=True, check=True)
+    # Numba's cache does not see that a function which is called from another file has changed.
+    with tempfile.TemporaryDirectory() as cache:
+        environment["NUMBA_CACHE_DIR"] = cache
+        done = subprocess.run(
+            command, env=environment, cwd=tree, stdout=subprocess.PIPE, text=True, check=True
+        )
     return json.loads(done.stdout.splitlines()[-1])
 
 
