@@ -15,6 +15,7 @@ __all__ = ["KINDS", "write_folder"]
 KINDS = {
     "tiffs": tiffs.write,
     "npy": arrays.write_npy,
+    "npz": arrays.write_npz,
     "edf": arrays.write_edf,
     "skyscan": skyscan.write,
     "nikon": nikon.write,
