@@ -37,7 +37,7 @@ def require_outputs(arguments: argparse.Namespace) -> None:
     for name in ("halves", "faint"):
         if getattr(arguments, name) and arguments.report is None:
             raise fail(f"--{name}", "--report with it, where it is told", "none")
-    if arguments.unseen_nan and (kind.everything or arguments.bits == 16):
+    if arguments.unseen_nan and (kind.everything or kind.hounsfield or arguments.bits == 16):
         remedy = "choose another ending of --output, and 32 bits"
         raise fail("--unseen-nan", "a file of the volume alone, in floating point", arguments.output, remedy)
     if arguments.resume and arguments.checkpoint is None:
@@ -46,8 +46,9 @@ def require_outputs(arguments: argparse.Namespace) -> None:
     for name in ("output", "report", "json", "tiff"):
         if (path := getattr(arguments, name)) is None:
             continue
-        if name == "tiff" or (name == "output" and kind.is_folder):
-            folders[f"--{name}"] = require_slices_folder(
+        if name == "tiff" or (name == "output" and kind.folder):
+            require = require_slices_folder if name == "tiff" else kind.require_folder
+            folders[f"--{name}"] = require(
                 path, overwrite=arguments.overwrite, remedy="pass --overwrite", argument=f"--{name}"
             )
         else:
@@ -95,8 +96,8 @@ def require_room_of(arguments: argparse.Namespace, scan: Scan) -> None:
     kind = format_of(arguments.output, "--output")
     if not kind.everything:
         kind.require(hu=arguments.hu, bits=arguments.bits, voxels=voxels, argument="--output")
-    if arguments.hu:
-        _require_hounsfield(arguments, scan)
+    if arguments.hu or kind.hounsfield:
+        _require_hounsfield(arguments, scan, "--hu" if arguments.hu else "--output")
     # At most three curves.
     needed = {Path(arguments.output).parent: kind.bytes_needed(voxels, 3, arguments.bits)}
     if arguments.tiff is not None:
@@ -105,11 +106,13 @@ def require_room_of(arguments: argparse.Namespace, scan: Scan) -> None:
     require_room_for(needed)
 
 
-def _require_hounsfield(arguments: argparse.Namespace, scan: Scan) -> None:
+def _require_hounsfield(arguments: argparse.Namespace, scan: Scan, option: str) -> None:
     """Refuse Hounsfield units without a spectrum or a real length: they compare with water at an energy."""
     if scan.unit == "pixel" or arguments.mono or scan.spectrum is None:
-        remedy = "pass --kvp or --spectrum and the pixel's size, or leave it out"
-        raise fail("--hu", "a spectrum and real lengths", "a volume without an energy", remedy)
+        remedy = "pass --kvp or --spectrum and the pixel's size, or leave Hounsfield units out"
+        raise fail(
+            option, "a spectrum and real lengths for Hounsfield units", "a volume without an energy", remedy
+        )
 
 
 def write_outputs(result: Result, scan: Scan, arguments: argparse.Namespace) -> None:

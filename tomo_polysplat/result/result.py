@@ -214,8 +214,9 @@ class Result:
 
         ``.h5`` and ``.hdf5`` hold everything, in the Data Exchange layout, and :meth:`load` reads them back. The
         others hold :attr:`volume` with voxel size and unit: ``.tif`` (ImageJ), ``.ome.tif``, a name ending in
-        ``/`` (a folder of TIFF slices), ``.mha``, ``.nrrd``, ``.nii``, ``.nii.gz``, ``.vti`` (ParaView); ``.npy``
-        holds its numbers alone. Whatever fails or interrupts it, the old file stays as it was.
+        ``/`` (a folder of TIFF slices), ``.mha``, ``.nrrd``, ``.nii``, ``.nii.gz``, ``.vti`` (ParaView), ``.ome.zarr``,
+        ``.dicom`` (a folder of DICOM slices, in Hounsfield units); ``.npy`` holds its numbers alone.
+        Whatever fails or interrupts it, the old file stays as it was.
 
         Parameters
         ----------
