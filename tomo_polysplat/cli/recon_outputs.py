@@ -118,6 +118,7 @@ def _require_hounsfield(arguments: argparse.Namespace, scan: Scan, option: str) 
 def write_outputs(result: Result, scan: Scan, arguments: argparse.Namespace) -> None:
     """Write all outputs. If one of them fails, the others are still written."""
     failures: list[OSError] = []
+    _explain(result, scan, arguments)
     _attempt(arguments.output, failures, lambda: _save(result, arguments))
     if failures:
         _rescue(result, arguments)
@@ -127,6 +128,21 @@ def write_outputs(result: Result, scan: Scan, arguments: argparse.Namespace) -> 
     _write_about(result, scan, arguments, failures)
     if failures:
         raise failures[0]
+
+
+def _explain(result: Result, scan: Scan, arguments: argparse.Namespace) -> None:
+    """Let the file that holds everything hold the residuals, too, which `view` and a report then show."""
+    from tomo_polysplat.result.formats import format_of
+
+    if not format_of(arguments.output).everything or not result.gaussians:
+        return
+    # Who has little time has it for the report alone.
+    if arguments.time_budget is not None and arguments.report is None:
+        return
+    try:
+        result.explain(scan, device=arguments.device)
+    except (ValueError, RuntimeError, MemoryError) as error:
+        logger.warning("How well the rays are explained is not kept: %s", error)
 
 
 def _write_about(result: Result, scan: Scan, arguments: argparse.Namespace, failures: list[OSError]) -> None:

@@ -21,6 +21,7 @@ from tomo_polysplat.units import cm_per
 if TYPE_CHECKING:
     from tomo_polysplat.quality.halves import Resolution
     from tomo_polysplat.quality.inserts import Contrast
+    from tomo_polysplat.report.residuals import Residuals
     from tomo_polysplat.scan.scan import Scan
 
 __all__ = ["Result"]
@@ -61,6 +62,8 @@ class Result:
         Words on what it was made from and with: scanner, volume, spectrum, device and software.
     geometry : dict, optional
         ASTRA's vector geometry of the projections, in `unit`: as told, or as ``align`` has found it.
+    residuals : Residuals, optional
+        How well the rays are explained, once :meth:`explain` or a report has looked at the scan; it is saved.
     seconds : float
         Time that the reconstruction took.
     flipped_2d : bool
@@ -82,6 +85,7 @@ class Result:
     geometry: dict[str, Any] | None = None
     seconds: float = 0.0
     flipped_2d: bool = False
+    residuals: Residuals | None = None
 
     def __post_init__(self) -> None:
         self.basis = np.ascontiguousarray(require_array("basis", self.basis, 4), np.float32)
@@ -280,6 +284,25 @@ class Result:
 
         write_npy(image_of(self), path, overwrite=overwrite)
 
+    def explain(self, scan: Scan, *, device: str = "auto") -> Residuals:
+        """How well the rays are explained, by view and by pixel, in units of their noise; kept in `residuals`.
+
+        Parameters
+        ----------
+        scan : Scan
+            What this was made from.
+        device : {"auto", "cpu", "cuda", "cuda:N"}
+
+        Raises
+        ------
+        ValueError
+            If the scan has another volume or unit, or this has no Gaussians.
+        """
+        from tomo_polysplat.report.residuals import residuals_of
+
+        self.residuals = residuals_of(self, scan, device=device)
+        return self.residuals
+
     def report(
         self,
         path: str | os.PathLike,
@@ -298,7 +321,8 @@ class Result:
         path : str or path
         scan : Scan, optional
             What this was made from: the page then has FDK beside the result, and how well the rays are explained in
-            units of their noise, by view and by pixel. It takes the time of FDK and of one look at 180 views.
+            units of their noise, by view and by pixel, unless `residuals` tell already. It takes the time of FDK and
+            of one look at 180 views.
         truth, metal_mask : array shaped like :attr:`volume`, or None
             True attenuation in 1/`unit` at :attr:`energy_kev`, and voxels of metal, for figures of merit.
         resolution, contrast : Resolution, Contrast, optional
