@@ -4,7 +4,13 @@ import os
 import signal
 
 import pytest
-import torch
+
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # Workers share the cores; threads of one would wait for those of the other. Read when torch is imported.
+    cores = (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, cores)))
+
+import torch  # noqa: E402
 
 
 def pytest_configure():

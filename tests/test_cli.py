@@ -165,6 +165,7 @@ def test_check_describes_a_scan(scan_file, capsys):
     assert main(["check", str(scan_file)]) == 0
     printed = capsys.readouterr().out
     assert "cone" in printed and "rays left out   0 of" in printed and "90 kVp" in printed
+    assert "Nothing to mend" in printed and f"cannot answer {printed.count(chr(10) + '?')} of" in printed
 
 
 @pytest.mark.parametrize(

@@ -184,3 +184,25 @@ def test_the_conda_recipe_has_the_dependencies_of_the_package():
         name, least = line.strip().split(">=")
         assert f"{others.get(name, name)} >={least}" in told
     assert f'version = "{tomo_polysplat.__version__}"' in recipe
+
+
+def long_functions(path):
+    """Functions of more than 40 lines, 6 parameters or 3 closures, and whether a comment above says why."""
+    source = path.read_text(encoding="utf-8")
+    lines = source.splitlines()
+    for node in ast.walk(ast.parse(source)):
+        if not isinstance(node, ast.FunctionDef):
+            continue
+        body = node.body[1:] if ast.get_docstring(node) else node.body
+        length = node.end_lineno - body[0].lineno + 1 if body else 0
+        names = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
+        closures = sum(isinstance(inner, ast.FunctionDef | ast.Lambda) for inner in ast.walk(node)) - 1
+        if length > 40 or len([n for n in names if n not in ("self", "cls")]) > 6 or closures > 3:
+            first = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
+            yield node.name, lines[first - 2].lstrip().startswith("# ")
+
+
+def test_a_long_function_says_why():
+    """But for the kernels, whose compilers take arrays and numbers and no objects that hold them."""
+    files = [path for part, path in sources() if part != "kernels"]
+    assert [f"{path.name}: {name}" for path in files for name, why in long_functions(path) if not why] == []

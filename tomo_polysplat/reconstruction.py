@@ -34,6 +34,7 @@ from tomo_polysplat.plan.calibration import Calibration
 from tomo_polysplat.plan.checkpoint import Checkpoint
 from tomo_polysplat.plan.model import all_curves
 from tomo_polysplat.plan.never_worse import densities_of_start
+from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.preparation import PreparedFit, RunOptions
 from tomo_polysplat.plan.solver import Solver
 from tomo_polysplat.plan.unit_check import tell_impossible
@@ -41,7 +42,7 @@ from tomo_polysplat.progress import progress_reports
 from tomo_polysplat.result.provenance import provenance
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.coverage import unseen_share
-from tomo_polysplat.scan.geometry import VolumeGrid, from_astra, is_planar_geometry, to_astra
+from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, from_astra, is_planar_geometry, to_astra
 from tomo_polysplat.scan.measurement import Measurement
 from tomo_polysplat.scan.mending import mend_scan
 from tomo_polysplat.scan.scan import Scan
@@ -58,6 +59,7 @@ logger = logging.getLogger(__name__)
 _VIEWS_OF_PIXELS = 16
 
 
+# One parameter for each option that a caller names.
 @usual_modes()
 def reconstruct(
     projections: Any,
@@ -184,28 +186,13 @@ def reconstruct(
     measured = Measurement(
         projections, proj_geom, vol_geom, unit, spectrum, valid, water_correction, filter_map
     ).filled()
-    proj_geom, vol_geom = measured.geometries()
     if measured.unit is None and measured.spectrum is not None:
         warn_of_unit("cm")
-    unit, water_correction = measured.unit or "cm", measured.water_correction
-    spectrum, filter_map = require_spectrum("spectrum", measured.spectrum), measured.filter_map
-    geometry, grid = from_astra(proj_geom, vol_geom)
-    widest, on = run_options.settings.surroundings, run_options.device
-    energies = 1 if spectrum is None else len(spectrum.energies)
-    require_machine(math.prod(np.shape(measured.projections)), math.prod(grid.shape), energies, on)
-    # What torch adds up depends on how many threads it has.
-    with one_torch_thread(on):
-        values, counts = usable_rays(
-            measured.projections, proj_geom, measured.valid, water_correction, spectrum
-        )
-        problem = Problem.of(values, geometry, grid, unit, spectrum, materials, widest, on)
-        problem = filtered(problem, filter_map, unit, proj_geom["type"] == "cyl_cone_vec")
-    # Made wider where the object is, it may have many times the voxels.
-    require_machine(0, math.prod(problem.grid.shape), energies, on)
-    # Sorted, they may be a copy: these would stay in memory beside it.
-    del values
+    unit, spectrum = measured.unit or "cm", require_spectrum("spectrum", measured.spectrum)
+    geometry, grid = from_astra(*measured.geometries())
+    problem, counts = _problem(measured, geometry, grid, materials, run_options)
     wanted = Calibration.of(calibrate, soft_density, problem.spectrum)
-    flipped = is_planar_geometry(proj_geom)
+    flipped = is_planar_geometry(measured.geometries()[0])
     moved = moves_of(align, time_budget)
     asked = None if wanted is None else {"names": wanted.names, "soft_density": wanted.soft_density}
     options = run_options.to_dict() | {
@@ -218,13 +205,7 @@ def reconstruct(
     with one_torch_thread(run_options.device), kept_threads(), progress_reports(progress) as report:
         solver = Solver(run_options, saved, started, flipped, report, moved)
         problem, prepared, outcome = solver.solve(problem, wanted, ask_scatter=calibrate is None)
-        if water_correction is not None:
-            prepared.plan.note("water_correction", "undone", describe_polynomial(water_correction))
-        prepared.plan.note("unseen", *_unseen(problem, grid))
-        if mended:
-            prepared.plan.note("mended", "the axis", "; ".join(mended))
-        if problem.filter_map is not None:
-            prepared.plan.note("filter_map", "modelled", problem.filter_map.describe())
+        _note_scan(prepared.plan, problem, grid, measured.water_correction, mended)
         with postponed_interrupts("the volume") as interruption:
             report(1.0, "volume")
             result = _result(
@@ -247,6 +228,44 @@ def reconstruct(
     result.seconds = time.perf_counter() - begun
     logger.info("Reconstructed in %.1f s: %s; %s", result.seconds, result.plan["stop"].why, result.counts)
     return result
+
+
+def _problem(
+    measured: Measurement, geometry: Geometry, grid: VolumeGrid, materials: Any, options: RunOptions
+) -> tuple[Problem, dict[str, int]]:
+    """What is to be solved, on this machine, and counts of the rays that are used."""
+    proj_geom, _ = measured.geometries()
+    spectrum, unit, on = measured.spectrum, measured.unit or "cm", options.device
+    energies = 1 if spectrum is None else len(spectrum.energies)
+    require_machine(math.prod(np.shape(measured.projections)), math.prod(grid.shape), energies, on)
+    # What torch adds up depends on how many threads it has.
+    with one_torch_thread(on):
+        values, counts = usable_rays(
+            measured.projections, proj_geom, measured.valid, measured.water_correction, spectrum
+        )
+        widest = options.settings.surroundings
+        problem = Problem.of(values, geometry, grid, unit, spectrum, materials, widest, on)
+        problem = filtered(problem, measured.filter_map, unit, proj_geom["type"] == "cyl_cone_vec")
+    # Made wider where the object is, it may have many times the voxels.
+    require_machine(0, math.prod(problem.grid.shape), energies, on)
+    return problem, counts
+
+
+def _note_scan(
+    plan: Plan,
+    problem: Problem,
+    grid: VolumeGrid,
+    water_correction: Sequence[float] | None,
+    mended: list[str],
+) -> None:
+    """Put into the plan what was known of the scan before the fit, and what was done about it."""
+    if water_correction is not None:
+        plan.note("water_correction", "undone", describe_polynomial(water_correction))
+    plan.note("unseen", *_unseen(problem, grid))
+    if mended:
+        plan.note("mended", "the axis", "; ".join(mended))
+    if problem.filter_map is not None:
+        plan.note("filter_map", "modelled", problem.filter_map.describe())
 
 
 def _unseen(problem: Problem, grid: VolumeGrid) -> tuple[float, str]:

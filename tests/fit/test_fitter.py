@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tomo_polysplat.fit.fitter import Fitter
+from tomo_polysplat.fit.fitter import Batches, Fitter
 from tomo_polysplat.fit.stopping import Clock
 
 sys.path.append(str(Path(__file__).parents[1] / "kernels"))
@@ -24,7 +24,7 @@ class ShortClock(Clock):
 
 def fitter_of(steps):
     gaussians, spacing, rays, scene, settings = fit_problem("cone", True, "cpu", "numba")
-    return Fitter(gaussians, spacing, rays, scene, settings, 1, steps, np.random.default_rng(1))
+    return Fitter(gaussians, spacing, rays, scene, settings, Batches(1, steps, np.random.default_rng(1)))
 
 
 def rates(fitter):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tomo_polysplat.model.seed import seed_gaussians
+from tomo_polysplat.model.seed import Spacing, seed_gaussians
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.settings import Settings
 
@@ -21,7 +21,9 @@ def grid_of(shape, voxel=(0.1, 0.1, 0.1), shift=(0.0, 0.0, 0.0)):
 def seeds(start, grid, spacing=1.3, polychromatic=False, settings=SETTINGS, finer=0.0):
     planar = grid.planar
     distance = spacing * float(grid.voxel_size[: 2 if planar else 3].min())
-    return seed_gaussians(start, grid, distance, settings, polychromatic, planar, torch.device("cpu"), finer)
+    return seed_gaussians(
+        torch.tensor(start), grid, Spacing(distance, finer), settings, polychromatic, planar
+    )
 
 
 def mass(cloud, dims):
@@ -67,9 +69,7 @@ def test_seeds_of_a_full_window_have_its_mass_to_rounding():
 
 def test_one_slice_of_a_scan_with_several_rows_gets_gaussians_that_end():
     grid = grid_of((1, 9, 9))
-    cloud = seed_gaussians(
-        np.ones((1, 9, 9), np.float32), grid, 0.13, SETTINGS, False, False, torch.device("cpu")
-    )
+    cloud = seed_gaussians(torch.ones(1, 9, 9), grid, Spacing(0.13), SETTINGS, False, False)
     assert not cloud.planar and bool(torch.isfinite(cloud.scale()).all())
     assert mass(cloud, 3) == pytest.approx(float(np.prod(grid.extent)), rel=1e-5)
 
@@ -170,7 +170,7 @@ def test_seeds_on_the_gpu_are_those_of_the_cpu():
     start[3:21, 4:16, 5:27] = 1.0
     start[9:13, 7:11, 8:13], start[15, 12, 20:23] = 9.0, 3.0
     clouds = [
-        seed_gaussians(start, grid, 0.17, SETTINGS, True, False, torch.device(device))
+        seed_gaussians(torch.tensor(start, device=device), grid, Spacing(0.17), SETTINGS, True, False)
         for device in ("cpu", "cuda")
     ]
     assert len(clouds[0]) == len(clouds[1]) and torch.equal(clouds[0].group, clouds[1].group.cpu())

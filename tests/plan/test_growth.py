@@ -11,7 +11,7 @@ import pytest
 import torch
 from planned import planned, problem
 
-from tomo_polysplat.fit.fitter import Fitter
+from tomo_polysplat.fit.fitter import Batches, Fitter
 from tomo_polysplat.fit.rays import batches_around
 from tomo_polysplat.fit.stopping import Clock
 from tomo_polysplat.plan.answer import Answer, Status
@@ -201,7 +201,7 @@ def test_a_cloud_without_dense_matter_that_grows_is_smoothed_less(times, curves,
 def test_the_optimiser_remembers_those_that_are_not_split(device, kernel):
     gaussians, spacing, rays, scene, settings = fit_problem("cone", True, device, kernel)
     growing = replace(settings, growth=2.0, relocate_until=1.0, bone_level=DENSE)
-    fitter = Fitter(gaussians, spacing, rays, scene, growing, 1, 100, np.random.default_rng(1))
+    fitter = Fitter(gaussians, spacing, rays, scene, growing, Batches(1, 100, np.random.default_rng(1)))
     count, clock = len(gaussians), Clock(100, None)
     light = int((gaussians.group <= 0).sum())
     assert 1 < light < count and fitter.most == count + light

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
 from tomo_polysplat.cli.options import add_scan_options
+
+if TYPE_CHECKING:
+    from tomo_polysplat.scan.scan import Scan
 
 NAME = "check"
 HELP = "say what is in a scan and what is wrong with it, and how to mend that"
@@ -19,13 +23,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Read, describe and check a file; the exit status is 3 if something should be mended."""
-    import numpy as np
-
     from tomo_polysplat.cli.options import scan_from
     from tomo_polysplat.scan.check import check_scan
-    from tomo_polysplat.scan.geometry import from_astra
 
     scan = scan_from(arguments)
+    lines = _described(scan)
+    width = max(map(len, lines))
+    for name, text in lines.items():
+        print(f"{name:{width}}  {text}")
+    findings = check_scan(scan)
+    print()
+    width = max(len(finding.probe) for finding in findings)
+    for finding in findings:
+        print(f"{SIGNS[finding.verdict]:4}  {finding.probe:{width}}  {finding.text}")
+        if finding.remedy:
+            print(f"{'':4}  {'':{width}}  -> {finding.remedy}")
+    defects, unknown = (
+        sum(finding.verdict == verdict for finding in findings) for verdict in ("defect", "unknown")
+    )
+    print(f"\n{_summary(defects, unknown)}")
+    return DEFECT_STATUS if defects else 0
+
+
+def _described(scan: Scan) -> dict[str, str]:
+    """What the file holds, a line each."""
+    import numpy as np
+
+    from tomo_polysplat.scan.geometry import from_astra
+
     geometry, grid = from_astra(scan.proj_geom, scan.vol_geom)
     values = scan.projections if scan.valid is None else scan.projections[scan.valid]
     lost = 0 if scan.valid is None else int(np.count_nonzero(~scan.valid))
@@ -46,14 +71,12 @@ def run(arguments: argparse.Namespace) -> int:
     if "centre" in scan.notes:
         how = "estimated from opposite views" if scan.notes["centre_estimated"] else "as given"
         lines["rotation axis"] = f"column {scan.notes['centre']:.2f}, {how}"
-    width = max(map(len, lines))
-    for name, text in lines.items():
-        print(f"{name:{width}}  {text}")
-    findings = check_scan(scan)
-    print()
-    width = max(len(finding.probe) for finding in findings)
-    for finding in findings:
-        print(f"{SIGNS[finding.verdict]:4}  {finding.probe:{width}}  {finding.text}")
-        if finding.remedy:
-            print(f"{'':4}  {'':{width}}  -> {finding.remedy}")
-    return DEFECT_STATUS if any(finding.verdict == "defect" for finding in findings) else 0
+    return lines
+
+
+def _summary(defects: int, unknown: int) -> str:
+    """What to do about all of the answers, in a sentence or two."""
+    text = f"Mend {defects} of them before recon." if defects else "Nothing to mend: recon can begin."
+    if unknown:
+        text += f" This scan cannot answer {unknown} of the questions; that alone is no fault."
+    return text

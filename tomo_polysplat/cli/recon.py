@@ -31,6 +31,7 @@ NAME = "recon"
 HELP = "reconstruct a scan into a volume of attenuation in 1/length"
 
 
+# Long: a line or two for every option, in the order of the help.
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this subcommand."""
     add_scan_options(parser)

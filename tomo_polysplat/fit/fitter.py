@@ -7,7 +7,7 @@ import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ from tomo_polysplat.model.density_control import grow, relocate, splittable
 from tomo_polysplat.model.gaussians import OF_ALL, Gaussians
 from tomo_polysplat.settings import Settings
 
-__all__ = ["Fitter", "next_views", "views_of_a_pass"]
+__all__ = ["Batches", "Fitter", "next_views", "views_of_a_pass"]
 
 # A pass over fewer views than this makes the steps of one over as many.
 _FEWEST_VIEWS = 10
@@ -36,6 +36,14 @@ _FEWEST_VIEWS = 10
 # to where they belong. Broccoli of 44^3 and, in twice the room, of 36^3 voxels, four times as many Gaussians: +1.61 and
 # +0.81 dB, a pass earlier +1.59 and +0.72, a third at a time to three times as many +1.27 and +0.56.
 _SPLIT, _SPLIT_FROM = 0.5, 0.14
+
+
+class Batches(NamedTuple):
+    """Views of a step, steps of the run, by which learning rates go, and who draws the order of the views."""
+
+    views: int
+    steps: int
+    rng: np.random.Generator
 
 
 class Fitter:
@@ -50,10 +58,7 @@ class Fitter:
     rays : Rays
     scene : FitScene
     settings : Settings
-    batch, steps : int
-        Views of a step, and steps of the run, by which learning rates go.
-    rng : numpy.random.Generator
-        Of the order of the views.
+    batches : Batches
     """
 
     def __init__(
@@ -63,11 +68,10 @@ class Fitter:
         rays: Rays,
         scene: FitScene,
         settings: Settings,
-        batch: int,
-        steps: int,
-        rng: np.random.Generator,
+        batches: Batches,
     ) -> None:
-        self.gaussians, self.rays, self.scene, self.settings, self.rng = gaussians, rays, scene, settings, rng
+        batch, steps, self.rng = batches
+        self.gaussians, self.rays, self.scene, self.settings = gaussians, rays, scene, settings
         self.step = make_step(gaussians, spacing, rays, scene, hurried(settings, steps), batch=batch)
         self.spacing, self.batch, self.order = spacing, batch, np.empty(0, int)
         self.steps = steps
@@ -117,8 +121,8 @@ class Fitter:
     def branch(self, **changes: Any) -> Fitter:
         """The same run from here on, with changes to its scene by name, on Gaussians of its own."""
         scene, rng = replace(self.scene, **changes), copy.deepcopy(self.rng)
-        gaussians, counts = self.gaussians.copy(), (self.batch, self.steps)
-        other = Fitter(gaussians, self.spacing, self.rays, scene, self.settings, *counts, rng)
+        gaussians, batches = self.gaussians.copy(), Batches(self.batch, self.steps, rng)
+        other = Fitter(gaussians, self.spacing, self.rays, scene, self.settings, batches)
         other.restore(self.snapshot(None, {}))
         return other
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.fitter import Fitter, views_of_a_pass
+from tomo_polysplat.fit.fitter import Batches, Fitter, views_of_a_pass
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.snapshot import Keeps
@@ -29,7 +29,7 @@ from tomo_polysplat.kernels.compile_time import working_time
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 
-__all__ = ["Between", "FitOutcome", "FitState", "Made", "Run", "fit"]
+__all__ = ["Between", "Course", "FitOutcome", "FitState", "Made", "Run", "fit"]
 
 logger = logging.getLogger(__name__)
 
@@ -179,55 +179,75 @@ class _Keeper(Run):
         return FitState(*numbers, lambda: volume(gaussians))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Course:
+    """How a fit runs, and whom it tells.
+
+    Attributes
+    ----------
+    views_per_step : int
+    rng : numpy.random.Generator
+        Of the order of the views.
+    started : float
+        When, in seconds of ``working_time``.
+    volume : callable
+        Makes the volume of Gaussians, for callbacks.
+    deadline : float or None
+        When the fit ends at the latest, in the same seconds.
+    callbacks : sequence of callables
+        Called once a pass; one that returns True ends the fit.
+    checkpoint : Keeps or None
+        Where it holds a snapshot, the fit goes on from there.
+    between : callable or None
+        Called between passes; asks what the plan left open.
+    pace : callable or None
+        Is told early on what a deadline has room for.
+    """
+
+    views_per_step: int
+    rng: np.random.Generator
+    started: float
+    volume: Callable[[Gaussians], np.ndarray]
+    deadline: float | None = None
+    callbacks: Sequence[Callable[[FitState], Any]] = ()
+    checkpoint: Keeps | None = None
+    between: Between | None = None
+    pace: Pace | None = None
+
+
 def fit(
-    gaussians: Gaussians,
-    spacing: float,
-    rays: Rays,
-    scene: FitScene,
-    settings: Settings,
-    *,
-    views_per_step: int,
-    rng: np.random.Generator,
-    started: float,
-    deadline: float | None = None,
-    volume: Callable[[Gaussians], np.ndarray],
-    callbacks: Sequence[Callable[[FitState], Any]] = (),
-    checkpoint: Keeps | None = None,
-    between: Between | None = None,
-    pace: Pace | None = None,
+    gaussians: Gaussians, spacing: float, rays: Rays, scene: FitScene, settings: Settings, course: Course
 ) -> FitOutcome:
     """Fit Gaussians to rays.
 
-    Stops after ``settings.passes`` over the views, at ``deadline`` (seconds of ``working_time``), when the held-out
-    rays have not improved for ``settings.patience`` passes (`usual_patience`), when a callback returns True, or on
-    KeyboardInterrupt; returns the Gaussians that `Watch` holds for the best. Where ``checkpoint``
-    holds a snapshot, ``gaussians`` are its own and the fit goes on from there. ``between`` is called
-    between passes, and asks what the plan left open; ``pace`` is told early on what a deadline has room for.
+    Stops after ``settings.passes`` over the views, at the deadline, when the held-out rays have not improved for
+    ``settings.patience`` passes (`usual_patience`), when a callback returns True, or on KeyboardInterrupt. Returns the
+    Gaussians that `Watch` holds for the best. Where the checkpoint holds a snapshot, ``gaussians`` are its own.
     """
     if not len(gaussians):
         logger.warning("The start volume is empty: no Gaussians, a volume of zeros.")
         words = "nothing to fit: the start volume is empty"
         return FitOutcome(gaussians, stop=Stop(StopReason.EMPTY, words))
-    batch = min(views_per_step, len(rays.views))
+    batch = min(course.views_per_step, len(rays.views))
     steps = max(1, math.ceil((settings.passes or 1.0) * views_of_a_pass(rays) / batch))
     outcome = FitOutcome(gaussians)
     passes = settings.passes or 1.0
     watch: Watch[Gaussians] = Watch(settings.patience or usual_patience(passes))
     # Nobody else holds the fitter, which makes room for another one where a question is answered by that.
     run = _Keeper(
-        Fitter(gaussians, spacing, rays, scene, settings, batch, steps, rng),
+        Fitter(gaussians, spacing, rays, scene, settings, Batches(batch, steps, course.rng)),
         # From now on: what compiling or recording the step took is no part of the run that the learning rates follow.
-        clock := Clock(steps, deadline, pace),
+        clock := Clock(steps, course.deadline, course.pace),
         outcome=outcome,
         watch=watch,
-        started=started,
-        checkpoint=checkpoint,
-        between=between,
+        started=course.started,
+        checkpoint=course.checkpoint,
+        between=course.between,
     )
     run.restore()
     try:
         if outcome.stop is None:
-            run.follow(volume, callbacks)
+            run.follow(course.volume, course.callbacks)
     except KeyboardInterrupt:
         logger.warning("Interrupted after %d steps; the best state so far is returned.", clock.done)
         outcome.stop = Stop(StopReason.INTERRUPTED, "interrupted")

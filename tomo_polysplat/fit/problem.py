@@ -104,6 +104,7 @@ class Problem:
     filter_map: FilterMap | None = None
     _known: _Known = field(default_factory=_Known, init=False, repr=False)
 
+    # What a caller of reconstruct tells, as it comes.
     @classmethod
     def of(
         cls,

@@ -8,6 +8,7 @@ fine at metal.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -20,53 +21,69 @@ from tomo_polysplat.model.seed_samples import box_mean, reaches, voxel_of
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.settings import Settings
 
-__all__ = ["seed_gaussians"]
+__all__ = ["Spacing", "seed_gaussians"]
 
 # Attenuation, in soft references, of a seed in what looks like air: from zero it would not grow.
 _LEAST = 0.02
 
 
+class Spacing(NamedTuple):
+    """How far apart seeds are.
+
+    Attributes
+    ----------
+    mean : float
+        Wanted distance in the grid's unit. It is changed so that a whole number fills the window.
+    finer : float
+        Share of the Gaussians, below 1, that lie where the start varies most, on a grid twice as fine as that of the
+        rest. The total stays that of a grid with one distance.
+    finest : float
+        Distance of the closest seeds that the detector could tell apart. Seeds that are farther apart are made as thin
+        as that across edges of the start (``seed_edges``). Infinity makes all of them round.
+    """
+
+    mean: float
+    finer: float = 0.0
+    finest: float = math.inf
+
+
 def seed_gaussians(
-    start: torch.Tensor | np.ndarray,
+    start: torch.Tensor,
     grid: VolumeGrid,
-    spacing: float,
+    spacing: Spacing,
     settings: Settings,
     polychromatic: bool,
     planar: bool,
-    device: torch.device,
-    finer: float = 0.0,
-    finest: float = math.inf,
 ) -> Gaussians:
     """Seed the support of a start volume.
 
     Parameters
     ----------
-    start : (nz, ny, nx) array or tensor
-        First reconstruction in soft references.
+    start : (nz, ny, nx) tensor
+        First reconstruction in soft references; the Gaussians are made on its device.
     grid : VolumeGrid
         In the solver's coordinates.
-    spacing : float
-        Wanted distance of the seeds in the grid's unit. It is changed so that a whole number fills the window.
+    spacing : Spacing
+    settings : Settings
+    polychromatic : bool
+        Whether seeds have material numbers of their own.
     planar : bool
         Endless along z, for a scan of one plane.
-    finer : float
-        Share of the Gaussians, below 1, that lie where the start varies most, on a grid twice as fine as that of the
-        rest. The total stays that of a grid with one ``spacing``.
-    finest : float
-        Distance of the closest seeds that the detector could tell apart. Seeds that are farther apart are made as thin
-        as that across edges of the start (``seed_edges``). Infinity makes all of them round.
     """
     dims = 2 if planar else 3
-    values = start if isinstance(start, torch.Tensor) else torch.tensor(start)
-    start = _sharpened(values.to(device), settings)
-    points, size, cell, value = _lattices(start, grid, spacing, dims, settings, finer)
-    reach = settings.free_radius * float(grid.voxel_size[:dims].min())
-    own, shared, group = _materials(start, points, value, grid, reach, settings, polychromatic)
+    start = _sharpened(start, settings)
+    points, size, cell, value = _lattices(start, grid, spacing, dims, settings)
+    if polychromatic:
+        reach = settings.free_radius * float(grid.voxel_size[:dims].min())
+        own, shared, group = _materials(start, points, value, grid, reach, settings)
+    else:
+        own, shared = torch.full_like(value, settings.soft_u), value.new_tensor([settings.soft_u])
+        group = torch.zeros(len(points), dtype=torch.int64, device=points.device)
     # Round, whatever the shape of the cell: a Gaussian thinner than the distance of rays could lie between them. With
     # this height, the cell's integral over the Gaussian's, a lattice of them averages to the wanted value.
     width = settings.seed_width * size
     attenuation = value * cell / (math.sqrt(2 * math.pi) * width) ** dims
-    rotation, thinner = edge_shapes(start, points, size, grid, settings, finest, dims)
+    rotation, thinner = edge_shapes(start, points, size, grid, settings, spacing.finest, dims)
     log_scale = width.log()[:, None] + thinner
     parts = (points, log_scale, rotation, attenuation, own, shared, rotation.new_tensor([settings.blur]))
     position, log_scale, rotation, attenuation, own, shared, blur = (part.float() for part in parts)
@@ -123,12 +140,13 @@ def _sharpened(start: torch.Tensor, settings: Settings) -> torch.Tensor:
 
 
 def _lattices(
-    start: torch.Tensor, grid: VolumeGrid, spacing: float, dims: int, settings: Settings, finer: float
+    start: torch.Tensor, grid: VolumeGrid, spacing: Spacing, dims: int, settings: Settings
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """Points (n, 3) on the support; spacing, volume of the cell and the start's mean over it, (n,) each."""
-    spacing = spacing / (1 - finer) ** (1 / dims)
-    coarse, step = _lattice(grid, spacing, dims, start.device)
-    metal = reaches(start, coarse, grid, settings.metal_level, spacing)
+    finer = spacing.finer
+    distance = spacing.mean / (1 - finer) ** (1 / dims)
+    coarse, step = _lattice(grid, distance, dims, start.device)
+    metal = reaches(start, coarse, grid, settings.metal_level, distance)
     parted = {1: ~metal, 2: metal}
     if finer:
         varied = _varied(start, coarse, grid, step, settings, finer) & ~metal
@@ -140,7 +158,7 @@ def _lattices(
         keep = nearby > settings.support_level
         points, value = points[keep], value[keep].clamp(min=_LEAST)
         cell = float(np.prod(share * step))
-        parts.append((points, torch.full_like(value, share * spacing), torch.full_like(value, cell), value))
+        parts.append((points, torch.full_like(value, share * distance), torch.full_like(value, cell), value))
     points, sizes, cells, values = (torch.cat(tensors) for tensors in zip(*parts))
     return points, sizes, cells, values
 
@@ -218,7 +236,6 @@ def _materials(
     grid: VolumeGrid,
     reach: float,
     settings: Settings,
-    polychromatic: bool,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Material numbers of their own, of the groups, and the group of every seed.
 
@@ -226,8 +243,6 @@ def _materials(
     between, the start does not tell materials reliably, and every Gaussian has a number of its own.
     """
     group = torch.zeros(len(points), dtype=torch.int64, device=points.device)
-    if not polychromatic:
-        return torch.full_like(value, settings.soft_u), value.new_tensor([settings.soft_u]), group
     own = start_numbers(value, settings)
     group[reaches(start, points, grid, settings.bone_level, reach)] = -1
     box, pieces, number = _pieces(_metal(start, settings))

@@ -22,6 +22,7 @@ _AVERAGED = 3
 _THINNEST = 0.4
 
 
+# Seeds and their start, and how thin they may get: nothing else holds these together.
 def edge_shapes(
     start: torch.Tensor,
     points: torch.Tensor,

@@ -123,6 +123,7 @@ class Quadrature:
         )
 
 
+# One parameter for each option that a caller names.
 def fit_quadrature(
     spectrum: Spectrum,
     materials: Materials | None = None,

@@ -11,7 +11,7 @@ import torch
 from tomo_polysplat.fit.memory import most_gaussians, require_room, room_for_gaussians
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.model.gaussians import Gaussians
-from tomo_polysplat.model.seed import seed_gaussians
+from tomo_polysplat.model.seed import Spacing, seed_gaussians
 from tomo_polysplat.plan.costs import work
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.resolution import finest_spacing, most_seeds
@@ -52,15 +52,12 @@ def first_gaussians(
     finest = 0.0 if plan.sharp else finest
     several = plan.curves > 1
     gaussians = seed_gaussians(
-        relative,
+        torch.as_tensor(relative).to(device),
         problem.grid,
-        spacing,
+        Spacing(spacing, plan.finer, finest),
         plan.adapted(settings),
         several,
         problem.planar,
-        device,
-        plan.finer,
-        finest,
     )
     free = int((gaussians.group < 0).sum())
     kinds = "none with a material number of its own"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.optimise import FitOutcome, Run, fit
+from tomo_polysplat.fit.optimise import Course, FitOutcome, Run, fit
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.stopping import Stop, StopReason
@@ -150,12 +150,7 @@ class Solver:
             logger.warning("Interrupted before the first step; what it would have begun with is returned.")
             return FitOutcome(prepared.gaussians, stop=Stop(StopReason.INTERRUPTED, "interrupted"))
         settings = plan.adapted(plan.with_agent(run_options.settings))
-        return fit(
-            prepared.gaussians,
-            plan.spacing * problem.voxel,
-            prepared.rays,
-            scene,
-            replace(settings, passes=plan.passes),
+        course = Course(
             views_per_step=plan.views_per_step,
             rng=np.random.default_rng(run_options.seed),
             started=self.started,
@@ -166,6 +161,8 @@ class Solver:
             between=self._questions(prepared, problem, ask_scatter),
             pace=lambda room, lacking: self._tell_pace(plan, room, lacking),
         )
+        settings = replace(settings, passes=plan.passes)
+        return fit(prepared.gaussians, plan.spacing * problem.voxel, prepared.rays, scene, settings, course)
 
     def _tell_pace(self, plan: Plan, room: float, lacking: float) -> None:
         """Say for how much of the run the time budget has room, at its beginning."""

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tomo_polysplat.fit.optimise import FitOutcome, fit
+from tomo_polysplat.fit.optimise import Course, FitOutcome, fit
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
@@ -51,11 +51,13 @@ def fitted_shortly(
         rays,
         scene,
         replace(means.settings, growth=1.0),
-        views_per_step=views_of_short_steps(plan, problem),
-        rng=np.random.default_rng(means.seed),
-        started=started,
-        deadline=None if means.time_budget is None else started + _SHARE_OF_BUDGET * means.time_budget,
-        volume=lambda gaussians: scene.volume(gaussians).cpu().numpy(),
+        Course(
+            views_per_step=views_of_short_steps(plan, problem),
+            rng=np.random.default_rng(means.seed),
+            started=started,
+            deadline=None if means.time_budget is None else started + _SHARE_OF_BUDGET * means.time_budget,
+            volume=lambda gaussians: scene.volume(gaussians).cpu().numpy(),
+        ),
     )
     if outcome.stop is not None and outcome.stop.reason is StopReason.INTERRUPTED:
         raise KeyboardInterrupt("interrupted during a short fit: there is no result yet")

@@ -75,6 +75,7 @@ class Contrast:
         return f"A ball that differs by {self.added:.0%} from the matter around it keeps {', '.join(told)}."
 
 
+# One parameter for each option that a caller names.
 def contrast(
     result: Result,
     scan: Scan,

@@ -25,6 +25,7 @@ __all__ = ["comparison", "comparison_figure", "history_figure", "png_bytes", "sl
 PANEL = 2.35  # inches
 
 
+# One parameter for each option that a caller names.
 def comparison_figure(
     path: str | os.PathLike,
     panels: Sequence[tuple[str, np.ndarray]],
@@ -42,6 +43,7 @@ def comparison_figure(
     _write(figure, path, overwrite)
 
 
+# One parameter for each option that a caller names.
 def comparison(
     panels: Sequence[tuple[str, np.ndarray]],
     truth: np.ndarray,

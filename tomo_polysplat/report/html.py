@@ -37,6 +37,7 @@ logger = logging.getLogger(__name__)
 Volumes = list[tuple[str, np.ndarray]]
 
 
+# One parameter for each option that a caller names.
 def write_report(
     result: Result,
     path: str | os.PathLike,

@@ -71,6 +71,7 @@ def draw(axis: Axes, table: Table, unit: str) -> None:
             _put(axis, place, line - 0.2, text, ACCENT if ours else INK, 10, "bold" if bold else "normal")
 
 
+# What Matplotlib's text takes.
 def _put(axis: Axes, x: float, y: float, text: str, colour: str, size: float, weight: str) -> None:
     align = "left" if x == 0 else "right"
     axis.text(x, y, text, ha=align, va="center", fontsize=size, color=colour, fontweight=weight)

@@ -303,6 +303,7 @@ class Result:
         self.residuals = residuals_of(self, scan, device=device)
         return self.residuals
 
+    # One parameter for each option that a caller names.
     def report(
         self,
         path: str | os.PathLike,

@@ -21,6 +21,7 @@ __all__ = ["cone_geometry", "parallel_geometry", "volume_seen"]
 logger = logging.getLogger(__name__)
 
 
+# One parameter for each option that a caller names.
 def cone_geometry(
     *,
     source_object: float,
@@ -81,6 +82,7 @@ def cone_geometry(
     return _with_volume(straight, offset, (width, height), voxels, voxel)
 
 
+# One parameter for each option that a caller names.
 def parallel_geometry(
     *,
     pixel: float | tuple[float, float],

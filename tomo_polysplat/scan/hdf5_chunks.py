@@ -138,6 +138,7 @@ def _overlap(wanted: range, low: int, high: int) -> tuple[slice, slice] | None:
     return slice(first, last), slice(source[0] - low, source[-1] - low + 1, wanted.step)
 
 
+# The arguments of a task that threads share out.
 def _unpack_into(where, content, skipped, filters, dtype, chunks, out, targets, sources) -> None:  # type: ignore[no-untyped-def]
     content = unpacked(where, content, skipped, filters, math.prod(chunks) * dtype.itemsize)
     out[targets] = np.frombuffer(content, dtype).reshape(chunks)[sources]

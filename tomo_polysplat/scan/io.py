@@ -30,6 +30,7 @@ __all__ = ["load_scan", "require_scan_name", "save_scan"]
 _WRITERS: dict[str, Callable[..., None]] = {".npz": write_npz, ".h5": write_hdf5, ".hdf5": write_hdf5}
 
 
+# One parameter for each option that a caller names.
 def load_scan(
     path: str | os.PathLike,
     *,

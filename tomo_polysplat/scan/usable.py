@@ -50,13 +50,7 @@ def usable_rays(
         values = projections_from_astra(projections, proj_geom)
     if np.may_share_memory(values, np.asarray(projections)):
         values = values.copy()
-    marked = None
-    if valid is not None:
-        mask = require_array("valid", valid)
-        require_shape("valid", mask, np.shape(projections), "of the projections")
-        # A curved detector is resampled: a ray that uses any invalid pixel is invalid, too.
-        whole = (mask > 0.5).astype(np.float32)
-        marked = ~(projections_from_astra(whole, proj_geom) >= 1)
+    marked = None if valid is None else _marked(valid, np.shape(projections), proj_geom)
     require_line_integrals(values, marked)
     parts = [(values[a:b], None if marked is None else marked[a:b]) for a, b in split_range(len(values), 64)]
     found = run_tasks(_take_out, parts)
@@ -85,6 +79,15 @@ def usable_rays(
             "Rays that no light came through, opaque by what is around them: %d.", counts["rays_opaque"]
         )
     return values, counts
+
+
+def _marked(valid: Any, shape: tuple[int, ...], proj_geom: Mapping[str, Any]) -> np.ndarray:
+    """Rays (views, rows, columns) that a mask says are not to be used."""
+    mask = require_array("valid", valid)
+    require_shape("valid", mask, shape, "of the projections")
+    # A curved detector is resampled: a ray that uses any invalid pixel is invalid, too.
+    whole = (mask > 0.5).astype(np.float32)
+    return ~(projections_from_astra(whole, proj_geom) >= 1)
 
 
 def _on_host(values: Any) -> Any:

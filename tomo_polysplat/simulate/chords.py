@@ -76,6 +76,7 @@ def _cover(covered, count, first, last):
     return hidden, count + 1 - (after - before)
 
 
+# Compiled: it takes arrays and numbers, and no objects that hold them.
 @njit(nogil=True, cache=True)
 def _trace(origin, direction, bounds, chosen, count, solids, covered, local, out):
     """Add one ray's areal densities to ``out``; ``chosen[:count]`` are the solids it may meet, in order."""
@@ -156,6 +157,7 @@ def _choose(planes, centres, radii, chosen):
     return count
 
 
+# Compiled: it takes arrays and numbers, and no objects that hold them.
 @njit(nogil=True, cache=True)
 def trace_view(cone, beam, corner, u, v, solids, out):
     """Areal densities of one view, added to ``out`` (rows, columns, materials).
@@ -195,6 +197,7 @@ def trace_view(cone, beam, corner, u, v, solids, out):
                     )
 
 
+# Compiled: it takes arrays and numbers, and no objects that hold them.
 @njit(nogil=True, cache=True)
 def paint_labels(labels, lower, step, first, last, label, round_axes, centre, to_local):
     """Write a label on the points of a grid that lie in a solid, trying ``first <= index < last`` only.

@@ -90,6 +90,7 @@ def _usual_pixels(size: int) -> int:
     return -(-3 * size // 2)
 
 
+# One parameter for each option that a caller names.
 def simulate_scan(
     scene: str,
     size: int = 64,
@@ -184,6 +185,7 @@ def simulate_scan(
     return scan
 
 
+# One parameter for each option that a caller names.
 def scan_phantom(
     phantom: Phantom,
     proj_geom: dict[str, Any],

@@ -29,6 +29,7 @@ def crossed_voxels(labels: np.ndarray, per_voxel: tuple[int, int]) -> np.ndarray
     return least != most
 
 
+# Compiled: it takes arrays and numbers, and no objects that hold them.
 @njit(nogil=True, cache=True)
 def sample_voxels(corners, size, closed, counts, parts, values, marks, mean, marked):
     """Mean value of the sample points of each voxel, and whether any of them is of a marked part.

@@ -22,6 +22,7 @@ __all__ = ["voxelise_truth"]
 _COARSE = 3
 
 
+# One parameter for each option that a caller names.
 def voxelise_truth(
     phantom: Phantom,
     attenuation: np.ndarray,

@@ -31,6 +31,7 @@ _HALF_WIDTH, _KVP, _ALUMINIUM = 0.6, 70.0, 0.05
 _SLAB, _RAYS = 1 << 29, 1 << 27
 
 
+# One parameter for each option that a caller names.
 def scan_structure(
     kind: str,
     size: int,

@@ -87,6 +87,7 @@ def bridged_start(
         return volume, "; metal not bridged: the GPU has no room for it"
 
 
+# A volume and its rays, and what is known of both: nothing else holds these together.
 def _better(
     values: torch.Tensor,
     volume: torch.Tensor,

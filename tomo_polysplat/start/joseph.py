@@ -79,6 +79,7 @@ def slabs_of(shape: tuple[int, ...], parts: int) -> list[tuple[int, int, int]]:
     return [(2 - axis, a, b) for a, b in split_range(shape[axis], parts)]
 
 
+# Compiled: it takes arrays and numbers, and no objects that hold them.
 @njit(nogil=True, cache=True, fastmath=True)
 def _trace(vectors, cone, size, voxels, shape, projections, adjoint, axis, first, last):  # type: ignore[no-untyped-def]
     """Project the voxels first..last along an axis (0 for x), or add to them what is projected back."""
@@ -142,6 +143,7 @@ def _longest(ray):  # type: ignore[no-untyped-def]
     return 1 if y >= z else 2
 
 
+# Compiled: it takes arrays and numbers, and no objects that hold them.
 @njit(nogil=True, cache=True)
 def _within(k0, k1, axis, first, last, m, a, start_a, slope_a, start_b, slope_b):  # type: ignore[no-untyped-def]
     """The steps k0..k1 that may touch a slab; some beside it may be among them."""

@@ -14,6 +14,7 @@ from tomo_polysplat.start.joseph import JosephProjector
 __all__ = ["sirt"]
 
 
+# One parameter for each option that a caller names.
 def sirt(
     projections: np.ndarray,
     geometry: Geometry,

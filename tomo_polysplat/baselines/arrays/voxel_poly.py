@@ -43,6 +43,7 @@ VIEWS_PER_STEP = 4
 RATE_ATTENUATION, RATE_MATERIAL = 3e-2, 3e-3  # per step of Adam, falling like those of the Gaussians
 
 
+# One parameter for each option that a caller names.
 def voxel_poly(
     projections: np.ndarray,
     geometry: Geometry,
@@ -108,6 +109,7 @@ def voxel_poly(
 class _Fit:
     """Rays, physics and optimiser of one run."""
 
+    # One parameter for each option that a caller names.
     def __init__(
         self,
         projections: np.ndarray,

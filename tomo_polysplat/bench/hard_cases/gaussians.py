@@ -53,6 +53,7 @@ def _run(scene: Scene, views: DetectorViews, kernel: str, device: str, cutoff: f
     return [part.detach().cpu().double() for part in (image, *gradients)], int(skipped)
 
 
+# One parameter for each option that a caller names.
 def compare_precisions(
     findings: Findings,
     scene: Scene,

@@ -21,6 +21,7 @@ from tomo_polysplat.bench.hard_cases.easy import (
 )
 from tomo_polysplat.bench.hard_cases.gaussians import compare_precisions
 from tomo_polysplat.bench.hard_cases.same import relative_rms
+from tomo_polysplat.fit.optimise import Course
 from tomo_polysplat.fit.optimise import fit as optimise
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.model.gaussians import Gaussians
@@ -96,10 +97,12 @@ def _fit_in(scan: Scan, dtype: torch.dtype) -> np.ndarray:
         rays,
         scene,
         settings,
-        views_per_step=plan.views_per_step,
-        rng=np.random.default_rng(0),
-        started=time.perf_counter(),
-        volume=lambda gaussians: np.zeros(0),
+        Course(
+            views_per_step=plan.views_per_step,
+            rng=np.random.default_rng(0),
+            started=time.perf_counter(),
+            volume=lambda gaussians: np.zeros(0),
+        ),
     )
     with torch.no_grad():
         volume = scene.volume(outcome.gaussians).numpy()

@@ -67,12 +67,31 @@ def probe_order(measured: Measured) -> Finding:
         named = ", ".join(map(str, chosen[wrong[:8]])) + (", ..." if len(wrong) > 8 else "")
         text = f"views {named} do not look like their neighbours, but like views from elsewhere"
         return Finding(ORDER, DEFECT, text, "leave them out, or mend their order or angle", numbers, doubt)
+    shows = _would_show(views, squared, near, usual) >= _POWER
+    return _in_order(numbers, doubt, shows, _ends_where_it_began(measured))
+
+
+def _in_order(numbers: dict[str, float], doubt: float, shows: bool, closes: bool) -> Finding:
+    """What to say where nothing is seen to be misplaced.
+
+    Parameters
+    ----------
+    numbers : dict
+        With ``ratio`` and ``rank``.
+    doubt : float
+        Standard error of the rank.
+    shows : bool
+        Whether misplaced views would be seen.
+    closes : bool
+        Whether the last view is told to be where the first is.
+    """
+    ratio, rank = numbers["ratio"], numbers["rank"]
     text = f"views from neighbouring places differ {100 * max(ratio, 0):.2g} % as much as any two views"
-    if _ends_where_it_began(measured):
+    if closes:
         text += "; the last view is told to be where the first is"
         remedy = "right if the stage went there; else the angles want numpy.linspace(..., endpoint=False)"
         return Finding(ORDER, UNKNOWN, text, remedy, numbers, doubt)
-    if ratio < _UNLIKE and rank < _RANDOM and _would_show(views, squared, near, usual) < _POWER:
+    if ratio < _UNLIKE and rank < _RANDOM and not shows:
         text += ", but many would not stand out elsewhere either"
         return Finding(ORDER, UNKNOWN, text, "more light, or an object that is not round", numbers, doubt)
     if ratio < _UNLIKE and rank < _RANDOM:

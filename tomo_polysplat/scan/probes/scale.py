@@ -37,9 +37,9 @@ def probe_scale(measured: Measured) -> Finding:
     change = np.diff(bend, axis=1)
     level, bend = 0.5 * (level[:, 1:] + level[:, :-1]), bend[:, 1:]
     found = _law(level.ravel(), bend.ravel(), change.ravel(), measured.air.noise)
+    hidden = "the object's detail hides the noise, or its rays hardly differ in noise"
     if found is None:
-        text = "the object's detail hides the noise, or its rays hardly differ in noise"
-        return Finding(SCALE, UNKNOWN, text, _NEEDS)
+        return Finding(SCALE, UNKNOWN, hidden, _NEEDS)
     slope, error = found
     numbers = {"slope": slope}
     text = f"the noise grows as exp({slope:.2f} P) (standard error {error:.2g})"
@@ -54,6 +54,9 @@ def probe_scale(measured: Measured) -> Finding:
         )
     if abs(slope - _NATURAL) < _EXPLAINED * error + 0.25 and _DECADIC - slope > _FAR * error:
         return Finding(SCALE, OK, f"{text}, as of natural logarithms", "", numbers, error)
+    if slope - _DECADIC > _RULED_OUT * error:
+        # Steeper than any logarithm of counts: it is not noise.
+        text = hidden
     return Finding(SCALE, UNKNOWN, text, _NEEDS, numbers, error)
 
 

@@ -53,6 +53,7 @@ class Pictures:
     degrees: np.ndarray
 
 
+# One parameter for each option that a caller names.
 def marked_scan(
     views: int = 48,
     rows: int = 33,
