@@ -26,6 +26,8 @@ shutil.rmtree(HERE / "gallery", ignore_errors=True)
 for notebook in sorted((HERE.parent / "examples").glob("*.ipynb")):
     shutil.copy(notebook, HERE / "gallery" / notebook.name)
 
-from from_code import make  # noqa: E402  # it lies beside this file
+from from_code import make  # noqa: E402  # they lie beside this file
+from from_commands import make as run_commands  # noqa: E402
 
 make(HERE / "generated")
+run_commands(HERE / "generated")

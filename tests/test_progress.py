@@ -6,6 +6,7 @@ import sys
 import pytest
 import tqdm.auto
 import tqdm.notebook
+from small_scans import QUICK, fan, reconstruct
 
 from tomo_polysplat.progress import TimeLeft, progress_reports
 
@@ -37,6 +38,15 @@ def test_a_run_that_slows_down_is_followed():
     late = [pair for pair in estimates(quick + slow) if 4 < pair[0] < 150]
     for true, told in late:
         assert told == pytest.approx(true, rel=0.25, abs=20)
+
+
+def test_a_long_run_of_many_reports_is_told_from_its_first_pass():
+    """An hour of ten passes, with a report every half second: known to 15 % after a third of the first pass."""
+    steps = [(k / 7200, 0.5 * k) for k in range(1, 7201)]
+    found = estimates(steps)
+    assert found[0][0] > 0.96 * 3600
+    for true, told in found:
+        assert told == pytest.approx(true, rel=0.15, abs=30)
 
 
 def test_a_fit_that_begins_anew_is_estimated_anew():
@@ -94,3 +104,15 @@ def test_lines_of_the_log_stay_whole(capsys):
         root.removeHandler(handler)
     lines = capsys.readouterr().err.replace("\r", "\n").split("\n")
     assert [line for line in lines if "dark" in line] == ["WARNING: a view is dark"]
+
+
+def test_a_pass_is_shown_while_it_is_made(monkeypatch):
+    """The first one has no error to tell yet; shares only grow, and there are more reports than passes."""
+    monkeypatch.setattr("tomo_polysplat.fit.stopping._TICK", 0.0)
+    told = []
+    reconstruct(fan(), progress=lambda share, words: told.append((share, words)), settings=QUICK)
+    first = [share for share, words in told if words == "first pass"]
+    steps = -(-fan().views // QUICK["views_per_step"])
+    assert len(first) == steps and first == sorted(first) and 0 < first[0] < first[-1] <= 0.5
+    shares = [share for share, words in told if "error" in words]
+    assert len(shares) > 2 and shares == sorted(shares)

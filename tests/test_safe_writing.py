@@ -346,7 +346,7 @@ def test_nothing_else_is_written_into_the_folder_of_slices(scan_file, tmp_path, 
     assert "a folder of its own" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("ending", [*ENDINGS, "stack/"])
+@pytest.mark.parametrize("ending", [*ENDINGS, "stack/", "ome.zarr"])
 def test_the_ending_decides_what_recon_writes(scan_file, tmp_path, solved, capsys, ending):
     options = [] if ending in ("h5", "npy") else ["--bits", "16"]
     output = f"{tmp_path}/new/v.{ending}" if ending == "stack/" else f"{tmp_path}/v.{ending}"

@@ -35,6 +35,7 @@ def require_replaceable_folder(
     overwrite: bool,
     remedy: str = "pass overwrite=True",
     argument: str = "folder",
+    what: str = "slices",
 ) -> Path:
     """The folder that would be written; refused is one that holds, or is, what must stay.
 
@@ -45,8 +46,8 @@ def require_replaceable_folder(
         Whether a file in it is one of those that may be replaced.
     overwrite : bool
         Whether they are to be replaced.
-    remedy, argument : str
-        For the message of an error.
+    remedy, argument, what : str
+        For the message of an error; `what` is in the folder.
 
     Raises
     ------
@@ -67,16 +68,21 @@ def require_replaceable_folder(
     if strange:
         got = f"{target} with {strange[0].name}" + (f" and {len(strange) - 1} more" if strange[1:] else "")
         choose = "name a new folder: this one is only ever replaced as a whole"
-        raise fail(argument, "a new folder, or one with nothing but slices", got, choose, FileExistsError)
+        raise fail(argument, f"a new folder, or one with nothing but {what}", got, choose, FileExistsError)
     if present and not overwrite:
-        raise fail(argument, "one without slices", f"{len(present)} in {target}", remedy, FileExistsError)
+        raise fail(argument, f"one without {what}", f"{len(present)} in {target}", remedy, FileExistsError)
     require_writable(existing_parent(target.parent), argument)
     return target
 
 
 @contextmanager
 def replacing_folder(
-    folder: str | os.PathLike, ours: Callable[[Path], bool], *, overwrite: bool, needed_bytes: int = 0
+    folder: str | os.PathLike,
+    ours: Callable[[Path], bool],
+    *,
+    overwrite: bool,
+    needed_bytes: int = 0,
+    what: str = "slices",
 ) -> Iterator[Path]:
     """An empty folder that becomes `folder` when the block ends without an error.
 
@@ -85,12 +91,12 @@ def replacing_folder(
 
     Parameters
     ----------
-    folder, ours, overwrite
+    folder, ours, overwrite, what
         See :func:`require_replaceable_folder`, whose errors these are.
     needed_bytes : int
         Size to be written, compared with the free disk space before anything is written.
     """
-    target = require_replaceable_folder(folder, ours, overwrite=overwrite).resolve()
+    target = require_replaceable_folder(folder, ours, overwrite=overwrite, what=what).resolve()
     require_room(existing_parent(target.parent), needed_bytes)
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = temporary_beside(target.with_suffix(""))
@@ -98,11 +104,12 @@ def replacing_folder(
     placed = False
     try:
         yield temporary
-        for path in temporary.iterdir():
-            flush_to_disk(path)
+        for path in temporary.rglob("*"):
+            if path.is_file():
+                flush_to_disk(path)
         if target.exists():
             shutil.copymode(target, temporary)
-        require_replaceable_folder(target, ours, overwrite=overwrite)
+        require_replaceable_folder(target, ours, overwrite=overwrite, what=what)
         _take_place(temporary, target)
         placed = True
     finally:
@@ -141,9 +148,14 @@ def _exchanged(one: Path, other: Path) -> bool:
 
 def _clear(old: Path, target: Path, ours: Callable[[Path], bool]) -> None:
     """Remove the old folder; what somebody else has put into it in the meantime is brought along, or stays."""
-    for path in sorted(old.iterdir()) if old.is_dir() else []:
+    present = sorted(old.iterdir()) if old.is_dir() else []
+    # Judged before anything is gone: what one file is may stand in another.
+    removed = {path for path in present if ours(path) or path.name in _LITTER}
+    for path in present:
         with suppress(OSError):
-            if ours(path) or path.name in _LITTER:
+            if path in removed and path.is_dir():
+                shutil.rmtree(path)
+            elif path in removed:
                 path.unlink()
             elif not (target / path.name).exists():
                 os.rename(path, target / path.name)

@@ -16,8 +16,9 @@ from tomo_polysplat.checks import fail
 
 __all__ = ["TimeLeft", "progress_reports"]
 
-# Reports that tell how fast a run is now, and the share of it that they have to span before anything is said.
-_RECENT, _ENOUGH = 8, 0.03
+# The share of a run by which is told how fast it is now, that which has to be seen before anything is said, and how far
+# apart the reports are that are kept of many.
+_RECENT, _ENOUGH, _APART = 0.1, 0.03, 0.004
 
 
 @contextmanager
@@ -62,7 +63,7 @@ class TimeLeft:
     """
 
     def __init__(self) -> None:
-        self._seen: deque[tuple[float, float]] = deque(maxlen=_RECENT)
+        self._seen: deque[tuple[float, float]] = deque()
 
     def told(self, share: float, now: float) -> str:
         """In words, or nothing.
@@ -76,10 +77,12 @@ class TimeLeft:
         """
         if share <= 0 or (self._seen and share < self._seen[-1][0]):
             self._seen.clear()
-        if 0 < share < 1:
-            self._seen.append((share, now))
-        if share >= 1 or not self._seen:
+        if share >= 1 or share <= 0:
             return ""
+        if not self._seen or share - self._seen[-1][0] >= _APART:
+            self._seen.append((share, now))
+        while len(self._seen) > 2 and share - self._seen[1][0] >= _RECENT:
+            self._seen.popleft()
         first, then = self._seen[0]
         if share - first < _ENOUGH or now <= then:
             return ""

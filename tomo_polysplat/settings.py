@@ -42,6 +42,7 @@ _CHOICES = {
     "loss": ("huber", "weighted-l1", "l1"),
     "edges": ("sharp", "blurred"),
     "light": ("soft", "fat"),
+    "density_check": ("refuse", "warn"),
     "kernel": ("auto", "triton", "numba", "reference"),
 }
 
@@ -67,6 +68,9 @@ class Settings:
     at least 4."""
     kernel: str = "auto"
     """"auto", "triton", "numba" or "reference"."""
+
+    density_check: str = "refuse"
+    """An object of a density that no matter has, as in a wrong unit of length: "refuse" it, or "warn" and go on."""
 
     # Seeds.
     max_gaussians: int | None = None

@@ -8,6 +8,8 @@ from small_scans import QUICK, disc
 
 import tomo_polysplat as tps
 from tomo_polysplat.plan.unit_check import doubt_lengths, tell_impossible
+from tomo_polysplat.report.decided import doubts
+from tomo_polysplat.units import cm_per, density_in_doubt
 
 
 def curves(density, voxels, steel=0):
@@ -65,3 +67,77 @@ def test_lengths_of_no_unit_beside_a_spectrum_are_told(given, told, caplog):
     caplog.clear()
     tps.reconstruct(*disc("water", spectrum), settings=QUICK)
     assert "lengths are taken" not in caplog.text  # one energy: any unit will do
+
+
+# What matter is in one unit and seems to be in another: densities of water that attenuates alike, at 60 keV or so.
+MATTER = {
+    "polymer foam": 0.03,
+    "lung": 0.26,
+    "wood": 0.5,
+    "water": 1.0,
+    "aluminium": 3.6,
+    "iron": 46.0,
+    "gold": 270.0,
+}
+
+
+@pytest.mark.parametrize("matter", MATTER)
+@pytest.mark.parametrize(
+    "meant, stated", [("mm", "cm"), ("um", "mm"), ("um", "cm"), ("mm", "um"), ("cm", "cm")]
+)
+def test_lengths_of_a_wrong_unit_are_doubted_and_the_right_one_is_named(matter, meant, stated):
+    """Foam alone looks like what it is, and like a wrong unit, too."""
+    level = MATTER[matter]
+    found = density_in_doubt(level * cm_per(meant) / cm_per(stated), stated)
+    if meant == stated:
+        assert (found is not None) == (level < 0.3) and not (found and found.impossible)
+        return
+    seems = level * cm_per(meant) / cm_per(stated)
+    assert (found is not None) == (not 0.3 <= seems <= 600)
+    if found is not None:
+        assert found.impossible == (not 0.005 <= seems <= 600)
+        if 0.3 <= level <= 10:
+            assert f"pass unit='{meant}'" in found.remedy and f"in {meant} like {level:.2g}" in found.words
+
+
+def water_disc(spectrum, length):
+    """The disc of water, every number of its geometry times `length`."""
+    values, proj_geom, vol_geom = disc("water", spectrum)
+    window = {name: edge * length for name, edge in vol_geom["option"].items()}
+    proj_geom = proj_geom | {"DetectorWidth": proj_geom["DetectorWidth"] * length}
+    return values, proj_geom, vol_geom | {"option": window}
+
+
+@pytest.mark.parametrize("unit, stated", [("cm", "um"), ("mm", "m")])
+def test_water_of_no_possible_density_is_refused_with_its_unit(unit, stated):
+    spectrum = tps.Spectrum.from_tube(90, filters={"Al": 0.1})
+    scan = water_disc(spectrum, 1 / cm_per(unit))
+    known = {"spectrum": spectrum, "settings": QUICK}
+    assert "lengths" not in tps.reconstruct(*scan, unit=unit, **known).plan
+    with pytest.raises(
+        ValueError, match=f"unit: .*in {stated} the object .*pass unit='{unit}'.*density_check"
+    ):
+        tps.reconstruct(*scan, unit=stated, **known)
+    result = tps.reconstruct(
+        *scan, unit=stated, spectrum=spectrum, settings=QUICK | {"density_check": "warn"}
+    )
+    assert "which no matter does" in result.plan["lengths"].why
+    assert any("the unit of length" in doubt for doubt in doubts(result.plan))
+
+
+def test_water_ten_times_too_large_is_said_and_goes_on(caplog):
+    spectrum = tps.Spectrum.from_tube(90, filters={"Al": 0.1})
+    with caplog.at_level(logging.WARNING):
+        result = tps.reconstruct(*water_disc(spectrum, 10.0), unit="cm", spectrum=spectrum, settings=QUICK)
+    assert "in mm like" in result.plan["lengths"].why and "pass unit='mm'" in caplog.text
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.03])
+def test_nothing_but_noise_is_no_matter_of_a_wrong_unit(noise):
+    """Of next to nothing any density may be told: no light is lost in it."""
+    spectrum = tps.Spectrum.from_tube(90, filters={"Al": 0.1})
+    values, *geometry = disc("water", spectrum)
+    values = 0.002 * values + noise * np.random.default_rng(0).normal(size=values.shape)
+    assert (
+        "lengths" not in tps.reconstruct(values, *geometry, unit="cm", spectrum=spectrum, settings=QUICK).plan
+    )

@@ -1,5 +1,8 @@
 """Residuals in units of noise, from projections known in closed form, and the verdict that is drawn from them."""
 
+from dataclasses import replace
+
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -199,3 +202,62 @@ def test_a_view_tells_of_its_rays_held_out():
     assert found.rms_held_out > 4 * found.rms / 2 and (found.held_out > 3).all()
     assert "(those kept out of the fit to" in verdict(result, found)[0]
     assert np.isnan(residuals_of(ball(), scan_of(values)).rms_held_out), "no settings, none held out"
+
+
+def scanned():
+    result, scan = ball(), scan_of(line_integrals())
+    result.settings = {"held_out": 0.01}
+    return result, scan, result.explain(scan)
+
+
+@pytest.mark.parametrize("endless", [False, True])
+def test_residuals_are_saved_with_the_result(tmp_path, endless):
+    """The unknown (no ray held out) and the endless (photons of data without noise) come back as they were."""
+    result, _, found = scanned()
+    assert np.isfinite(found.rms_held_out) and np.isfinite(found.photons)
+    if endless:
+        found = result.residuals = replace(found, rms_held_out=np.nan, photons=np.inf)
+    result.save(tmp_path / "r.h5")
+    loaded = Result.load(tmp_path / "r.h5").residuals
+    for name, value in vars(found).items():
+        np.testing.assert_allclose(getattr(loaded, name), value, rtol=1e-6, err_msg=name)
+        assert np.asarray(getattr(loaded, name)).dtype.kind == np.asarray(value).dtype.kind, name
+    ball().save(tmp_path / "without.h5")
+    assert Result.load(tmp_path / "without.h5").residuals is None
+
+
+def test_a_report_of_a_saved_result_shows_them_without_the_scan(tmp_path):
+    result, _, found = scanned()
+    result.save(tmp_path / "r.h5")
+    Result.load(tmp_path / "r.h5").report(tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text()
+    assert f"{found.rays} rays of {VIEWS} views" in page and verdict(result, found)[0] in page
+    ball().report(tmp_path / "bare.html")
+    assert "rms residual by view" not in (tmp_path / "bare.html").read_text()
+
+
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        ("by_view", np.zeros(3)),
+        ("bias", np.zeros((2, 2))),
+        ("by_pixel", np.full((ROWS, COLUMNS), np.inf)),
+        ("worst", np.zeros(2)),
+        ("views", np.zeros((3, 7))),
+        ("block", 0.0),
+        ("rms", 1e300),
+        ("photons", -1.0),
+    ],
+)
+def test_damaged_residuals_are_refused(tmp_path, name, value):
+    result, _, _ = scanned()
+    result.save(tmp_path / "r.h5")
+    with h5py.File(tmp_path / "r.h5", "r+") as file:
+        kept = file["polysplat/residuals"]
+        if name in kept:
+            del kept[name]
+            kept[name] = value
+        else:
+            kept.attrs[name] = value
+    with pytest.raises(ValueError, match="/polysplat/residuals/"):
+        Result.load(tmp_path / "r.h5")

@@ -222,8 +222,8 @@ def test_other_files_are_refused(tmp_path):
         load_scan(path)
     with pytest.raises(FileNotFoundError):
         load_scan(tmp_path / "missing.h5")
-    np.savez(tmp_path / "other.npz", projections=np.zeros((2, 2, 2)))
-    with pytest.raises(ValueError, match="no vectors, vol_shape, vol_window"):
+    np.savez(tmp_path / "other.npz", projections=np.zeros((2, 2, 2)), vol_shape=(2, 2, 2))
+    with pytest.raises(ValueError, match="no vectors, vol_window"):
         load_scan(tmp_path / "other.npz")
 
 

@@ -234,3 +234,20 @@ def test_npy_pictures_in_one_file_or_one_in_each(tmp_path):
         frames_of([tmp_path / "texts.npy"])
     with pytest.raises(ValueError, match="pictures of one kind of file, got .npy, .tif"):
         frames_of([tmp_path / "0.npy", tmp_path / "0.tif"])
+
+
+def test_npz_stacks_with_their_angles_and_without(tmp_path):
+    pictures = pictures_of(marked())
+    path, stated = tmp_path / "a.npz", {key: value for key, value in STATED.items() if key != "arc"}
+    order = np.random.default_rng(0).permutation(48)
+    arrays = {"data": pictures.projections[order], "flat": pictures.flats[0], "dark": pictures.darks}
+    np.savez(path, **arrays, theta=pictures.degrees[order])
+    require_the_same_volume(tps.load_scan(path, scanner=stated), marked())
+    np.savez(path, **arrays)
+    scan = tps.load_scan(tmp_path, scanner=stated)
+    assert "no angles: 48 views" in " ".join(scan.notes["scanner"]["guessed"])
+    np.savez(path, **arrays, theta=np.deg2rad(pictures.degrees[order]))
+    with pytest.raises(ValueError, match="0 to 6.15, which look like radians"):
+        tps.load_scan(path, scanner=stated)
+    with pytest.raises(ValueError, match="the distances and the pixel of the scanner"):
+        tps.load_scan(path, scanner={"arc": 360})

@@ -8,13 +8,13 @@ from collections.abc import Sequence
 
 import tomo_polysplat
 from tomo_polysplat.checks import visible
-from tomo_polysplat.cli import bench, check, demo, doctor, import_scan, recon, simulate, view
+from tomo_polysplat.cli import bench, check, completion, demo, doctor, import_scan, recon, simulate, view
 from tomo_polysplat.cli.options import INTERRUPTED
 from tomo_polysplat.cli.parser import Parser
 
 __all__ = ["main"]
 
-COMMANDS = (demo, import_scan, recon, view, simulate, check, bench, doctor)
+COMMANDS = (demo, import_scan, recon, view, simulate, check, bench, doctor, completion)
 BAD_INPUT, FAILED = 2, 1
 
 
@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return arguments.run(arguments)
     try:
         return arguments.run(arguments)
-    except (ValueError, TypeError, OSError, MemoryError) as error:
+    except (ValueError, TypeError, OSError, MemoryError, ImportError) as error:
         return _complain(str(error) or type(error).__name__, BAD_INPUT)
     except KeyboardInterrupt as error:
         return _complain(str(error) or "interrupted", INTERRUPTED)

@@ -40,8 +40,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--output",
         required=True,
         metavar="FILE",
-        help=".h5 with everything, or the volume as .tif, .ome.tif, .mha, .nrrd, .nii.gz, .vti, .npy, or a folder "
-        "of TIFF slices (NAME/)",
+        help=".h5 with everything, or the volume as .tif, .ome.tif, .mha, .nrrd, .nii.gz, .vti, .npy, "
+        ".ome.zarr, .dicom (a series), or a folder of TIFF slices (NAME/)",
     )
     parser.add_argument(
         "--hu", action="store_true", help="Hounsfield units instead of attenuation (not in .h5)"

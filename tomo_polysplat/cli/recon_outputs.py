@@ -37,7 +37,7 @@ def require_outputs(arguments: argparse.Namespace) -> None:
     for name in ("halves", "faint"):
         if getattr(arguments, name) and arguments.report is None:
             raise fail(f"--{name}", "--report with it, where it is told", "none")
-    if arguments.unseen_nan and (kind.everything or arguments.bits == 16):
+    if arguments.unseen_nan and (kind.everything or kind.hounsfield or arguments.bits == 16):
         remedy = "choose another ending of --output, and 32 bits"
         raise fail("--unseen-nan", "a file of the volume alone, in floating point", arguments.output, remedy)
     if arguments.resume and arguments.checkpoint is None:
@@ -46,8 +46,9 @@ def require_outputs(arguments: argparse.Namespace) -> None:
     for name in ("output", "report", "json", "tiff"):
         if (path := getattr(arguments, name)) is None:
             continue
-        if name == "tiff" or (name == "output" and kind.is_folder):
-            folders[f"--{name}"] = require_slices_folder(
+        if name == "tiff" or (name == "output" and kind.folder):
+            require = require_slices_folder if name == "tiff" else kind.require_folder
+            folders[f"--{name}"] = require(
                 path, overwrite=arguments.overwrite, remedy="pass --overwrite", argument=f"--{name}"
             )
         else:
@@ -95,8 +96,8 @@ def require_room_of(arguments: argparse.Namespace, scan: Scan) -> None:
     kind = format_of(arguments.output, "--output")
     if not kind.everything:
         kind.require(hu=arguments.hu, bits=arguments.bits, voxels=voxels, argument="--output")
-    if arguments.hu:
-        _require_hounsfield(arguments, scan)
+    if arguments.hu or kind.hounsfield:
+        _require_hounsfield(arguments, scan, "--hu" if arguments.hu else "--output")
     # At most three curves.
     needed = {Path(arguments.output).parent: kind.bytes_needed(voxels, 3, arguments.bits)}
     if arguments.tiff is not None:
@@ -105,16 +106,19 @@ def require_room_of(arguments: argparse.Namespace, scan: Scan) -> None:
     require_room_for(needed)
 
 
-def _require_hounsfield(arguments: argparse.Namespace, scan: Scan) -> None:
+def _require_hounsfield(arguments: argparse.Namespace, scan: Scan, option: str) -> None:
     """Refuse Hounsfield units without a spectrum or a real length: they compare with water at an energy."""
     if scan.unit == "pixel" or arguments.mono or scan.spectrum is None:
-        remedy = "pass --kvp or --spectrum and the pixel's size, or leave it out"
-        raise fail("--hu", "a spectrum and real lengths", "a volume without an energy", remedy)
+        remedy = "pass --kvp or --spectrum and the pixel's size, or leave Hounsfield units out"
+        raise fail(
+            option, "a spectrum and real lengths for Hounsfield units", "a volume without an energy", remedy
+        )
 
 
 def write_outputs(result: Result, scan: Scan, arguments: argparse.Namespace) -> None:
     """Write all outputs. If one of them fails, the others are still written."""
     failures: list[OSError] = []
+    _explain(result, scan, arguments)
     _attempt(arguments.output, failures, lambda: _save(result, arguments))
     if failures:
         _rescue(result, arguments)
@@ -124,6 +128,21 @@ def write_outputs(result: Result, scan: Scan, arguments: argparse.Namespace) -> 
     _write_about(result, scan, arguments, failures)
     if failures:
         raise failures[0]
+
+
+def _explain(result: Result, scan: Scan, arguments: argparse.Namespace) -> None:
+    """Let the file that holds everything hold the residuals, too, which `view` and a report then show."""
+    from tomo_polysplat.result.formats import format_of
+
+    if not format_of(arguments.output).everything or not result.gaussians:
+        return
+    # Who has little time has it for the report alone.
+    if arguments.time_budget is not None and arguments.report is None:
+        return
+    try:
+        result.explain(scan, device=arguments.device)
+    except (ValueError, RuntimeError, MemoryError) as error:
+        logger.warning("How well the rays are explained is not kept: %s", error)
 
 
 def _write_about(result: Result, scan: Scan, arguments: argparse.Namespace, failures: list[OSError]) -> None:

@@ -56,7 +56,8 @@ def shown_by(arguments: argparse.Namespace) -> Shown:
     from tomo_polysplat.scan.io import load_scan
     from tomo_polysplat.viewer.volumes import shown_of
 
-    result, residuals = _loaded(arguments.result), None
+    result = _loaded(arguments.result)
+    residuals = result.residuals
     others: dict[str, Any] = {_name(path): _loaded(path) for path in arguments.others}
     if len(others) < len(arguments.others):
         raise fail("OTHER", "files of different names", "two of one name")

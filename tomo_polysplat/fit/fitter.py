@@ -95,6 +95,7 @@ class Fitter:
             views = self._next_views(self.batch)
             self.step(views, share)
             clock.done += 1
+            clock.tick()
             clock.look_ahead(self._settle)
             made += 1
             if made == 1:

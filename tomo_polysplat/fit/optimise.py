@@ -21,6 +21,7 @@ from tomo_polysplat.fit.stopping import (
     Pace,
     Stop,
     StopReason,
+    Tick,
     Watch,
     is_true,
     usual_patience,
@@ -202,6 +203,8 @@ class Course:
         Called between passes; asks what the plan left open.
     pace : callable or None
         Is told early on what a deadline has room for.
+    tick : callable or None
+        Is told the share that is done, also within a pass.
     """
 
     views_per_step: int
@@ -213,6 +216,7 @@ class Course:
     checkpoint: Keeps | None = None
     between: Between | None = None
     pace: Pace | None = None
+    tick: Tick | None = None
 
 
 def fit(
@@ -237,7 +241,7 @@ def fit(
     run = _Keeper(
         Fitter(gaussians, spacing, rays, scene, settings, Batches(batch, steps, course.rng)),
         # From now on: what compiling or recording the step took is no part of the run that the learning rates follow.
-        clock := Clock(steps, course.deadline, course.pace),
+        clock := Clock(steps, course.deadline, course.pace, course.tick),
         outcome=outcome,
         watch=watch,
         started=course.started,

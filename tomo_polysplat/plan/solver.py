@@ -13,7 +13,7 @@ import torch
 from tomo_polysplat.fit.optimise import Course, FitOutcome, Run, fit
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.fit.stopping import Stop, StopReason
+from tomo_polysplat.fit.stopping import FitState, Stop, StopReason
 from tomo_polysplat.fit.surroundings import cut_out
 from tomo_polysplat.kernels.compile_time import working_time
 from tomo_polysplat.model.gaussians import Gaussians
@@ -150,16 +150,18 @@ class Solver:
             logger.warning("Interrupted before the first step; what it would have begun with is returned.")
             return FitOutcome(prepared.gaussians, stop=Stop(StopReason.INTERRUPTED, "interrupted"))
         settings = plan.adapted(plan.with_agent(run_options.settings))
+        told = _Told(self.report)
         course = Course(
             views_per_step=plan.views_per_step,
             rng=np.random.default_rng(run_options.seed),
             started=self.started,
             deadline=self._deadline(prepared),
             volume=_volume_of(scene, plan, problem, self.flipped),
-            callbacks=[lambda state: self.report(state.share, state.describe()), *run_options.callbacks],
+            callbacks=[told.passed, *run_options.callbacks],
             checkpoint=self.saved,
             between=self._questions(prepared, problem, ask_scatter),
             pace=lambda room, lacking: self._tell_pace(plan, room, lacking),
+            tick=told.tick,
         )
         settings = replace(settings, passes=plan.passes)
         return fit(prepared.gaussians, plan.spacing * problem.voxel, prepared.rays, scene, settings, course)
@@ -201,6 +203,22 @@ class Solver:
         left = max(end - working_time(), 0.0)
         volume = prepared.plan.growth * prepared.scene.seconds_of_basis(prepared.gaussians)
         return end - min(volume + _FINISHING, 0.5 * left)
+
+
+class _Told:
+    """How far a fit is, after each of its passes and meanwhile."""
+
+    def __init__(self, report: Callable[[float, str], Any]) -> None:
+        self._report, self._words = report, "first pass"
+
+    def passed(self, state: FitState) -> None:
+        """After a pass."""
+        self._words = state.describe()
+        self._report(state.share, self._words)
+
+    def tick(self, share: float) -> None:
+        """Within one."""
+        self._report(share, self._words)
 
 
 def _volume_of(

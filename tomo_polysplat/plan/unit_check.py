@@ -1,14 +1,18 @@
-"""Densities that no matter has, of a wrong unit of length or size of a pixel, or of the wrong materials."""
+"""Densities that no matter has, or few do, of a wrong unit of length or size of a pixel, or of the wrong materials."""
 
 from __future__ import annotations
 
 import logging
+import math
 
 import numpy as np
 
+from tomo_polysplat.checks import fail
+from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.plan.answer import Answer
+from tomo_polysplat.units import CM_PER_UNIT, Doubt, density_in_doubt
 
-__all__ = ["doubt_lengths", "tell_impossible"]
+__all__ = ["doubt_lengths", "lengths_in_doubt", "refuse_lengths", "tell_impossible"]
 
 logger = logging.getLogger(__name__)
 
@@ -18,6 +22,9 @@ _DENSEST_SOLID, _FEWEST = 22.6, 8
 _OF_METAL, _METAL = 0.2, 5.0
 # Share of rays without a value from which these explain it first.
 _LIGHTLESS = 0.005
+# -log(I/I0) of the darker rays from which there is matter that attenuates, and not noise alone.
+_ATTENUATES, _DARKER = 0.1, 95.0
+_VIEWS = 24
 _WRONG_LENGTHS = "The unit of length or the size of a pixel looks wrong"
 
 
@@ -26,6 +33,36 @@ def doubt_lengths(facts: dict[str, Answer], words: str, what: str = _WRONG_LENGT
     if "lengths" not in facts:
         facts["lengths"] = Answer.found("doubtful", words)
         logger.warning("%s: %s.", what, words)
+
+
+def lengths_in_doubt(level: float, problem: Problem) -> Doubt | None:
+    """Whether the object's main matter has a density that a wrong unit would explain.
+
+    Parameters
+    ----------
+    level : float
+        Attenuation of the main matter in that of water, or of the first material where that is a solid.
+    problem : Problem
+        Polychromatic.
+    """
+    if not _attenuates(problem.projections):
+        return None
+    cm = problem.depth / problem.length
+    unit = next((name for name, size in CM_PER_UNIT.items() if math.isclose(size, cm, rel_tol=1e-6)), "cm")
+    return density_in_doubt(level, unit)
+
+
+def refuse_lengths(doubt: Doubt) -> Exception:
+    """The exception to raise where no matter is like that."""
+    remedy = f"{doubt.remedy}; settings={{'density_check': 'warn'}} goes on"
+    return fail("unit", "lengths that make possible matter of the object", doubt.words, remedy)
+
+
+def _attenuates(projections: np.ndarray) -> bool:
+    """Whether rays lose light, which those through next to nothing do not."""
+    some = projections[:: -(-len(projections) // _VIEWS)]
+    finite = some[np.isfinite(some)]
+    return bool(len(finite)) and float(np.percentile(finite, _DARKER)) > _ATTENUATES
 
 
 def tell_impossible(curves: np.ndarray, facts: dict[str, Answer], lightless: float = 0.0) -> None:

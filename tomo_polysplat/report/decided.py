@@ -137,6 +137,8 @@ def doubts(plan: Mapping[str, Answer]) -> list[str]:
         found.append(f"all of it, for the {plan['rays'].why}")
     if "spectrum_doubt" in plan:
         found.append(f"the spectrum ({plan['spectrum_doubt'].why})")
+    if "lengths" in plan:
+        found.append(f"the unit of length, and every density with it ({plan['lengths'].why})")
     return found
 
 

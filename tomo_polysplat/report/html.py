@@ -19,7 +19,7 @@ from tomo_polysplat.report.evidence import by_pixel_figure, by_view_figure
 from tomo_polysplat.report.figures import history_figure, png_bytes, slices_figure
 from tomo_polysplat.report.materials import histogram_figure
 from tomo_polysplat.report.page import folded, image, page, section, text
-from tomo_polysplat.report.residuals import Residuals, residuals_of
+from tomo_polysplat.report.residuals import Residuals
 from tomo_polysplat.report.slices import Plane, display_window, planes_through
 from tomo_polysplat.report.style import OURS, full_name
 from tomo_polysplat.report.verdict import verdict
@@ -52,7 +52,7 @@ def write_report(
     volume = _spatial(result, result.volume)
     true = None if truth is None else _spatial(result, truth)
     metal = None if metal_mask is None else _spatial(result, metal_mask).astype(bool)
-    residuals, beside = (None, []) if scan is None else of_scan(result, scan)
+    residuals, beside = (result.residuals, []) if scan is None else of_scan(result, scan)
     shown = beside + [(full_name(OURS), volume), *([] if true is None else [("truth", true)])]
     title = title_of(result, scan)
     body = [
@@ -114,14 +114,17 @@ def _about(result: Result) -> str:
 
 
 def of_scan(result: Result, scan: Scan) -> tuple[Residuals | None, Volumes]:
-    """Residuals, and the volume of the standard method by its name; what fails is left out, which the log says."""
-    residuals, beside = None, []
+    """Residuals, and the volume of the standard method by its name; what fails is left out, which the log says.
+
+    Residuals that the result has already are taken, others are kept in it.
+    """
+    residuals, beside = result.residuals, []
     try:
         name, volume = standard_volume(scan)
         require_shape("the scan's volume", volume, result.grid.shape, "of the result")
         beside.append((full_name(name.lower()) if name == "FDK" else name, volume))
-        if result.gaussians:
-            residuals = residuals_of(result, scan)
+        if residuals is None and result.gaussians:
+            residuals = result.explain(scan)
     except (ValueError, RuntimeError, MemoryError) as error:
         logger.warning("The page does without what the scan would tell: %s", error)
     return residuals, beside

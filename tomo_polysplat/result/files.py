@@ -3,7 +3,8 @@
 The HDF5 file follows Data Exchange: ``/exchange/data`` (z, y, x) is the volume, with attributes ``unit``,
 ``energy_kev``, ``voxel_size`` and ``origin`` (x, y, z; the centre of the first voxel). What everything else
 is computed from stands in ``/polysplat``: ``basis``, ``gaussians``, ``spectrum``, and as JSON text
-``history``, ``plan``, ``counts``, ``settings``, ``provenance`` and ``materials``. y ascends with the index, also
+``history``, ``plan``, ``counts``, ``settings``, ``provenance`` and ``materials``; ``residuals`` are those by view and
+by pixel, where they are known. y ascends with the index, also
 after a 2D scan.
 """
 
@@ -23,6 +24,7 @@ from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.plain_file import PlainFile
 from tomo_polysplat.plan.answer import Answer
 from tomo_polysplat.result.image import Image
+from tomo_polysplat.result.residuals_file import read_residuals, write_residuals
 from tomo_polysplat.result.result import GAUSSIAN_PARTS, Result
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.scan.hdf5 import (
@@ -114,6 +116,7 @@ def _write_model(group: Any, result: Result) -> None:
     write_spectrum(group, result.spectrum)
     if result.materials is not None:
         group["materials"] = json.dumps(plain(list(result.materials)))
+    write_residuals(group, result.residuals)
     for name in JSON_PARTS:
         part = getattr(result, name)
         if name == "plan":
@@ -150,6 +153,7 @@ def load_hdf5(path: str | os.PathLike) -> Result:
                 "seconds in the file", number_attribute(group, "seconds") or 0.0, at_least=0
             ),
             flipped_2d=bool(number_attribute(group, "flipped_2d")),
+            residuals=read_residuals(group),
         )
 
 

@@ -33,6 +33,10 @@ class Format:
         Whether it is the package's own, from which a result can be loaded.
     single_tiff : bool
         Whether it cannot be larger than 4 GiB.
+    folder : str
+        Module and function that refuse a folder which must stay, where it is a folder.
+    hounsfield : bool
+        Whether it always holds Hounsfield units, in 16 bits.
     """
 
     endings: tuple[str, ...]
@@ -40,15 +44,19 @@ class Format:
     sixteen_bits: bool = True
     everything: bool = False
     single_tiff: bool = False
+    folder: str = ""
+    hounsfield: bool = False
 
-    @property
-    def is_folder(self) -> bool:
-        """Whether it is a folder of slices."""
-        return self.endings == ("/",)
+    def require_folder(self, folder: str | os.PathLike, **known: Any) -> Path:
+        """The folder to write; refuses one that must stay, by `require_replaceable_folder`."""
+        return _function(self.folder)(folder, **known)
 
     def bytes_needed(self, voxels: int, channels: int, bits: int = 32) -> int:
         """Bytes of a file with this many voxels and base curves."""
-        return image_bytes(voxels * (channels + 1 if self.everything else 1), bits)
+        bits = 16 if self.hounsfield else bits
+        # Copies of an eighth, and an eighth of that, and so on.
+        share = 8 / 7 if ".zarr" in self.endings else 1
+        return int(share * image_bytes(voxels * (channels + 1 if self.everything else 1), bits))
 
     def require(self, *, hu: bool, bits: int, voxels: int = 0, argument: str = "path") -> None:
         """Refuse what this kind of file cannot hold."""
@@ -70,7 +78,9 @@ FORMATS = (
     Format((".npy",), "files.write_npy", sixteen_bits=False),
     Format((".ome.tif", ".ome.tiff"), "tiff.write_ome_tiff"),
     Format((".tif", ".tiff"), "tiff.write_tiff", single_tiff=True),
-    Format(("/",), "tiff.write_tiff_slices"),
+    Format((".ome.zarr", ".zarr"), "ome_zarr.write_ome_zarr", folder="ome_zarr.require_zarr_folder"),
+    Format((".dicom",), "dicom.write_dicom", folder="dicom.require_dicom_folder", hounsfield=True),
+    Format(("/",), "tiff.write_tiff_slices", folder="tiff.require_slices_folder"),
     Format((".mha",), "image_files.write_metaimage"),
     Format((".nrrd",), "image_files.write_nrrd"),
     Format((".nii.gz", ".nii"), "image_files.write_nifti"),
@@ -89,9 +99,12 @@ def format_of(path: str | bytes | os.PathLike, argument: str = "path") -> Format
     """
     name = os.fsdecode(path).replace(os.sep, "/").lower()
     for kind in FORMATS:
-        if name.endswith(kind.endings):
+        # A shell completes the name of a store that is there with a slash.
+        if name.endswith(kind.endings) or (kind.folder and name.rstrip("/").endswith(kind.endings)):
             return kind
     remedy = did_you_mean(Path(name).suffix, ENDINGS)
+    if name.endswith(".dcm"):
+        remedy = "a DICOM series is a folder, of a name ending in .dicom"
     raise fail(argument, f"a name ending in {', '.join(ENDINGS)}", repr(os.fsdecode(path)), remedy)
 
 
@@ -105,14 +118,22 @@ def save_as(
     unseen_nan: bool = False,
 ) -> None:
     """See :meth:`Result.save`."""
-    from importlib import import_module
-
     kind = format_of(path)
     kind.require(hu=hu, bits=bits, voxels=result.basis[0].size)
-    module, name = kind.write.split(".")
-    write: Callable[..., Any] = getattr(import_module(f"tomo_polysplat.result.{module}"), name)
     if kind.everything and unseen_nan:
         remedy = "Result.load reads it back, whose coverage tells"
         raise fail("unseen_nan", "a file of the volume alone", os.fsdecode(path), remedy)
+    if kind.hounsfield:
+        if unseen_nan:
+            raise fail("unseen_nan", "a file of floating point", os.fsdecode(path), "choose .nrrd or .nii.gz")
+        # Rounded by its writer, once.
+        hu, bits = True, 32
     content = result if kind.everything else image_of(result, hu=hu, bits=bits, unseen_nan=unseen_nan)
-    write(content, path, overwrite=overwrite)
+    _function(kind.write)(content, path, overwrite=overwrite)
+
+
+def _function(name: str) -> Callable[..., Any]:
+    from importlib import import_module
+
+    module, function = name.split(".")
+    return getattr(import_module(f"tomo_polysplat.result.{module}"), function)

@@ -21,6 +21,7 @@ from tomo_polysplat.units import cm_per
 if TYPE_CHECKING:
     from tomo_polysplat.quality.halves import Resolution
     from tomo_polysplat.quality.inserts import Contrast
+    from tomo_polysplat.report.residuals import Residuals
     from tomo_polysplat.scan.scan import Scan
 
 __all__ = ["Result"]
@@ -61,6 +62,8 @@ class Result:
         Words on what it was made from and with: scanner, volume, spectrum, device and software.
     geometry : dict, optional
         ASTRA's vector geometry of the projections, in `unit`: as told, or as ``align`` has found it.
+    residuals : Residuals, optional
+        How well the rays are explained, once :meth:`explain` or a report has looked at the scan; it is saved.
     seconds : float
         Time that the reconstruction took.
     flipped_2d : bool
@@ -82,6 +85,7 @@ class Result:
     geometry: dict[str, Any] | None = None
     seconds: float = 0.0
     flipped_2d: bool = False
+    residuals: Residuals | None = None
 
     def __post_init__(self) -> None:
         self.basis = np.ascontiguousarray(require_array("basis", self.basis, 4), np.float32)
@@ -214,8 +218,9 @@ class Result:
 
         ``.h5`` and ``.hdf5`` hold everything, in the Data Exchange layout, and :meth:`load` reads them back. The
         others hold :attr:`volume` with voxel size and unit: ``.tif`` (ImageJ), ``.ome.tif``, a name ending in
-        ``/`` (a folder of TIFF slices), ``.mha``, ``.nrrd``, ``.nii``, ``.nii.gz``, ``.vti`` (ParaView); ``.npy``
-        holds its numbers alone. Whatever fails or interrupts it, the old file stays as it was.
+        ``/`` (a folder of TIFF slices), ``.mha``, ``.nrrd``, ``.nii``, ``.nii.gz``, ``.vti`` (ParaView), ``.ome.zarr``,
+        ``.dicom`` (a folder of DICOM slices, in Hounsfield units); ``.npy`` holds its numbers alone.
+        Whatever fails or interrupts it, the old file stays as it was.
 
         Parameters
         ----------
@@ -279,6 +284,25 @@ class Result:
 
         write_npy(image_of(self), path, overwrite=overwrite)
 
+    def explain(self, scan: Scan, *, device: str = "auto") -> Residuals:
+        """How well the rays are explained, by view and by pixel, in units of their noise; kept in `residuals`.
+
+        Parameters
+        ----------
+        scan : Scan
+            What this was made from.
+        device : {"auto", "cpu", "cuda", "cuda:N"}
+
+        Raises
+        ------
+        ValueError
+            If the scan has another volume or unit, or this has no Gaussians.
+        """
+        from tomo_polysplat.report.residuals import residuals_of
+
+        self.residuals = residuals_of(self, scan, device=device)
+        return self.residuals
+
     # One parameter for each option that a caller names.
     def report(
         self,
@@ -298,7 +322,8 @@ class Result:
         path : str or path
         scan : Scan, optional
             What this was made from: the page then has FDK beside the result, and how well the rays are explained in
-            units of their noise, by view and by pixel. It takes the time of FDK and of one look at 180 views.
+            units of their noise, by view and by pixel, unless `residuals` tell already. It takes the time of FDK and
+            of one look at 180 views.
         truth, metal_mask : array shaped like :attr:`volume`, or None
             True attenuation in 1/`unit` at :attr:`energy_kev`, and voxels of metal, for figures of merit.
         resolution, contrast : Resolution, Contrast, optional

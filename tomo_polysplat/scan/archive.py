@@ -16,7 +16,7 @@ import numpy as np
 from tomo_polysplat.checks import fail, require_array, visible
 from tomo_polysplat.files import existing_file, require_plausible_size
 
-__all__ = ["archived_number", "archived_text", "read_archive"]
+__all__ = ["archive_names", "archived_number", "archived_text", "read_archive"]
 
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 # NumPy writes no other kinds; some of them may need gigabytes before they give the first byte.
@@ -68,6 +68,16 @@ def read_archive(
         raise fail(
             "path", "a readable .npz archive", f"{file} ({error})", "copy or write the file again"
         ) from error
+
+
+def archive_names(path: Path) -> set[str]:
+    """Names of the arrays of a NumPy archive; none of a file that is no archive, or a broken one."""
+    try:
+        with _Listed(io.FileIO(path)) as stream, zipfile.ZipFile(stream) as archive:
+            stream.listed = True
+            return {name[:-4] for name in archive.namelist() if name.endswith(".npy")}
+    except _BROKEN:
+        return set()
 
 
 class _Listed(io.BufferedReader):

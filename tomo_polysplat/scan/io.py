@@ -13,7 +13,7 @@ from tomo_polysplat.files import existing_file
 from tomo_polysplat.scan.data_exchange import scan_from_hdf5
 from tomo_polysplat.scan.data_exchange_writer import write_hdf5
 from tomo_polysplat.scan.npz import scan_from_npz, write_npz
-from tomo_polysplat.scan.readers import cil_nexus, nxtomo
+from tomo_polysplat.scan.readers import cil_nexus, npz_stack, nxtomo
 from tomo_polysplat.scan.readers.part import Part
 from tomo_polysplat.scan.readers.recognise import acquisition_of
 from tomo_polysplat.scan.readers.scan_part import scan_part
@@ -131,7 +131,7 @@ def _reader_of_scans(path: Path) -> Callable[[Path, ReadOptions], Scan] | None:
         return None
     file = existing_file(path)
     if zipfile.is_zipfile(file):
-        return scan_from_npz
+        return None if npz_stack.recognises(file) else scan_from_npz
     with open(file, "rb") as stream:
         start = stream.read(4)
     if start == b"PK\x03\x04":

@@ -24,6 +24,7 @@ from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.decision import Decision, Known, is_number
 from tomo_polysplat.plan.lab import Lab
 from tomo_polysplat.plan.plan import adapted_to
+from tomo_polysplat.plan.unit_check import lengths_in_doubt, refuse_lengths
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.levels import MAIN_SHARE, main_level, mass_level
 
@@ -82,6 +83,8 @@ class Reference(NamedTuple):
         Whether the unit of length looks wrong.
     dense : float
         Attenuation, in references, of dense matter that is most of the object, has soft matter in it and is no metal.
+    level : float
+        Of half of the object's mass, in densities of the first material; 0 for one energy.
     """
 
     value: float
@@ -90,6 +93,7 @@ class Reference(NamedTuple):
     why: str = ""
     wrong_unit: bool = False
     dense: float = 0.0
+    level: float = 0.0
 
     def adapted(self, settings: Settings) -> Settings:
         """The settings with levels and material numbers of what the object is made of."""
@@ -121,11 +125,13 @@ def soft_reference(
         factor = 1000.0 ** round((math.log10(level) - _BETWEEN_UNITS) / 3)
         if factor != 1:
             why = f"water, with lengths off by a factor of {factor:g}: the object looks {level:.3g} times as dense"
-            return Reference(factor * first, factor * first, settings.soft_u, why, wrong_unit=True)
+            return Reference(
+                factor * first, factor * first, settings.soft_u, why, wrong_unit=True, level=level
+            )
     main = _main_solid(volume / (first * problem.depth), settings, _LIGHTER if solid else 1.0)
     if not main:
         why = f"soft matter: half of the object's mass is at most {level:.3g} times as dense"
-        return Reference(first, first, settings.soft_u, why)
+        return Reference(first, first, settings.soft_u, why, level=level)
     if _holds_soft_matter(volume / (first * problem.depth), settings):
         why = f"soft matter: it lies within what is {main:.3g} times as dense"
         return Reference(first, first, settings.soft_u, why, dense=main)
@@ -209,6 +215,9 @@ class SoftReference(Decision):
         """From the start volume."""
         found = soft_reference(lab.start, lab.problem, lab.settings, lab.problem.solid)
         unit = "g/cm3" if lab.problem.polychromatic else "per unit of length"
-        if found.wrong_unit:
-            lab.doubt_lengths(f"densities are measured by {found.why}")
+        doubt = lengths_in_doubt(found.level, lab.problem) if lab.problem.polychromatic else None
+        if doubt is not None and doubt.impossible and lab.settings.density_check == "refuse":
+            raise refuse_lengths(doubt)
+        if doubt is not None:
+            lab.doubt_lengths(f"{doubt.words}: {doubt.remedy}")
         return Answer(found.data(), f"{found.value:.4g} {unit}: {found.why}", Status.ASKED)

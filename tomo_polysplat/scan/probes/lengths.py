@@ -8,14 +8,15 @@ import numpy as np
 
 from tomo_polysplat.scan.probes.finding import DEFECT, OK, UNKNOWN, Finding
 from tomo_polysplat.scan.probes.measured import Measured
-from tomo_polysplat.units import cm_per
+from tomo_polysplat.units import cm_per, density_in_doubt
 
 __all__ = ["LENGTHS", "probe_lengths"]
 
 LENGTHS = "unit of length"
-# Densities of water, in g/cm3, that attenuate as solid objects usually do, and as any matter at all may: aerogel and
-# platinum.
-_USUAL, _POSSIBLE = (0.3, 10.0), (0.003, 1000.0)
+# Water of more g/cm3 attenuates as metal does.
+_METAL = 10.0
+# -log(I/I0) of the darker rays from which there is matter that attenuates: an aerogel does not.
+_ATTENUATES = 0.1
 # Rays that show more than this share of the large values pass the object.
 _OBJECT = 0.1
 _NEEDS = "the unit and the size of a pixel, as the scanner has them"
@@ -33,14 +34,12 @@ def probe_lengths(measured: Measured) -> Finding:
     density = _as_water(measured)
     numbers = {"density": density}
     text = f"the object attenuates like water of {density:.2g} g/cm3 would"
-    if not _POSSIBLE[0] < density < _POSSIBLE[1]:
-        factor = 10.0 ** round(math.log10(density))
-        text += ", which no matter does"
-        remedy = f"check the unit: lengths look {factor:.0e} times too {'small' if density > 1 else 'large'}"
-        return Finding(LENGTHS, DEFECT, text, remedy, numbers)
-    if not _USUAL[0] < density < _USUAL[1]:
-        text += ": right for foam or lung" if density < 1 else ": right for metal"
-        return Finding(LENGTHS, UNKNOWN, text, _NEEDS, numbers)
+    doubt = density_in_doubt(density, scan.unit)
+    if doubt is not None:
+        certain = doubt.impossible and float(np.percentile(measured.filled, 95)) > _ATTENUATES
+        return Finding(LENGTHS, DEFECT if certain else UNKNOWN, doubt.words, doubt.remedy, numbers)
+    if density > _METAL:
+        return Finding(LENGTHS, UNKNOWN, f"{text}: right for metal", _NEEDS, numbers)
     return Finding(LENGTHS, OK, text, "", numbers)
 
 

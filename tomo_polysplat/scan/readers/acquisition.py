@@ -129,6 +129,8 @@ class Acquisition:
     tube : Tube
     exposure : float or None
         Seconds a picture.
+    shifts : array, shape (views, 2), or None
+        Columns and rows, as the pictures are stored, by which each has to be moved to fit the setup.
     said : tuple of str
         What had to be guessed.
     other : mapping of texts
@@ -149,8 +151,19 @@ class Acquisition:
     from_detector: bool = False
     tube: Tube = Tube()
     exposure: float | None = None
+    shifts: np.ndarray | None = None
     said: tuple[str, ...] = ()
     other: Mapping[str, str] = field(default_factory=dict)
+
+    def geometry(self) -> Geometry:
+        """Where the rays of the pictures run, rows ascending with z and columns as seen from the source."""
+        _, rows, columns = self.frames.shape
+        plain = self.setup if isinstance(self.setup, Geometry) else self.setup.geometry(rows, columns)
+        if self.shifts is None:
+            return plain
+        right = -self.shifts[:, :1] if self.from_detector else self.shifts[:, :1]
+        up = -self.shifts[:, 1:] if self.top_first else self.shifts[:, 1:]
+        return replace(plain, corner=plain.corner + right * plain.u + up * plain.v)
 
     def saying(self, *guesses: str) -> Acquisition:
         """The same with more guesses told."""

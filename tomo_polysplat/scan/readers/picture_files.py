@@ -11,6 +11,7 @@ from tomo_polysplat.checks import fail
 from tomo_polysplat.files import existing_file
 from tomo_polysplat.scan.readers.edf import EdfFrames
 from tomo_polysplat.scan.readers.frames import ArrayFrames, Frames, TiffFrames
+from tomo_polysplat.scan.readers.xradia_frames import xrm_pictures
 
 __all__ = ["NpyFrames", "frames_of"]
 
@@ -54,11 +55,16 @@ class NpyFrames:
             raise fail("path", "a .npy file of numbers", got, "save it again with numpy.save") from error
 
 
-_READERS: dict[str, Callable[[Sequence[Path]], Frames]] = {".npy": NpyFrames, ".edf": EdfFrames}
+_READERS: dict[str, Callable[[Sequence[Path]], Frames]] = {
+    ".npy": NpyFrames,
+    ".edf": EdfFrames,
+    ".txrm": xrm_pictures,
+    ".xrm": xrm_pictures,
+}
 
 
 def frames_of(files: Sequence[Path]) -> Frames:
-    """Pictures of TIFF, ``.npy`` or EDF files, told apart by the first one's name.
+    """Pictures of TIFF, ``.npy``, EDF, .txrm or .xrm files, told apart by the first one's name.
 
     Raises
     ------

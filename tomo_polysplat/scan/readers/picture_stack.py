@@ -15,7 +15,7 @@ from tomo_polysplat.scan.readers.picture_files import frames_of
 from tomo_polysplat.scan.readers.picture_names import PICTURE_SUFFIXES, has_word, named_files, pictures_in
 from tomo_polysplat.scan.readers.stated import read_toml, require_known, stated_over
 
-__all__ = ["read", "recognises"]
+__all__ = ["full_turn", "guessed", "read", "recognises", "written_beside"]
 
 KIND = "stack of TIFFs, EDF or .npy files"
 _REMEDY = (
@@ -34,20 +34,23 @@ def recognises(path: Path) -> bool:
 def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     """See `tomo_polysplat.load_scan`; `stated` has its ``scanner``."""
     folder = path if path.is_dir() else path.parent
-    written, other = _written(path)
+    written, other = written_beside(path)
     known = written | require_known(stated, "scanner")
     if path.suffix.lower() in PICTURE_SUFFIXES and path.is_file():
         known.setdefault("projections", path)
     files = _sorted_out(folder, known)
     frames = frames_of(files["projections"])
-    views = frames.shape[0]
     known |= {name: files[name] for name in ("flats", "darks") if files[name]}
-    setup = Setup(np.arange(views) * (360.0 / views), np.nan)
-    told = Acquisition(KIND, frames, setup, folder.name, other=other)
-    return _guessed(stated_over(told, known, folder), known)
+    told = Acquisition(KIND, frames, full_turn(frames.shape[0]), folder.name, other=other)
+    return guessed(stated_over(told, known, folder), known)
 
 
-def _written(path: Path) -> tuple[dict[str, Any], dict[str, str]]:
+def full_turn(views: int) -> Setup:
+    """What is taken where nothing is told: even steps, and a pixel that has yet to be known."""
+    return Setup(np.arange(views) * (360.0 / views), np.nan)
+
+
+def written_beside(path: Path) -> tuple[dict[str, Any], dict[str, str]]:
     """Known and other keys of the TOML file that is meant, or the only one in the folder."""
     beside = sorted(path.glob("*.toml")) if path.is_dir() else []
     if len(beside) > 1:
@@ -96,7 +99,7 @@ def _sorted_out(folder: Path, known: Mapping[str, Any]) -> dict[str, list[Path]]
     return files
 
 
-def _guessed(told: Acquisition, known: Mapping[str, Any]) -> Acquisition:
+def guessed(told: Acquisition, known: Mapping[str, Any]) -> Acquisition:
     """Refuse what cannot be guessed, and say what is."""
     setup = told.setup
     assert isinstance(setup, Setup)

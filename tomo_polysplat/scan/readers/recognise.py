@@ -7,13 +7,22 @@ from pathlib import Path
 from typing import Any
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.scan.readers import cil_nexus, nikon, nxtomo, picture_stack, rtk, skyscan
+from tomo_polysplat.scan.readers import (
+    cil_nexus,
+    nikon,
+    npz_stack,
+    nxtomo,
+    picture_stack,
+    rtk,
+    skyscan,
+    xradia,
+)
 from tomo_polysplat.scan.readers.acquisition import Acquisition
 
 __all__ = ["acquisition_of"]
 
 # The first one that recognises what it is shown reads it: what any folder of pictures is comes last.
-READERS = (skyscan, nikon, nxtomo, cil_nexus, rtk, picture_stack)
+READERS = (skyscan, nikon, xradia, nxtomo, cil_nexus, rtk, npz_stack, picture_stack)
 _REMEDY = (
     "name the folder or the file that the scanner wrote; docs/scanner_files.md tells what is read of each"
 )

@@ -79,7 +79,7 @@ def _limit(told: Acquisition, kind: str, saturation: float | None) -> float:
 
 def _geometry(told: Acquisition) -> Geometry:
     views, rows, columns = told.frames.shape
-    geometry = told.setup if isinstance(told.setup, Geometry) else told.setup.geometry(rows, columns)
+    geometry = told.geometry()
     if geometry.shape != (views, rows, columns):
         got = f"{geometry.views} angles for {views} pictures of {rows} x {columns} pixels"
         if geometry.views == views:

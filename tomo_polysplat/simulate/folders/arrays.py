@@ -1,4 +1,4 @@
-"""Plain folders of arrays: NumPy's .npy files, and the ESRF's EDF pictures, beside a small TOML file."""
+"""Plain folders of arrays: NumPy's .npy and .npz files, and the ESRF's EDF pictures, beside a small TOML file."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from tomo_polysplat.simulate.folders.scene import Pictures
 from tomo_polysplat.simulate.folders.tiffs import write_distances
 
-__all__ = ["edf_bytes", "write_edf", "write_npy"]
+__all__ = ["edf_bytes", "write_edf", "write_npy", "write_npz"]
 
 _EDF_TYPES = {"u2": "UnsignedShort", "f4": "FloatValue", "i4": "SignedInteger"}
 _EDF_BLOCK = 512
@@ -19,6 +19,13 @@ def write_npy(folder: Path, pictures: Pictures) -> None:
     """Fill an empty folder with three stacks."""
     for name in ("projections", "flats", "darks"):
         np.save(folder / f"{name}.npy", getattr(pictures, name))
+    write_distances(folder)
+
+
+def write_npz(folder: Path, pictures: Pictures) -> None:
+    """Fill an empty folder with one archive."""
+    stacks = {name: getattr(pictures, name) for name in ("projections", "flats", "darks", "degrees")}
+    np.savez_compressed(folder / "marker.npz", **stacks)
     write_distances(folder)
 
 

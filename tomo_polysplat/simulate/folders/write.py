@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tomo_polysplat.checks import fail, require_choice
 from tomo_polysplat.scan.scan import Scan
-from tomo_polysplat.simulate.folders import arrays, cil, nikon, nxtomo, rtk, skyscan, tiffs
+from tomo_polysplat.simulate.folders import arrays, cil, nikon, nxtomo, rtk, skyscan, tiffs, xradia
 from tomo_polysplat.simulate.folders.scene import marked_scan, pictures_of
 
 __all__ = ["KINDS", "write_folder"]
@@ -15,12 +15,14 @@ __all__ = ["KINDS", "write_folder"]
 KINDS = {
     "tiffs": tiffs.write,
     "npy": arrays.write_npy,
+    "npz": arrays.write_npz,
     "edf": arrays.write_edf,
     "skyscan": skyscan.write,
     "nikon": nikon.write,
     "nxtomo": nxtomo.write,
     "rtk": rtk.write,
     "cil": cil.write,
+    "xradia": xradia.write,
 }
 # Scans of a geometry that a kind has of its own.
 _SCANS = {"nikon": nikon.make}
