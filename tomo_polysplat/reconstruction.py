@@ -292,13 +292,11 @@ def _result(
         number, tunables = float(gaussians.shared_material[0]), about["settings"]
         plan.note("soft_material", number, describe_soft(number, plan.soft_u, tunables["soft_gain"]))
     with torch.no_grad():
-        found = outcome.start
-        found = (
-            scene.basis(gaussians) * plan.reference
-            if found is None
-            else densities_of_start(found, plan, problem, scene.reference_curve)
-        )
-        own = cut_out(to_host(found), problem.margin)
+        if outcome.start is None:
+            own = scene.basis_on_host(gaussians, plan.reference)
+        else:
+            own = to_host(densities_of_start(outcome.start, plan, problem, scene.reference_curve))
+        own = cut_out(own, problem.margin)
         heights = gaussians.weights(scene.reference_curve).sum(dim=0)
         parts = {
             "position": gaussians.position.cpu().numpy() * length + problem.centre,

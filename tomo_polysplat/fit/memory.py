@@ -18,6 +18,7 @@ __all__ = [
     "require_machine",
     "require_room",
     "room_for_gaussians",
+    "voxels_at_once",
 ]
 
 logger = logging.getLogger(__name__)
@@ -32,6 +33,8 @@ _PIXEL = 48
 # Bytes a voxel takes, the most at once: while seeds are chosen and when the volumes are made; and the samples
 # of thin Gaussians (render.renderer).
 _VOXEL, _SAMPLES = 110, 12 << 25
+# Voxels that are made at once at most: a larger volume is no faster in one piece.
+_LARGEST_SLAB = 1 << 26
 # Copies of the projections that the first reconstruction makes: water equivalents, the filtered ones, ASTRA's.
 _COPIES = 4
 # Bytes of the host that a ray takes, and an energy, whose ray is traced through so many paths and kept three times
@@ -45,6 +48,14 @@ def free_bytes(device: torch.device) -> int:
     """Memory of a CUDA device that torch can still hand out."""
     unused = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
     return torch.cuda.mem_get_info(device)[0] + unused
+
+
+def voxels_at_once(device: torch.device) -> int:
+    """Voxels of a slab for which there is room while a volume is made, at least one."""
+    free = available_memory() if device.type == "cpu" else free_bytes(device)
+    if free is None:
+        return _LARGEST_SLAB
+    return min(max(int(0.5 * _SHARE * free / _VOXEL), 1), _LARGEST_SLAB)
 
 
 def projections_stay(size: int, device: torch.device) -> bool:

@@ -28,7 +28,6 @@ from tomo_polysplat.plan.never_worse import judge, note_seeds
 from tomo_polysplat.plan.order import ask_between, decide
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.preparation import PreparedFit, RunOptions, calibrate, physics, prepare, under
-from tomo_polysplat.transfer import to_host
 
 __all__ = ["Solver"]
 
@@ -214,7 +213,7 @@ def _volume_of(
 
     def volume(gaussians: Gaussians) -> np.ndarray:
         with torch.no_grad():
-            whole = cut_out(to_host(scene.volume(gaussians) * factor), problem.margin)
+            whole = cut_out(scene.volume_on_host(gaussians, factor), problem.margin)
         return np.ascontiguousarray(whole[0, ::-1]) if flipped else whole
 
     return volume
