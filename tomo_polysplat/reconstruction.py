@@ -20,6 +20,7 @@ from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.soft_matter import describe_soft
 from tomo_polysplat.fit.stopping import StopReason
 from tomo_polysplat.fit.surroundings import cut_out
+from tomo_polysplat.free_memory import limit_memory, memory_limits
 from tomo_polysplat.interrupts import postponed_interrupts
 from tomo_polysplat.kernels.compile_time import compiled_seconds, working_time
 from tomo_polysplat.kernels.device import one_torch_thread, usual_modes
@@ -59,6 +60,7 @@ _VIEWS_OF_PIXELS = 16
 
 
 @usual_modes()
+@memory_limits()
 def reconstruct(
     projections: Any,
     proj_geom: Mapping[str, Any] | None = None,
@@ -177,6 +179,7 @@ def reconstruct(
     """
     begun = time.perf_counter()
     run_options = RunOptions.of(quality, settings, time_budget, seed, device, callbacks)
+    limit_memory(run_options.settings.memory, run_options.device.type)
     started, compiled = working_time(), compiled_seconds()
     mended: list[str] = []
     if mend and isinstance(projections, Scan) and proj_geom is None:
