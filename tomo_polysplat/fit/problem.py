@@ -242,12 +242,14 @@ class Problem:
     def agreement(self, bodies: Sequence[torch.Tensor]) -> list[float | None]:
         """How much of what varies in bodies of voxels is the object's, told once a scan; see ``start.agreement``."""
         if self._known.agreement is None:
-            values = self._copied(bodies[0].device)
+            # Of a start that a GPU has no room for the bodies are on the host.
+            device = next((one for one in self._known.copies if one.type == "cuda"), bodies[0].device)
+            values = self._copied(device)
             try:
-                self._known.agreement = halves_agree(values, self.geometry, self.grid, bodies)
+                self._known.agreement = halves_agree(values, self.geometry, self.grid, bodies, device)
             except RuntimeError as problem:
                 # Torch's or ASTRA's, of a GPU that has no room for two more volumes.
-                if not values.is_cuda:
+                if device.type != "cuda":
                     raise
                 logger.warning("Texture is not told from noise: %s", problem)
                 self._known.agreement = [None] * len(bodies)
