@@ -1,6 +1,7 @@
 """What memory does not hold is refused before any of it is taken, with bytes needed, bytes free and a remedy."""
 
 import time
+import tracemalloc
 
 import astra
 import numpy as np
@@ -12,6 +13,7 @@ import tomo_polysplat as tps
 from tomo_polysplat import free_memory
 from tomo_polysplat.fit import memory
 from tomo_polysplat.free_memory import available_memory, bytes_of, limit_memory, require_memory
+from tomo_polysplat.scan.usable import usable_rays
 
 REMEDIES = {
     "vol_geom": "fewer or larger voxels",
@@ -139,7 +141,7 @@ def test_what_a_machine_cannot_hold_is_refused_at_once(what, monkeypatch):
 def test_a_volume_that_a_gpu_cannot_hold_is_refused_at_once(monkeypatch):
     device = torch.device("cuda", 0)
     monkeypatch.setattr(memory, "free_bytes", lambda device: int(5e9))
-    monkeypatch.setattr(free_memory, "available_memory", lambda: int(5e10))
+    monkeypatch.setattr(free_memory, "available_memory", lambda: int(1e11))
     memory.require_machine(10**6, 512**3, 100, device)
     with pytest.raises(MemoryError, match=r"vol_geom: .*5\.00 GB free on cuda:0.*12\.88 GB.*device='cpu'"):
         memory.require_machine(10**6, 1024**3, 100, device)
@@ -147,6 +149,22 @@ def test_a_volume_that_a_gpu_cannot_hold_is_refused_at_once(monkeypatch):
     memory.require_machine(10**6, 1024**3, 100, device)
     with pytest.raises(MemoryError, match="projections"):
         memory.require_machine(10**10, 256**3, 100, device)
+
+
+def test_a_mask_takes_no_copies_of_the_size_of_the_projections():
+    scan = cone(24, 40)
+    mask = np.ones(scan.projections.shape, bool)
+    mask[3, 4, 5] = False
+    usable_rays(scan.projections, scan.proj_geom, mask)
+    tracemalloc.start()
+    try:
+        values, counts = usable_rays(scan.projections, scan.proj_geom, mask)
+        most = tracemalloc.get_traced_memory()[1] / mask.size
+    finally:
+        tracemalloc.stop()
+    assert np.isnan(values[4, 3, 5]) and counts["rays_marked_invalid"] == 1 == np.isnan(values).sum()
+    # The values, what is marked, and another byte while that is made; for so small a scan some 5 of what is looked at.
+    assert 5 <= most < 13
 
 
 def test_a_cloud_that_a_cpu_cannot_hold_is_refused(monkeypatch):

@@ -201,11 +201,10 @@ def reconstruct(
         values, counts = usable_rays(
             measured.projections, proj_geom, measured.valid, water_correction, spectrum
         )
-        problem = Problem.of(values, geometry, grid, unit, spectrum, materials, widest, on)
+        problem = Problem.of(values, geometry, grid, unit, spectrum, materials, widest, on, own=True)
         problem = filtered(problem, filter_map, unit, proj_geom["type"] == "cyl_cone_vec")
     # Made wider where the object is, it may have many times the voxels.
     require_machine(0, math.prod(problem.grid.shape), energies, on)
-    # Sorted, they may be a copy: these would stay in memory beside it.
     del values
     wanted = Calibration.of(calibrate, soft_density, problem.spectrum)
     flipped = is_planar_geometry(proj_geom)

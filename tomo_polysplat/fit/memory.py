@@ -40,9 +40,10 @@ _SEEDED, _SMOOTHED, _MADE, _SAMPLES = 52, {"cpu": 58, "cuda": 12}, 64, 12 << 25
 _LARGEST_SLAB = 1 << 26
 # Copies of the projections that the first reconstruction makes: water equivalents, the filtered ones, ASTRA's.
 _COPIES = 4
-# Bytes of the host that a ray takes, and an energy, whose ray is traced through so many paths and kept three times
-# (peaks of runs of 1e7 rays and of 3000 and 12 000 energies); and a voxel of a result.
-_RAY, _ENERGY, _RESULT = 30, 3 * 8 * 2048, 24
+# Bytes of the host that a ray takes: as measured, in the fit's order, and whether it is good; on a CPU also what the
+# start makes of it (peaks of runs of 1e7 rays). An energy, whose ray is traced through so many paths and kept three
+# times (runs of 3000 and 12 000 energies); and a voxel of a result.
+_RAY, _ENERGY, _RESULT = {"cpu": 30, "cuda": 14}, 3 * 8 * 2048, 24
 # Of what is free: the rest is the driver's, other programs', and lost between blocks.
 _SHARE = 0.9
 
@@ -84,11 +85,13 @@ def require_machine(rays: int, voxels: int, energies: int, device: torch.device)
         "vol_geom": "take fewer or larger voxels, or a smaller window of the object",
         "spectrum": "rebin the spectrum: some hundreds of energies are as good",
     }
+    # A GPU that has no room for the projections leaves them, and what the start makes of them, to the host.
+    a_ray = _RAY["cuda" if device.type == "cuda" and projections_stay(4 * rays, device) else "cpu"]
     a_voxel = _SMOOTHED["cpu"] if device.type == "cpu" else _RESULT
     if not start_stays(voxels, device):
         a_voxel = max(a_voxel, _SEEDED)
     needed = {
-        "projections": (f"{rays} rays", float(rays * _RAY)),
+        "projections": (f"{rays} rays", float(rays * a_ray)),
         "vol_geom": (f"{voxels} voxels", float(voxels * a_voxel)),
         "spectrum": (f"{energies} energies", float(energies * _ENERGY)),
     }

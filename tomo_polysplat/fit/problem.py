@@ -25,7 +25,7 @@ from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.scan.noise import photons_per_ray
 from tomo_polysplat.scan.snapped import snapped_geometry, snapped_grid
-from tomo_polysplat.scan.view_order import view_order
+from tomo_polysplat.scan.view_order import sorted_in_place, view_order
 from tomo_polysplat.start.agreement import halves_agree
 from tomo_polysplat.transfer import to_device
 from tomo_polysplat.units import LENGTH_UNITS, cm_per
@@ -115,10 +115,12 @@ class Problem:
         materials: Materials | Sequence[Any] | None,
         surroundings: float = 0.0,
         device: torch.device = _HOST,
+        own: bool = False,
     ) -> Problem:
         """The problem of a scan in the caller's unit, its views sorted; one energy makes it monochromatic.
 
-        The grid may be wider by as much as the share ``surroundings`` on every side, which a ``device`` finds out.
+        The grid may be wider by as much as the share ``surroundings`` on every side, which a ``device`` finds out. The
+        projections of a caller who gives them up (``own``) are sorted in place.
         """
         require_choice("unit", unit, LENGTH_UNITS)
         if spectrum is not None and spectrum.is_monochromatic:
@@ -134,8 +136,11 @@ class Problem:
         outside = snapped_geometry(geometry.normalised(grid.centre, length))
         order = view_order(outside, projections)
         mixed = bool((np.diff(order) != 1).any())
-        if mixed:
-            projections, outside = projections[order], outside.select(order)
+        if mixed and own:
+            sorted_in_place(projections, order)
+        elif mixed:
+            projections = projections[order]
+        outside = outside.select(order) if mixed else outside
         return cls(
             projections, outside, inside, grid.centre, length, depth, planar, spectrum, curves,
             margin=margin, surroundings=why, order=order if mixed else None,
