@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -151,6 +152,8 @@ def run(arguments: argparse.Namespace) -> int:
         scan = replace(scan, filter_map=filter_map_from(arguments.filter_map))
     require_room_of(arguments, scan)
     print(scan)
+    # What a run will take is said without -v as well.
+    logging.getLogger("tomo_polysplat.plan.expected").setLevel(logging.INFO)
     with progress_reports(None) as progress:
         result = tomo_polysplat.reconstruct(
             replace(scan, spectrum=spectrum),

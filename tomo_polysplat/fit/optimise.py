@@ -195,6 +195,7 @@ def fit(
     checkpoint: Keeps | None = None,
     between: Between | None = None,
     pace: Pace | None = None,
+    timed: Callable[[Clock, float], Any] | None = None,
 ) -> FitOutcome:
     """Fit Gaussians to rays.
 
@@ -202,7 +203,8 @@ def fit(
     rays have not improved for ``settings.patience`` passes (`usual_patience`), when a callback returns True, or on
     KeyboardInterrupt; returns the Gaussians that `Watch` holds for the best. Where ``checkpoint``
     holds a snapshot, ``gaussians`` are its own and the fit goes on from there. ``between`` is called
-    between passes, and asks what the plan left open; ``pace`` is told early on what a deadline has room for.
+    between passes, and asks what the plan left open; ``pace`` is told early on what a deadline has room for, and
+    ``timed`` the seconds of a step.
     """
     if not len(gaussians):
         logger.warning("The start volume is empty: no Gaussians, a volume of zeros.")
@@ -217,7 +219,7 @@ def fit(
     run = _Keeper(
         Fitter(gaussians, spacing, rays, scene, settings, batch, steps, rng),
         # From now on: what compiling or recording the step took is no part of the run that the learning rates follow.
-        clock := Clock(steps, deadline, pace),
+        clock := Clock(steps, deadline, pace, timed),
         outcome=outcome,
         watch=watch,
         started=started,

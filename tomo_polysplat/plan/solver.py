@@ -13,7 +13,7 @@ import torch
 from tomo_polysplat.fit.optimise import FitOutcome, Run, fit
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.fit.stopping import Stop, StopReason
+from tomo_polysplat.fit.stopping import Clock, Stop, StopReason
 from tomo_polysplat.fit.surroundings import cut_out
 from tomo_polysplat.kernels.compile_time import working_time
 from tomo_polysplat.model.gaussians import Gaussians
@@ -22,6 +22,7 @@ from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.calibration import Calibration
 from tomo_polysplat.plan.checkpoint import Checkpoint
 from tomo_polysplat.plan.decision import When
+from tomo_polysplat.plan.expected import expected, tell
 from tomo_polysplat.plan.first_volume import first_volume
 from tomo_polysplat.plan.lab import Lab
 from tomo_polysplat.plan.never_worse import judge, note_seeds
@@ -164,7 +165,16 @@ class Solver:
             checkpoint=self.saved,
             between=self._questions(prepared, problem, ask_scatter),
             pace=lambda room, lacking: self._tell_pace(plan, room, lacking),
+            timed=lambda clock, a_step: self._tell_expected(prepared, clock, a_step),
         )
+
+    def _tell_expected(self, prepared: PreparedFit, clock: Clock, a_step: float) -> None:
+        """Say what the run will take, once some steps have been timed."""
+        plan, so_far = prepared.plan, working_time() - self.started
+        growth = plan.answers["growth"].value if "growth" in plan.answers else 1.0
+        memory = plan.facts["memory"].why if "memory" in plan.facts else ""
+        parts = clock.steps, clock.done, a_step, so_far, float(growth), f"memory {memory}"
+        tell(expected(*parts), self.run_options.time_budget)
 
     def _tell_pace(self, plan: Plan, room: float, lacking: float) -> None:
         """Say for how much of the run the time budget has room, at its beginning."""
