@@ -13,8 +13,10 @@ import tomo_polysplat as tps
 from tomo_polysplat.fit import memory
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.step import EagerStep
+from tomo_polysplat.model import seed_samples
 from tomo_polysplat.plan import first_gaussians
 
+WINDOW = 4 * 32 * 32
 CPU = torch.device("cpu")
 
 
@@ -42,6 +44,8 @@ def taken(tmp_path_factory):
 
     scan = cone(32, 40, metal=True)
     with pytest.MonkeyPatch.context() as patch:
+        # As in a volume that is many times as large as what is looked at together.
+        patch.setattr(seed_samples, "_AT_ONCE", WINDOW)
         patch.setattr(
             first_gaussians, "seed_gaussians", counted("seeds", first_gaussians.seed_gaussians, at=2)
         )
@@ -59,11 +63,14 @@ def taken(tmp_path_factory):
     return found, math.prod(scan.volume_shape), scan.rows * scan.columns
 
 
-def test_seeds(taken):
+def test_seeds(taken, monkeypatch):
     found, voxels, _ = taken
+    monkeypatch.setattr(memory, "_WINDOW", WINDOW)
+    counted = memory.start_bytes(voxels)
     # With the start, and the start in soft references.
     most = found["seeds"][0] + 8 * voxels
-    assert 0.5 * memory._SEEDED * voxels < most <= memory._SEEDED * voxels
+    assert 0.5 * counted < most <= counted
+    assert memory.start_bytes(8 * voxels) > 7.5 * counted, "mostly voxels"
 
 
 def test_a_step(taken):

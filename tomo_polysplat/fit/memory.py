@@ -18,6 +18,7 @@ __all__ = [
     "require_machine",
     "require_room",
     "room_for_gaussians",
+    "start_bytes",
     "start_stays",
     "step_bytes",
     "voxels_at_once",
@@ -35,7 +36,9 @@ _PIXEL = 48
 # Bytes a voxel takes at once, by torch's own count on 40^3 to 64^3 (tests/fit/test_counted_memory.py): while a start is
 # looked at and seeded; in a step, with the smoothing, on the CPU and by the kernels of a GPU, which hold the volume and
 # its slope; while a volume is made of three curves and metal. And the samples of thin Gaussians (render.renderer).
-_SEEDED, _SMOOTHED, _MADE, _SAMPLES = 52, {"cpu": 58, "cuda": 12}, 64, 12 << 25
+_SEEDED, _SMOOTHED, _MADE, _SAMPLES = 40, {"cpu": 58, "cuda": 12}, 64, 12 << 25
+# Voxels of a start around which windows are looked at together (model.seed_samples), and bytes of one on top.
+_WINDOW, _WINDOWED = 1 << 25, 22
 # Voxels that are made at once at most: a larger volume is no faster in one piece.
 _LARGEST_SLAB = 1 << 26
 # Copies of the projections that the first reconstruction makes: water equivalents, the filtered ones, ASTRA's.
@@ -63,7 +66,12 @@ def projections_stay(size: int, device: torch.device) -> bool:
 
 def start_stays(voxels: int, device: torch.device) -> bool:
     """Whether a start of so many voxels is looked at and seeded on the device, or on the host for want of room."""
-    return device.type == "cpu" or voxels * _SEEDED <= _SHARE * free_bytes(device)
+    return device.type == "cpu" or start_bytes(voxels) <= _SHARE * free_bytes(device)
+
+
+def start_bytes(voxels: int) -> int:
+    """Bytes that a start of so many voxels takes while it is looked at and seeded."""
+    return voxels * _SEEDED + min(voxels, _WINDOW) * _WINDOWED
 
 
 def require_machine(rays: int, voxels: int, energies: int, device: torch.device) -> None:
@@ -88,11 +96,12 @@ def require_machine(rays: int, voxels: int, energies: int, device: torch.device)
     # A GPU that has no room for the projections leaves them, and what the start makes of them, to the host.
     a_ray = _RAY["cuda" if device.type == "cuda" and projections_stay(4 * rays, device) else "cpu"]
     a_voxel = _SMOOTHED["cpu"] if device.type == "cpu" else _RESULT
+    of_voxels = voxels * a_voxel
     if not start_stays(voxels, device):
-        a_voxel = max(a_voxel, _SEEDED)
+        of_voxels = max(of_voxels, start_bytes(voxels))
     needed = {
         "projections": (f"{rays} rays", float(rays * a_ray)),
-        "vol_geom": (f"{voxels} voxels", float(voxels * a_voxel)),
+        "vol_geom": (f"{voxels} voxels", float(of_voxels)),
         "spectrum": (f"{energies} energies", float(energies * _ENERGY)),
     }
     require_memory(needed, remedies)
