@@ -1,6 +1,7 @@
 """What memory does not hold is refused before any of it is taken, with bytes needed, bytes free and a remedy."""
 
 import time
+import tracemalloc
 
 import astra
 import numpy as np
@@ -11,7 +12,8 @@ from small_scans import cone
 import tomo_polysplat as tps
 from tomo_polysplat import free_memory
 from tomo_polysplat.fit import memory
-from tomo_polysplat.free_memory import available_memory, require_memory
+from tomo_polysplat.free_memory import available_memory, bytes_of, limit_memory, require_memory
+from tomo_polysplat.scan.usable import usable_rays
 
 REMEDIES = {
     "vol_geom": "fewer or larger voxels",
@@ -59,6 +61,44 @@ def test_the_tightest_limit_around_a_process_counts(grouped, version):
     assert available_memory() == machine
 
 
+def test_a_limit_is_what_a_process_may_hold_in_all(monkeypatch):
+    held = free_memory._held()
+    with free_memory.memory_limits():
+        limit_memory("2 GB", "cuda")
+        assert available_memory() > held // 10, "the host is not the GPU"
+        monkeypatch.setattr(free_memory, "_held", lambda: 10**6)
+        limit_memory("3MB", "cpu")
+        assert available_memory() == 2_000_000
+        limit_memory(1000.0, "cpu")
+        assert available_memory() == 0
+        monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device: 5 * 10**8)
+        monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 6 * 10**8)
+        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (10**10, 10**11))
+        assert free_memory.free_bytes(torch.device("cuda", 0)) == 15 * 10**8
+    assert available_memory() > 2_000_000
+    assert free_memory.free_bytes(torch.device("cuda", 0)) == 101 * 10**8
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [("12 GB", 12e9), ("500mb", 5e8), ("1.5 GiB", 1.5 * 2**30), ("7", 7.0), (8e9, 8e9), (".5 TB", 5e11)],
+)
+def test_bytes_are_read_as_people_write_them(text, size):
+    assert bytes_of(text, "memory") == size
+
+
+@pytest.mark.parametrize("text", ["", "GB", "12 XB", "0 GB", "-1 GB", "nan", 0, -1.0, float("nan"), [1]])
+def test_what_is_no_size_is_refused(text):
+    with pytest.raises((ValueError, TypeError), match="memory"):
+        tps.reconstruct(None, settings={"memory": text})
+
+
+def test_too_small_a_limit_is_told_before_the_work():
+    scan = cone(12, 20)
+    with pytest.raises(MemoryError, match=r"GB of memory that are free"):
+        tps.reconstruct(scan, settings={"memory": "1 MB"}, device="cpu")
+
+
 def test_a_machine_that_does_not_say_refuses_nothing(tmp_path, monkeypatch):
     for name in ("_MEMINFO", "_OWN_GROUPS"):
         monkeypatch.setattr(free_memory, name, tmp_path / "none")
@@ -101,12 +141,30 @@ def test_what_a_machine_cannot_hold_is_refused_at_once(what, monkeypatch):
 def test_a_volume_that_a_gpu_cannot_hold_is_refused_at_once(monkeypatch):
     device = torch.device("cuda", 0)
     monkeypatch.setattr(memory, "free_bytes", lambda device: int(5e9))
-    monkeypatch.setattr(free_memory, "available_memory", lambda: int(5e10))
-    memory.require_machine(10**6, 256**3, 100, device)
-    with pytest.raises(MemoryError, match=r"vol_geom: .*5\.00 GB free on cuda:0.*14\.76 GB.*device='cpu'"):
-        memory.require_machine(10**6, 512**3, 100, device)
+    monkeypatch.setattr(free_memory, "available_memory", lambda: int(1e11))
+    memory.require_machine(10**6, 512**3, 100, device)
+    with pytest.raises(MemoryError, match=r"vol_geom: .*5\.00 GB free on cuda:0.*12\.88 GB.*device='cpu'"):
+        memory.require_machine(10**6, 1024**3, 100, device)
+    monkeypatch.setattr(memory, "free_bytes", lambda device: int(80e9))
+    memory.require_machine(10**6, 1024**3, 100, device)
     with pytest.raises(MemoryError, match="projections"):
         memory.require_machine(10**10, 256**3, 100, device)
+
+
+def test_a_mask_takes_no_copies_of_the_size_of_the_projections():
+    scan = cone(24, 40)
+    mask = np.ones(scan.projections.shape, bool)
+    mask[3, 4, 5] = False
+    usable_rays(scan.projections, scan.proj_geom, mask)
+    tracemalloc.start()
+    try:
+        values, counts = usable_rays(scan.projections, scan.proj_geom, mask)
+        most = tracemalloc.get_traced_memory()[1] / mask.size
+    finally:
+        tracemalloc.stop()
+    assert np.isnan(values[4, 3, 5]) and counts["rays_marked_invalid"] == 1 == np.isnan(values).sum()
+    # The values, what is marked, and another byte while that is made; for so small a scan some 5 of what is looked at.
+    assert 5 <= most < 13
 
 
 def test_a_cloud_that_a_cpu_cannot_hold_is_refused(monkeypatch):

@@ -6,13 +6,23 @@ machine has: a container, or a queue's job, has a control group with a limit.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from contextlib import suppress
+import os
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from tomo_polysplat.checks import fail
+from tomo_polysplat.checks import fail, require_number
 
-__all__ = ["available_memory", "in_gigabytes", "require_memory"]
+if TYPE_CHECKING:
+    import torch
+
+__all__ = [
+    *("available_memory", "bytes_of", "free_bytes", "in_gigabytes"),
+    *("limit_memory", "memory_limits", "require_memory"),
+]
 
 _MEMINFO, _OWN_GROUPS, _GROUPS = Path("/proc/meminfo"), Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
 # Limit, use, and what of the use is files that the system can let go of, in both versions of control groups.
@@ -20,11 +30,70 @@ _VERSIONS = {
     "": ("memory.max", "memory.current", "inactive_file "),
     "memory": ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file "),
 }
+_STATM = Path("/proc/self/statm")
+_UNITS = {"": 1.0} | {
+    f"{prefix}{binary}b": (1024.0 if binary else 1000.0) ** power
+    for power, prefix in enumerate(("", "k", "m", "g", "t"))
+    for binary in ("", "i")
+    if prefix or not binary
+}
+# Bytes that a caller lets the host's processes, and a GPU's, hold in all.
+_LIMITS: ContextVar[dict[str, float]] = ContextVar("_LIMITS")
+
+
+@contextmanager
+def memory_limits() -> Iterator[None]:
+    """Forget at the end what `limit_memory` was told within."""
+    before = _LIMITS.set(dict(_LIMITS.get({})))
+    try:
+        yield
+    finally:
+        _LIMITS.reset(before)
+
+
+def limit_memory(size: Any, kind: str) -> None:
+    """Plan as if this process may hold no more than so many bytes, on the host ("cpu") or on a GPU ("cuda").
+
+    Nothing is enforced: what is planned stays below. None is no limit.
+    """
+    if size is not None:
+        _LIMITS.set(_LIMITS.get({}) | {kind: bytes_of(size, "memory")})
+
+
+def bytes_of(value: Any, argument: str) -> float:
+    """Bytes of a number, or of a text such as "12 GB", "500MB" or "8 GiB".
+
+    Raises
+    ------
+    ValueError
+        For anything else, and for nothing.
+    """
+    if not isinstance(value, str):
+        return require_number(argument, value, above=0)
+    found = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*([a-z]*)\s*", value.lower())
+    if found is None or found[2] not in _UNITS or not float(found[1]) > 0:
+        raise fail(argument, 'bytes, as a number or as "12 GB", "500 MB" or "8 GiB"', repr(value))
+    return float(found[1]) * _UNITS[found[2]]
+
+
+def free_bytes(device: torch.device) -> int:
+    """Memory of a CUDA device that torch can still hand out, within the limit of `limit_memory`."""
+    import torch
+
+    held = torch.cuda.memory_allocated(device)
+    free = torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device) - held
+    limit = _LIMITS.get({}).get("cuda")
+    return free if limit is None else max(min(free, int(limit) - held), 0)
 
 
 def available_memory() -> int | None:
-    """Bytes of memory that a process may still take, or None where the system does not say."""
+    """Bytes of memory that a process may still take, or None where the system does not say.
+
+    Within the limit of `limit_memory`, of which what the process holds already is taken off.
+    """
     free = []
+    if (limit := _LIMITS.get({}).get("cpu")) is not None:
+        free.append(max(int(limit) - _held(), 0))
     with suppress(OSError):
         for line in _MEMINFO.read_text(encoding="ascii").splitlines():
             if line.startswith("MemAvailable:"):
@@ -67,6 +136,13 @@ def require_memory(needed: Mapping[str, tuple[str, float]], remedies: Mapping[st
 def in_gigabytes(size: float) -> str:
     """Bytes as text."""
     return f"{size / 1e9:.2f} GB"
+
+
+def _held() -> int:
+    """Bytes of memory that this process holds; 0 where the system does not say."""
+    with suppress(OSError):
+        return int(_STATM.read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return 0
 
 
 def _left_in_groups() -> list[int]:

@@ -20,6 +20,7 @@ from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.soft_matter import describe_soft
 from tomo_polysplat.fit.stopping import StopReason
 from tomo_polysplat.fit.surroundings import cut_out
+from tomo_polysplat.free_memory import limit_memory, memory_limits
 from tomo_polysplat.interrupts import postponed_interrupts
 from tomo_polysplat.kernels.compile_time import compiled_seconds, working_time
 from tomo_polysplat.kernels.device import one_torch_thread, usual_modes
@@ -61,6 +62,7 @@ _VIEWS_OF_PIXELS = 16
 
 # One parameter for each option that a caller names.
 @usual_modes()
+@memory_limits()
 def reconstruct(
     projections: Any,
     proj_geom: Mapping[str, Any] | None = None,
@@ -179,6 +181,7 @@ def reconstruct(
     """
     begun = time.perf_counter()
     run_options = RunOptions.of(quality, settings, time_budget, seed, device, callbacks)
+    limit_memory(run_options.settings.memory, run_options.device.type)
     started, compiled = working_time(), compiled_seconds()
     mended: list[str] = []
     if mend and isinstance(projections, Scan) and proj_geom is None:
@@ -244,7 +247,7 @@ def _problem(
             measured.projections, proj_geom, measured.valid, measured.water_correction, spectrum
         )
         widest = options.settings.surroundings
-        problem = Problem.of(values, geometry, grid, unit, spectrum, materials, widest, on)
+        problem = Problem.of(values, geometry, grid, unit, spectrum, materials, widest, on, own=True)
         problem = filtered(problem, measured.filter_map, unit, proj_geom["type"] == "cyl_cone_vec")
     # Made wider where the object is, it may have many times the voxels.
     require_machine(0, math.prod(problem.grid.shape), energies, on)
@@ -311,13 +314,11 @@ def _result(
         number, tunables = float(gaussians.shared_material[0]), about["settings"]
         plan.note("soft_material", number, describe_soft(number, plan.soft_u, tunables["soft_gain"]))
     with torch.no_grad():
-        found = outcome.start
-        found = (
-            scene.basis(gaussians) * plan.reference
-            if found is None
-            else densities_of_start(found, plan, problem, scene.reference_curve)
-        )
-        own = cut_out(to_host(found), problem.margin)
+        if outcome.start is None:
+            own = scene.basis_on_host(gaussians, plan.reference)
+        else:
+            own = to_host(densities_of_start(outcome.start, plan, problem, scene.reference_curve))
+        own = cut_out(own, problem.margin)
         heights = gaussians.weights(scene.reference_curve).sum(dim=0)
         parts = {
             "position": gaussians.position.cpu().numpy() * length + problem.centre,

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 from tomo_polysplat.checks import did_you_mean, fail, require_choice, require_number
+from tomo_polysplat.free_memory import bytes_of
 
 __all__ = ["PRESETS", "Settings", "make_settings"]
 
@@ -68,6 +69,9 @@ class Settings:
     at least 4."""
     kernel: str = "auto"
     """"auto", "triton", "numba" or "reference"."""
+    memory: float | str | None = None
+    """What a run may hold on the device that it fits on, in bytes or as text such as "12 GB"; None: all that is free.
+    The plan stays below it: fewer Gaussians, start and projections on the host, smaller slabs. Nothing is enforced."""
 
     density_check: str = "refuse"
     """An object of a density that no matter has, as in a wrong unit of length: "refuse" it, or "warn" and go on."""
@@ -196,6 +200,8 @@ class Settings:
                 continue
             if field.name == "agent":
                 _require_changes(name, value)
+            elif field.name == "memory":
+                object.__setattr__(self, field.name, bytes_of(value, name))
             elif field.name in _CHOICES:
                 require_choice(name, value, _CHOICES[field.name])
             else:

@@ -11,6 +11,7 @@ from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.result.result import Result
+from tomo_polysplat.scan import hdf5_map
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.scan.io import load_scan
 
@@ -146,6 +147,53 @@ def test_everything_comes_back_from_a_file(tmp_path, flat):
     assert back.history == [{"seconds": 0.5, "iteration": 3, "loss": 0.25, "held_out": None}]
     assert back.counts == {"masked_rays": 4}
     np.testing.assert_array_equal([back.grid.lower, back.grid.upper], [result.grid.lower, result.grid.upper])
+
+
+@pytest.mark.parametrize("kind", ["polychromatic", "monochromatic", "flat"])
+def test_a_large_result_stays_in_its_file(tmp_path, monkeypatch, kind):
+    monkeypatch.setattr(hdf5_map, "_LARGE", 200)
+    result = polychromatic(np.linspace(0, 1, 60).reshape(GRID.shape))
+    if kind == "monochromatic":
+        result = Result(np.random.default_rng(0).random((1, *GRID.shape)), GRID, unit="pixel")
+    elif kind == "flat":
+        grid = VolumeGrid((1, 4, 5), (-1, -1, -1), (1, 1, 1))
+        result = polychromatic(basis=result.basis[:, :1], grid=grid, flipped_2d=True)
+    path = tmp_path / "result.h5"
+    result.save(path)
+    back, before = Result.load(path), path.read_bytes()
+    assert hdf5_map.is_mapped(back.basis) and hdf5_map.is_mapped(back.volume) == (kind != "flat")
+    np.testing.assert_allclose(back.volume, result.volume, rtol=1e-6)
+    np.testing.assert_array_equal(back.basis, result.basis)
+    back.basis[0, 0] = 7.0
+    back.volume[..., 0] = 9.0
+    assert path.read_bytes() == before, "the file is as it was"
+    back.save(path, overwrite=True)
+    again = Result.load(path)
+    assert (again.basis[0, 0] == 7.0).all()
+    assert kind == "flat" or (again.volume[..., 0] == 9.0).all()
+
+
+def test_a_large_result_that_was_damaged_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(hdf5_map, "_LARGE", 200)
+    path = tmp_path / "result.h5"
+    for name in ("exchange/data", "polysplat/basis"):
+        polychromatic().save(path, overwrite=True)
+        with h5py.File(path, "r+") as file:
+            file[name][..., 2, 3] = np.nan
+        with pytest.raises(ValueError, match="damaged"):
+            Result.load(path)
+
+
+def test_a_result_is_saved_slab_by_slab(tmp_path, monkeypatch):
+    whole = polychromatic(np.linspace(0, 1, 60).reshape(GRID.shape))
+    whole.save(tmp_path / "whole.h5")
+    monkeypatch.setattr("tomo_polysplat.result.result._AT_ONCE", 20)
+    parts = polychromatic(whole.material)
+    assert [values.shape for _, values in parts.slabs()] == [(1, 4, 5)] * 3
+    parts.save(tmp_path / "parts.h5")
+    assert "volume" not in parts.__dict__, "it was never made as a whole"
+    volumes = [h5py.File(tmp_path / f"{name}.h5")["exchange/data"][()] for name in ("whole", "parts")]
+    np.testing.assert_allclose(volumes[1], volumes[0], rtol=1e-6)
 
 
 def test_a_monochromatic_result_comes_back(tmp_path):

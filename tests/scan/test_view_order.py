@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tomo_polysplat.scan.geometry import Geometry
-from tomo_polysplat.scan.view_order import view_order
+from tomo_polysplat.scan.view_order import sorted_in_place, view_order
 
 COLUMNS = 5
 
@@ -55,3 +55,12 @@ def test_a_wobble_along_the_axis_is_no_helix():
     angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     geometry = scan(angles, 0.1 * np.random.default_rng(2).normal(size=24))
     assert np.array_equal(view_order(geometry, values(geometry)), np.arange(24))
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2, 3, 4], [4, 0, 1, 2, 3], [1, 0, 3, 4, 2], [0, 4, 2, 3, 1]])
+def test_views_are_sorted_in_place_as_by_a_copy(order):
+    data = np.random.default_rng(2).normal(size=(5, 2, 3))
+    expected, place = data[order], data.ctypes.data
+    sorted_in_place(data, np.array(order))
+    np.testing.assert_array_equal(data, expected)
+    assert data.ctypes.data == place

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import time
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from tomo_polysplat.cli.options import add_scan_options
@@ -19,6 +21,12 @@ SIGNS = {"ok": "ok", "defect": "MEND", "unknown": "?"}
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this subcommand."""
     add_scan_options(parser)
+    parser.add_argument(
+        "--time",
+        action="store_true",
+        help="say what recon will take on this machine: makes the start and times some steps",
+    )
+    parser.add_argument("--device", default="auto", help="with --time: auto (default), cpu, cuda or cuda:N")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -42,6 +50,8 @@ def run(arguments: argparse.Namespace) -> int:
         sum(finding.verdict == verdict for finding in findings) for verdict in ("defect", "unknown")
     )
     print(f"\n{_summary(defects, unknown)}")
+    if arguments.time:
+        print(f"\nrecon  {_expected(scan, arguments.device)}")
     return DEFECT_STATUS if defects else 0
 
 
@@ -80,3 +90,16 @@ def _summary(defects: int, unknown: int) -> str:
     if unknown:
         text += f" This scan cannot answer {unknown} of the questions; that alone is no fault."
     return text
+
+
+def _expected(scan: Scan, device: str) -> str:
+    """What a reconstruction will take, in words."""
+    from tomo_polysplat.plan.expected import only_told
+    from tomo_polysplat.reconstruction import reconstruct
+
+    # As recon asks it.
+    spectrum = None if scan.unit == "pixel" else scan.spectrum
+    begun = time.perf_counter()
+    with only_told() as found:
+        reconstruct(replace(scan, spectrum=spectrum), device=device, progress=False)
+    return found[0].describe() if found else f"{time.perf_counter() - begun:.2g} s in all: it was run"

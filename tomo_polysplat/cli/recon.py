@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -129,6 +130,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_solver_options(group)
     group.add_argument(
+        "--memory",
+        metavar="SIZE",
+        help='what the run may hold on the device, such as "12 GB" (default: all that is free)',
+    )
+    group.add_argument(
         "--checkpoint",
         metavar="FILE",
         help="keep the fit there (.npz) while it runs, to go on from with --resume",
@@ -147,6 +153,8 @@ def run(arguments: argparse.Namespace) -> int:
         scan = replace(scan, filter_map=filter_map_from(arguments.filter_map))
     require_room_of(arguments, scan)
     print(scan)
+    # What a run will take is said without -v as well.
+    logging.getLogger("tomo_polysplat.plan.expected").setLevel(logging.INFO)
     with progress_reports(None) as progress:
         result = tomo_polysplat.reconstruct(
             replace(scan, spectrum=spectrum),
@@ -160,7 +168,7 @@ def run(arguments: argparse.Namespace) -> int:
             soft_density=arguments.soft_density,
             mend=not arguments.no_mend,
             progress=progress,
-            settings=dict(_setting(text) for text in arguments.set) or None,
+            settings=_settings(arguments) or None,
             checkpoint=arguments.checkpoint,
             resume=arguments.resume,
         )
@@ -195,6 +203,12 @@ def _spectrum_of(scan: Scan, arguments: argparse.Namespace) -> Spectrum | None:
             raise fail("--energy", "a spectrum, from the file or from --kvp", "none")
         require_energy_of("--energy", arguments.energy, spectrum)
     return spectrum
+
+
+def _settings(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Single settings by name."""
+    memory = {} if arguments.memory is None else {"memory": arguments.memory}
+    return dict(_setting(text) for text in arguments.set) | memory
 
 
 def _setting(text: str) -> tuple[str, Any]:

@@ -8,7 +8,7 @@ import math
 import torch
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.free_memory import available_memory, in_gigabytes, require_memory
+from tomo_polysplat.free_memory import available_memory, free_bytes, in_gigabytes, require_memory
 from tomo_polysplat.kernels.portions import FEW_VIEWS, MANY, views_at_once
 
 __all__ = [
@@ -18,6 +18,10 @@ __all__ = [
     "require_machine",
     "require_room",
     "room_for_gaussians",
+    "start_bytes",
+    "start_stays",
+    "step_bytes",
+    "voxels_at_once",
 ]
 
 logger = logging.getLogger(__name__)
@@ -29,27 +33,45 @@ _GAUSSIAN, _FOOTPRINT = 640, 144
 _RUNS = 2
 # Bytes a pixel of a step takes: image and gradient of four channels, projections and their slopes.
 _PIXEL = 48
-# Bytes a voxel takes, the most at once: while seeds are chosen and when the volumes are made; and the samples
-# of thin Gaussians (render.renderer).
-_VOXEL, _SAMPLES = 110, 12 << 25
+# Bytes a voxel takes at once, by torch's own count on 40^3 to 64^3 (tests/fit/test_counted_memory.py): while a start is
+# looked at and seeded; in a step, with the smoothing, on the CPU and by the kernels of a GPU, which hold the volume and
+# its slope; while a volume is made of three curves and metal. And the samples of thin Gaussians (render.renderer).
+_SEEDED, _SMOOTHED, _MADE, _SAMPLES = 40, {"cpu": 58, "cuda": 12}, 64, 12 << 25
+# Voxels of a start around which windows are looked at together (model.seed_samples), and bytes of one on top.
+_WINDOW, _WINDOWED = 1 << 25, 22
+# Voxels that are made at once at most: a larger volume is no faster in one piece.
+_LARGEST_SLAB = 1 << 26
 # Copies of the projections that the first reconstruction makes: water equivalents, the filtered ones, ASTRA's.
 _COPIES = 4
-# Bytes of the host that a ray takes, and an energy, whose ray is traced through so many paths and kept three times
-# (peaks of runs of 1e7 rays and of 3000 and 12 000 energies); and a voxel of a volume that is made on a GPU.
-_RAY, _ENERGY, _VOXEL_OF_RESULT = 30, 3 * 8 * 2048, 24
+# Bytes of the host that a ray takes: as measured, in the fit's order, and whether it is good; on a CPU also what the
+# start makes of it (peaks of runs of 1e7 rays). An energy, whose ray is traced through so many paths and kept three
+# times (runs of 3000 and 12 000 energies); and a voxel of a result.
+_RAY, _ENERGY, _RESULT = {"cpu": 30, "cuda": 14}, 3 * 8 * 2048, 24
 # Of what is free: the rest is the driver's, other programs', and lost between blocks.
 _SHARE = 0.9
 
 
-def free_bytes(device: torch.device) -> int:
-    """Memory of a CUDA device that torch can still hand out."""
-    unused = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    return torch.cuda.mem_get_info(device)[0] + unused
+def voxels_at_once(device: torch.device) -> int:
+    """Voxels of a slab for which there is room while a volume is made, at least one."""
+    free = available_memory() if device.type == "cpu" else free_bytes(device)
+    if free is None:
+        return _LARGEST_SLAB
+    return min(max(int(0.5 * _SHARE * free / _MADE), 1), _LARGEST_SLAB)
 
 
 def projections_stay(size: int, device: torch.device) -> bool:
     """Whether projections of ``size`` bytes fit on the device, with what is made of them at the start."""
     return device.type == "cpu" or _COPIES * size <= _SHARE * free_bytes(device)
+
+
+def start_stays(voxels: int, device: torch.device) -> bool:
+    """Whether a start of so many voxels is looked at and seeded on the device, or on the host for want of room."""
+    return device.type == "cpu" or start_bytes(voxels) <= _SHARE * free_bytes(device)
+
+
+def start_bytes(voxels: int) -> int:
+    """Bytes that a start of so many voxels takes while it is looked at and seeded."""
+    return voxels * _SEEDED + min(voxels, _WINDOW) * _WINDOWED
 
 
 def require_machine(rays: int, voxels: int, energies: int, device: torch.device) -> None:
@@ -71,18 +93,33 @@ def require_machine(rays: int, voxels: int, energies: int, device: torch.device)
         "vol_geom": "take fewer or larger voxels, or a smaller window of the object",
         "spectrum": "rebin the spectrum: some hundreds of energies are as good",
     }
-    a_voxel = _VOXEL if device.type == "cpu" else _VOXEL_OF_RESULT
+    # A GPU that has no room for the projections leaves them, and what the start makes of them, to the host.
+    a_ray = _RAY["cuda" if device.type == "cuda" and projections_stay(4 * rays, device) else "cpu"]
+    a_voxel = _SMOOTHED["cpu"] if device.type == "cpu" else _RESULT
+    of_voxels = voxels * a_voxel
+    if not start_stays(voxels, device):
+        of_voxels = max(of_voxels, start_bytes(voxels))
     needed = {
-        "projections": (f"{rays} rays", float(rays * _RAY)),
-        "vol_geom": (f"{voxels} voxels", float(voxels * a_voxel)),
+        "projections": (f"{rays} rays", float(rays * a_ray)),
+        "vol_geom": (f"{voxels} voxels", float(of_voxels)),
         "spectrum": (f"{energies} energies", float(energies * _ENERGY)),
     }
     require_memory(needed, remedies)
-    if device.type == "cuda" and voxels * _VOXEL > _SHARE * free_bytes(device):
+    smoothed = voxels * _SMOOTHED["cuda"]
+    if device.type == "cuda" and smoothed > _SHARE * free_bytes(device):
         expected = f"voxels that fit into the {in_gigabytes(free_bytes(device))} free on {device}"
-        got = f"{voxels} voxels, about {in_gigabytes(voxels * _VOXEL)}"
+        got = f"{voxels} voxels, about {in_gigabytes(smoothed)}"
         remedy = f"{remedies['vol_geom']}, or device='cpu'"
         raise fail("vol_geom", expected, got, remedy, MemoryError)
+
+
+def step_bytes(
+    device: torch.device, *, gaussians: int, views: int, pixels: int, voxels: int
+) -> dict[str, int]:
+    """Bytes that the steps of a fit take on a device, by what takes them; parameters as for `require_room`."""
+    # A CPU holds the footprints of all views of a step.
+    of_a_gaussian = _of_a_gaussian(views if device.type == "cpu" else views_at_once(views, gaussians))
+    return {"Gaussians": gaussians * of_a_gaussian} | _of_all(views, pixels, voxels, device)
 
 
 def require_room(
@@ -106,9 +143,7 @@ def require_room(
     MemoryError
         If the host has too little memory left for the Gaussians of a fit on a CPU.
     """
-    # A CPU holds the footprints of all views of a step.
-    of_a_gaussian = _of_a_gaussian(views if device.type == "cpu" else views_at_once(views, gaussians))
-    parts = {"Gaussians": gaussians * of_a_gaussian} | _of_all(views, pixels, voxels)
+    parts = step_bytes(device, gaussians=gaussians, views=views, pixels=pixels, voxels=voxels)
     need = sum(parts.values())
     words = ", ".join(f"{name} {in_gigabytes(size)}" for name, size in parts.items())
     words = f"about {in_gigabytes(need)} ({words})"
@@ -142,7 +177,7 @@ def room_for_gaussians(device: torch.device, *, views: int, pixels: int, voxels:
     free = available_memory() if device.type == "cpu" else free_bytes(device)
     if free is None:
         return math.inf
-    left = max(_SHARE * free - sum(_of_all(views, pixels, voxels).values()), 0.0)
+    left = max(_SHARE * free - sum(_of_all(views, pixels, voxels, device).values()), 0.0)
     few = left / _of_a_gaussian(views)
     if few < MANY or device.type == "cpu":
         return few
@@ -160,9 +195,9 @@ def _of_a_gaussian(views: int) -> int:
     return _GAUSSIAN + _FOOTPRINT * views
 
 
-def _of_all(views: int, pixels: int, voxels: int) -> dict[str, int]:
+def _of_all(views: int, pixels: int, voxels: int, device: torch.device) -> dict[str, int]:
     """Bytes that a fit takes whatever the number of Gaussians."""
     return {
         "images of a step": views * pixels * _PIXEL,
-        "volumes": voxels * _VOXEL + min(_SAMPLES, 27 * 12 * voxels),
+        "volumes": voxels * _SMOOTHED[device.type] + min(_SAMPLES, 27 * 12 * voxels),
     }

@@ -205,6 +205,8 @@ class Course:
         Is told early on what a deadline has room for.
     tick : callable or None
         Is told the share that is done, also within a pass.
+    timed : callable or None
+        Is told once, early on, the seconds of a step.
     """
 
     views_per_step: int
@@ -217,6 +219,7 @@ class Course:
     between: Between | None = None
     pace: Pace | None = None
     tick: Tick | None = None
+    timed: Callable[[Clock, float], Any] | None = None
 
 
 def fit(
@@ -241,7 +244,7 @@ def fit(
     run = _Keeper(
         Fitter(gaussians, spacing, rays, scene, settings, Batches(batch, steps, course.rng)),
         # From now on: what compiling or recording the step took is no part of the run that the learning rates follow.
-        clock := Clock(steps, course.deadline, course.pace, course.tick),
+        clock := Clock(steps, course.deadline, course.pace, course.tick, course.timed),
         outcome=outcome,
         watch=watch,
         started=course.started,

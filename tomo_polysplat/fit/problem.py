@@ -25,7 +25,7 @@ from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.scan.noise import photons_per_ray
 from tomo_polysplat.scan.snapped import snapped_geometry, snapped_grid
-from tomo_polysplat.scan.view_order import view_order
+from tomo_polysplat.scan.view_order import sorted_in_place, view_order
 from tomo_polysplat.start.agreement import halves_agree
 from tomo_polysplat.transfer import to_device
 from tomo_polysplat.units import LENGTH_UNITS, cm_per
@@ -116,10 +116,12 @@ class Problem:
         materials: Materials | Sequence[Any] | None,
         surroundings: float = 0.0,
         device: torch.device = _HOST,
+        own: bool = False,
     ) -> Problem:
         """The problem of a scan in the caller's unit, its views sorted; one energy makes it monochromatic.
 
-        The grid may be wider by as much as the share ``surroundings`` on every side, which a ``device`` finds out.
+        The grid may be wider by as much as the share ``surroundings`` on every side, which a ``device`` finds out. The
+        projections of a caller who gives them up (``own``) are sorted in place.
         """
         require_choice("unit", unit, LENGTH_UNITS)
         if spectrum is not None and spectrum.is_monochromatic:
@@ -135,8 +137,11 @@ class Problem:
         outside = snapped_geometry(geometry.normalised(grid.centre, length))
         order = view_order(outside, projections)
         mixed = bool((np.diff(order) != 1).any())
-        if mixed:
-            projections, outside = projections[order], outside.select(order)
+        if mixed and own:
+            sorted_in_place(projections, order)
+        elif mixed:
+            projections = projections[order]
+        outside = outside.select(order) if mixed else outside
         return cls(
             projections, outside, inside, grid.centre, length, depth, planar, spectrum, curves,
             margin=margin, surroundings=why, order=order if mixed else None,
@@ -243,12 +248,14 @@ class Problem:
     def agreement(self, bodies: Sequence[torch.Tensor]) -> list[float | None]:
         """How much of what varies in bodies of voxels is the object's, told once a scan; see ``start.agreement``."""
         if self._known.agreement is None:
-            values = self._copied(bodies[0].device)
+            # Of a start that a GPU has no room for the bodies are on the host.
+            device = next((one for one in self._known.copies if one.type == "cuda"), bodies[0].device)
+            values = self._copied(device)
             try:
-                self._known.agreement = halves_agree(values, self.geometry, self.grid, bodies)
+                self._known.agreement = halves_agree(values, self.geometry, self.grid, bodies, device)
             except RuntimeError as problem:
                 # Torch's or ASTRA's, of a GPU that has no room for two more volumes.
-                if not values.is_cuda:
+                if device.type != "cuda":
                     raise
                 logger.warning("Texture is not told from noise: %s", problem)
                 self._known.agreement = [None] * len(bodies)

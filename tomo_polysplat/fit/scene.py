@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from tomo_polysplat.fit.slabs import on_host
 from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model.gaussians import Gaussians
@@ -16,7 +17,7 @@ from tomo_polysplat.physics.detector_blur import blurred
 from tomo_polysplat.physics.pixel_light import averaged_light
 from tomo_polysplat.physics.quadrature import Quadrature
 from tomo_polysplat.physics.transmission import polychromatic_projection
-from tomo_polysplat.render.metal_edges import tail_factors, tails
+from tomo_polysplat.render.metal_edges import HALO, tail_factors, tails
 from tomo_polysplat.render.renderer import project_gaussians, voxelise_gaussians, voxelise_means
 from tomo_polysplat.transfer import to_host
 
@@ -148,6 +149,31 @@ class FitScene:
     def basis(self, gaussians: Gaussians) -> torch.Tensor:
         """(channels, nz, ny, nx) densities of the curves in soft references, means over the voxels."""
         return self._means(gaussians, gaussians.weights(self.reference_curve))
+
+    def volume_on_host(self, gaussians: Gaussians, factor: float, most: int | None = None) -> np.ndarray:
+        """`volume` times a factor, made by slabs (`fit.slabs`), of ``most`` voxels or what there is room for."""
+        return self._by_slabs(gaussians, lambda part: part.volume(gaussians)[None] * factor, 1, most)[0]
+
+    def basis_on_host(self, gaussians: Gaussians, factor: float, most: int | None = None) -> np.ndarray:
+        """`basis` times a factor, likewise."""
+        channels = 1 if self.reference_curve is None else len(self.reference_curve)
+        return self._by_slabs(gaussians, lambda part: part.basis(gaussians) * factor, channels, most)
+
+    def _by_slabs(
+        self,
+        gaussians: Gaussians,
+        made: Callable[[FitScene], torch.Tensor],
+        channels: int,
+        most: int | None,
+    ) -> np.ndarray:
+        def make(first: int, last: int) -> torch.Tensor:
+            size = (last - first, *self.box.shape[1:])
+            return made(replace(self, box=self.box.part((first, 0, 0), size)))
+
+        # Without metal a voxel depends on no other one.
+        halo = HALO if bool((gaussians.group > 0).any()) else 0
+        place = gaussians.position.device
+        return on_host(make, channels, self.box.shape, place, halo=halo, most=most)
 
     @torch.no_grad()
     def seconds_of_basis(self, gaussians: Gaussians) -> float:

@@ -43,6 +43,8 @@ _IMPROVEMENT = 2e-3
 _PATIENCE, _LEAST_PATIENCE = 0.4, 4
 # Between the ends of these steps a run's pace is measured; what the first one waits for is not the pace.
 _PACED = (1, 4)
+# Seconds, or the share of a run, over which a step is timed, and in whole numbers of so many: some smooth, some do not.
+_TIMED, _SHARE_TIMED, _ALIKE = 1.0, 0.1, 4
 
 
 class StopReason(str, Enum):
@@ -118,11 +120,17 @@ class Clock:
     """How much of a run is done: of its steps or of its time, whichever ends first."""
 
     def __init__(
-        self, steps: int, deadline: float | None, tell: Pace | None = None, tick: Tick | None = None
+        self,
+        steps: int,
+        deadline: float | None,
+        tell: Pace | None = None,
+        tick: Tick | None = None,
+        timed: Callable[[Clock, float], Any] | None = None,
     ) -> None:
         self.steps, self.deadline, self.begun, self.done = steps, deadline, working_time(), 0
         self._tell, self._settled = tell, self.begun
         self._tick, self._ticked = tick, self.begun
+        self._timed, self._since = timed, (0, self.begun)
 
     @property
     def late(self) -> bool:
@@ -154,6 +162,7 @@ class Clock:
 
         ``settle`` waits until the steps that were asked for are done: a GPU makes them later.
         """
+        self._time_some(settle)
         first, last = _PACED
         if self._tell is None or self.deadline is None or self.done not in _PACED:
             return
@@ -172,6 +181,23 @@ class Clock:
             return
         self._ticked = now
         self._tick(self.share())
+
+    def _time_some(self, settle: Callable[[], Any]) -> None:
+        """Tell once, early on, how long a step takes."""
+        if self._timed is None:
+            return
+        since, then = self._since
+        made = self.done - since
+        if since and (made % _ALIKE or made == 0):
+            return
+        if since and working_time() - then < _TIMED and made < _SHARE_TIMED * self.steps:
+            return
+        settle()
+        if since:
+            timed, self._timed = self._timed, None
+            timed(self, (working_time() - then) / made)
+        # What the first step waits for is no pace.
+        self._since = self.done, working_time()
 
     def allows(self, slower: float) -> bool:
         """Whether the steps left, slower than those so far by this factor, would end before the deadline."""

@@ -17,7 +17,7 @@ from tomo_polysplat.kernels.spatial_order import spatial_order
 from tomo_polysplat.model.bone_numbers import start_numbers
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.model.seed_edges import edge_shapes
-from tomo_polysplat.model.seed_samples import box_mean, reaches, voxel_of
+from tomo_polysplat.model.seed_samples import box_mean, largest_around, reaches, voxel_of
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.settings import Settings
 
@@ -111,7 +111,7 @@ def _metal(start: torch.Tensor, settings: Settings) -> torch.Tensor:
     if not settings.metal_rim:
         return core
     box, pieces, _ = _pieces(core | (start > settings.metal_rim))
-    labels = torch.from_numpy(pieces.astype(np.int64)).to(start.device)
+    labels = torch.from_numpy(pieces).to(start.device)
     touched = labels[core[box]].unique()
     metal = torch.zeros_like(core)
     metal[box] = torch.isin(labels, touched[touched > 0])
@@ -181,20 +181,12 @@ def _varied(
     half[3 - dims :] = np.maximum(np.round(0.5 * step / grid.voxel_size[:dims]).astype(int), 1)[::-1]
     mean = box_mean(start.clamp(0.0, settings.tv_clip), half)
     reach = [int(n) if size > 1 else 0 for n, size in zip(half, start.shape)]
-    spread = (_largest_around(mean, reach) + _largest_around(-mean, reach))[voxel_of(points, grid)]
+    voxels = voxel_of(points, grid)
+    highest, lowest = (largest_around(side, reach)[voxels] for side in (mean, -mean))
+    spread = highest + lowest
     chosen = torch.zeros_like(supported)
     chosen[spread.masked_fill(~supported, -1.0).topk(min(most, len(points))).indices] = True
     return chosen & supported
-
-
-def _largest_around(volume: torch.Tensor, reach: list[int]) -> torch.Tensor:
-    """The largest value within ``reach`` voxels along each axis."""
-    for axis, n in enumerate(reach):
-        window, margins = [1, 1, 1], [0] * 6
-        window[axis], margins[4 - 2 * axis], margins[5 - 2 * axis] = 2 * n + 1, n, n
-        padded = torch.nn.functional.pad(volume[None, None], margins, mode="replicate")
-        volume = torch.nn.functional.max_pool3d(padded, window, stride=1)[0, 0]
-    return volume
 
 
 def _lattice(
@@ -216,7 +208,7 @@ def _sample(
     cells = np.ones(3, int)
     cells[3 - len(cell) :] = np.maximum(np.round(cell / grid.voxel_size[: len(cell)]).astype(int), 1)[::-1]
     mean, index = box_mean(start, cells), voxel_of(points, grid)
-    return mean[index].double(), _largest_around(mean, [1, 1, 1])[index]
+    return mean[index].double(), largest_around(mean, [1, 1, 1])[index]
 
 
 def _split(points: torch.Tensor, step: np.ndarray, times: int) -> torch.Tensor:
@@ -246,8 +238,8 @@ def _materials(
     own = start_numbers(value, settings)
     group[reaches(start, points, grid, settings.bone_level, reach)] = -1
     box, pieces, number = _pieces(_metal(start, settings))
-    labels = torch.zeros(start.shape, dtype=torch.int64, device=start.device)
-    labels[box] = torch.from_numpy(pieces.astype(np.int64)).to(start.device)
-    piece = labels[voxel_of(points, grid)]
+    labels = torch.zeros(start.shape, dtype=torch.int32, device=start.device)
+    labels[box] = torch.from_numpy(pieces).to(start.device)
+    piece = labels[voxel_of(points, grid)].long()
     group = torch.where(piece > 0, piece, group)
     return own, value.new_tensor([settings.soft_u, *[settings.metal_u] * number]), group

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.memory import most_gaussians, require_room, room_for_gaussians
+from tomo_polysplat.fit.memory import most_gaussians, require_room, room_for_gaussians, start_stays
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.model.seed import Spacing, seed_gaussians
@@ -51,14 +51,16 @@ def first_gaussians(
     finest = math.inf if settings.seed_spacing else finest_spacing(problem)[0] * problem.voxel
     finest = 0.0 if plan.sharp else finest
     several = plan.curves > 1
+    stays = start_stays(math.prod(relative.shape), device)
     gaussians = seed_gaussians(
-        torch.as_tensor(relative).to(device),
+        torch.as_tensor(relative).to(device if stays else "cpu"),
         problem.grid,
         Spacing(spacing, plan.finer, finest),
         plan.adapted(settings),
         several,
         problem.planar,
     )
+    gaussians = gaussians if stays else gaussians.to(device)
     free = int((gaussians.group < 0).sum())
     kinds = "none with a material number of its own"
     if several:

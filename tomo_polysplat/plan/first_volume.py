@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from tomo_polysplat.fit.memory import start_stays
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.physics.water import areal_density, transmitted_energy
@@ -22,22 +23,30 @@ def first_volume(problem: Problem, device: torch.device, settings: Settings) -> 
     """A volume (nz, ny, nx) by classical means, and how it was made.
 
     Under a spectrum it is an attenuation in that of the first material of 1 g/cm3, else one per unit of length; either
-    times ``problem.depth``. Rays through what shows as metal are bridged where that helps.
+    times ``problem.depth``. Rays through what shows as metal are bridged where that helps. It is on the host where the
+    device has no room for what looks at it.
     """
     primary = problem.primary(device)
     values = _as_if_soft(problem, primary)
-    volume, done = initial_volume_on(values, problem.geometry, problem.grid)
-    reference = soft_reference(volume, problem, settings)
+    volume, done = initial_volume_on(values, problem.geometry, problem.grid, device)
+    reference = soft_reference(_looked_at(volume, device), problem, settings)
     problem.remember_solid(reference.value != reference.first)
     for _ in range(_TIMES if problem.solid else 0):
         values = _as_if_solid(problem, primary, reference.number)
-        volume, done = initial_volume_on(values, problem.geometry, problem.grid)
-        reference = soft_reference(volume, problem, settings, problem.solid)
+        volume, done = initial_volume_on(values, problem.geometry, problem.grid, device)
+        reference = soft_reference(_looked_at(volume, device), problem, settings, problem.solid)
     metal = reference.adapted(settings).metal_level * problem.depth * reference.value
+    if not values.is_cuda:
+        volume = volume.cpu()
     volume, bridged = bridged_start(
         values, volume, done["method"], problem.geometry, problem.grid, metal=metal
     )
-    return volume, f"{done['method'].upper()}: {done['reason']}{bridged}"
+    return _looked_at(volume, device), f"{done['method'].upper()}: {done['reason']}{bridged}"
+
+
+def _looked_at(volume: torch.Tensor, device: torch.device) -> torch.Tensor:
+    """The volume where there is room for what looks at it: on the host if need be."""
+    return volume if start_stays(volume.numel(), device) else volume.cpu()
 
 
 def _as_if_soft(problem: Problem, primary: torch.Tensor) -> torch.Tensor:

@@ -102,4 +102,7 @@ def all_curves(problem: Problem, basis: np.ndarray, plan: Plan, dense: float) ->
         words += f"; settings={{'bone_level': {0.7 * dense:.2g}}} would free material numbers there"
         plan.note("dense_matter", found, words)
         logger.warning("One curve may be too few: %s.", words)
-    return np.concatenate([basis, np.zeros((2, *basis.shape[1:]), np.float32)])
+    # What is never written to takes no memory.
+    curves = np.zeros((3, *basis.shape[1:]), np.float32)
+    curves[0] = basis[0]
+    return curves

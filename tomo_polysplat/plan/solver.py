@@ -13,7 +13,7 @@ import torch
 from tomo_polysplat.fit.optimise import Course, FitOutcome, Run, fit
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.fit.stopping import FitState, Stop, StopReason
+from tomo_polysplat.fit.stopping import Clock, FitState, Stop, StopReason
 from tomo_polysplat.fit.surroundings import cut_out
 from tomo_polysplat.kernels.compile_time import working_time
 from tomo_polysplat.model.gaussians import Gaussians
@@ -22,13 +22,13 @@ from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.calibration import Calibration
 from tomo_polysplat.plan.checkpoint import Checkpoint
 from tomo_polysplat.plan.decision import When
+from tomo_polysplat.plan.expected import expected, tell
 from tomo_polysplat.plan.first_volume import first_volume
 from tomo_polysplat.plan.lab import Lab
 from tomo_polysplat.plan.never_worse import judge, note_seeds
 from tomo_polysplat.plan.order import ask_between, decide
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.preparation import PreparedFit, RunOptions, calibrate, physics, prepare, under
-from tomo_polysplat.transfer import to_host
 
 __all__ = ["Solver"]
 
@@ -162,9 +162,18 @@ class Solver:
             between=self._questions(prepared, problem, ask_scatter),
             pace=lambda room, lacking: self._tell_pace(plan, room, lacking),
             tick=told.tick,
+            timed=lambda clock, a_step: self._tell_expected(prepared, clock, a_step),
         )
         settings = replace(settings, passes=plan.passes)
         return fit(prepared.gaussians, plan.spacing * problem.voxel, prepared.rays, scene, settings, course)
+
+    def _tell_expected(self, prepared: PreparedFit, clock: Clock, a_step: float) -> None:
+        """Say what the run will take, once some steps have been timed."""
+        plan, so_far = prepared.plan, working_time() - self.started
+        growth = plan.answers["growth"].value if "growth" in plan.answers else 1.0
+        memory = plan.facts["memory"].why if "memory" in plan.facts else ""
+        parts = clock.steps, clock.done, a_step, so_far, float(growth), f"memory {memory}"
+        tell(expected(*parts), self.run_options.time_budget)
 
     def _tell_pace(self, plan: Plan, room: float, lacking: float) -> None:
         """Say for how much of the run the time budget has room, at its beginning."""
@@ -229,7 +238,7 @@ def _volume_of(
 
     def volume(gaussians: Gaussians) -> np.ndarray:
         with torch.no_grad():
-            whole = cut_out(to_host(scene.volume(gaussians) * factor), problem.margin)
+            whole = cut_out(scene.volume_on_host(gaussians, factor), problem.margin)
         return np.ascontiguousarray(whole[0, ::-1]) if flipped else whole
 
     return volume

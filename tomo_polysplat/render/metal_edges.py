@@ -10,7 +10,7 @@ from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.render.renderer import voxelise_peaks
 
-__all__ = ["tail_factors", "tails"]
+__all__ = ["HALO", "tail_factors", "tails"]
 
 # The level of metal near a voxel is the largest metal within this many voxels: the next ones may all be at a surface.
 _AROUND = 2
@@ -19,6 +19,8 @@ _AROUND = 2
 _ALL, _NONE = 0.9, 1.2
 # A voxel with less metal than this share of its other matter is clean: it shows what lies beside the metal.
 _CLEAN = 0.02
+# Voxels to every side on which a voxel's factor depends: metal around metal that owns tails, next to it.
+HALO = _AROUND + 3
 
 
 def tails(

@@ -39,6 +39,8 @@ from tomo_polysplat.scan.hdf5 import (
     text_attribute,
     write_spectrum,
 )
+from tomo_polysplat.scan.hdf5_links import member
+from tomo_polysplat.scan.hdf5_map import is_mapped, mapped, read_or_map
 from tomo_polysplat.scan.hdf5_writer import new_hdf5
 from tomo_polysplat.units import LENGTH_UNITS
 
@@ -83,12 +85,13 @@ def write_json(path: str | os.PathLike, content: Any, *, overwrite: bool) -> Non
 
 def save_hdf5(result: Result, path: str | os.PathLike, *, overwrite: bool = False) -> None:
     """See :meth:`Result.save`."""
-    volume = result.volume_zyx
-    arrays = [result.basis, volume, *result.gaussians.values()]
+    arrays = [result.basis, result.basis[0], *result.gaussians.values()]
     needed = sum(np.asarray(array).nbytes for array in arrays)
     with new_hdf5(path, overwrite=overwrite, needed_bytes=needed) as file:
         file["implements"] = "exchange:polysplat"
-        data = file.create_dataset("exchange/data", data=volume)
+        data = file.create_dataset("exchange/data", result.grid.shape, np.float32)
+        for slices, values in result.slabs():
+            data[slices] = values
         size = result.grid.voxel_size
         data.attrs.update(
             description="attenuation",
@@ -134,13 +137,13 @@ def load_hdf5(path: str | os.PathLike) -> Result:
             raise fail("path", "a file written by Result.save", got, remedy)
         if (version := number_attribute(group, "format")) != FORMAT:
             raise fail("path", f"a file of format {FORMAT}", f"format {version:g}", "update tomo-polysplat")
-        basis = read_numbers(group, "basis")
+        basis = read_or_map(group, "basis")
         if basis.ndim != 4:
             raise fail("/polysplat/basis", "shape (channels, z, y, x)", f"{basis.shape}")
         materials = _read_materials(group)
         limit = _LARGEST if materials is None else _DENSEST
         _require_range("basis", basis, -limit, limit)
-        return Result(
+        result = Result(
             basis=basis,
             grid=VolumeGrid(basis.shape[1:], read_attribute(group, "lower"), read_attribute(group, "upper")),
             unit=require_choice("unit in the file", text_attribute(group, "unit"), LENGTH_UNITS),
@@ -155,6 +158,20 @@ def load_hdf5(path: str | os.PathLike) -> Result:
             flipped_2d=bool(number_attribute(group, "flipped_2d")),
             residuals=read_residuals(group),
         )
+        _take_volume(result, file)
+    return result
+
+
+def _take_volume(result: Result, file: Any) -> None:
+    """Map the volume of a result whose densities are mapped, instead of making it of these in memory."""
+    if not is_mapped(result.basis) or result.flipped_2d:
+        return
+    volume = mapped(file, "exchange/data")
+    if volume is not None and volume.shape == result.grid.shape:
+        energy = number_attribute(member(file, "exchange/data"), "energy_kev")
+        if energy == result.energy_kev:
+            _require_range("volume", volume, -_LARGEST, _LARGEST)
+            result.__dict__["volume"] = volume
 
 
 def _read_gaussians(group: Any, planar: bool) -> dict[str, np.ndarray]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Result"]
 
+# Voxels of a slab.
+_AT_ONCE = 1 << 24
 GAUSSIAN_PARTS = {"position": (3,), "scale": (3,), "rotation": (4,), "density": (), "u": ()}
 
 
@@ -120,6 +123,18 @@ class Result:
             return self._public(self.basis[0].copy())
         return self._public(self._attenuation(self.energy_kev))
 
+    def slabs(self) -> Iterator[tuple[slice, np.ndarray]]:
+        """Slices, and :attr:`volume_zyx` there, one slab after another: all of it without all of it in memory."""
+        depth = max(1, _AT_ONCE // max(math.prod(self.grid.shape[1:]), 1))
+        for first in range(0, self.grid.shape[0], depth):
+            some = slice(first, min(first + depth, self.grid.shape[0]))
+            if "volume" in self.__dict__:
+                yield some, self.volume_zyx[some]
+            elif self.materials is None:
+                yield some, self.basis[0, some]
+            else:
+                yield some, self._attenuation(self.energy_kev, some)
+
     @cached_property
     def coverage(self) -> np.ndarray:
         """Share of the views that see each voxel, float32 from 0 to 1, shaped like :attr:`volume`.
@@ -187,10 +202,11 @@ class Result:
         u = np.divide(dense_share, density, out=np.zeros_like(density), where=present)
         return self._public(np.clip(u, 0, 1, out=u))
 
-    def _attenuation(self, kev: float | None) -> np.ndarray:
+    def _attenuation(self, kev: float | None, some: slice = slice(None)) -> np.ndarray:
+        """(z, y, x) attenuation in some slices."""
         assert self.materials is not None and kev is not None
         curves = self.materials.mass_attenuation([kev])[:, 0] * cm_per(self.unit)
-        return np.tensordot(curves.astype(np.float32), self.basis, axes=1)
+        return np.tensordot(curves.astype(np.float32), self.basis[:, some], axes=1)
 
     def _require_materials(self, name: str) -> None:
         if self.materials is None:
@@ -250,6 +266,9 @@ class Result:
     @classmethod
     def load(cls, path: str | os.PathLike) -> Result:
         """Read what :meth:`save` wrote. Nothing is unpickled, and declared sizes are checked first.
+
+        Of a large result (from 1 GiB) the densities and :attr:`volume` stay in the file, and are read where they are
+        looked at; what is written to them does not change the file.
 
         Parameters
         ----------

@@ -12,7 +12,7 @@ from tomo_polysplat.checks import fail, require_array, require_shape
 from tomo_polysplat.parallel import run_tasks, split_range
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.water_correction import undo_water_correction
-from tomo_polysplat.scan.geometry import projections_from_astra
+from tomo_polysplat.scan.geometry import is_planar_geometry, projections_from_astra
 from tomo_polysplat.scan.line_integrals import require_line_integrals
 from tomo_polysplat.scan.noise import photons_per_ray
 from tomo_polysplat.scan.opaque import fill_opaque
@@ -82,12 +82,15 @@ def usable_rays(
 
 
 def _marked(valid: Any, shape: tuple[int, ...], proj_geom: Mapping[str, Any]) -> np.ndarray:
-    """Rays (views, rows, columns) that a mask says are not to be used."""
+    """(views, rows, columns) True for rays that are not to be used, of a mask in the order of the projections."""
     mask = require_array("valid", valid)
     require_shape("valid", mask, shape, "of the projections")
-    # A curved detector is resampled: a ray that uses any invalid pixel is invalid, too.
-    whole = (mask > 0.5).astype(np.float32)
-    return ~(projections_from_astra(whole, proj_geom) >= 1)
+    usable = mask > 0.5
+    if proj_geom.get("type") == "cyl_cone_vec":
+        # A curved detector is resampled: a ray that uses any invalid pixel is invalid, too.
+        return ~(projections_from_astra(usable.astype(np.float32), proj_geom) >= 1)
+    ordered = usable[:, None] if is_planar_geometry(proj_geom) else usable.swapaxes(0, 1)
+    return np.logical_not(ordered, out=np.empty(ordered.shape, bool))
 
 
 def _on_host(values: Any) -> Any:

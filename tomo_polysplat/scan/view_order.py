@@ -6,7 +6,7 @@ import numpy as np
 
 from tomo_polysplat.scan.view_geometry import Geometry
 
-__all__ = ["view_order"]
+__all__ = ["sorted_in_place", "view_order"]
 
 
 def view_order(geometry: Geometry, projections: np.ndarray) -> np.ndarray:
@@ -36,3 +36,18 @@ def view_order(geometry: Geometry, projections: np.ndarray) -> np.ndarray:
     for view in order[np.append(same, False) | np.insert(same, 0, False)]:
         sums[view] = np.nansum(projections[view], dtype=np.float64)
     return np.lexsort([sums, *keys])
+
+
+def sorted_in_place(projections: np.ndarray, order: np.ndarray) -> None:
+    """Put the views of (views, ...) projections in an order, with room for one view more."""
+    done = np.arange(len(order)) == order
+    for start in range(len(order)):
+        if done[start]:
+            continue
+        first, at = projections[start].copy(), start
+        while order[at] != start:
+            projections[at] = projections[order[at]]
+            done[at] = True
+            at = order[at]
+        projections[at] = first
+        done[at] = True

@@ -27,7 +27,11 @@ _MOST_ADDITIONS = 5e9
 
 
 def halves_agree(
-    projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid, bodies: Sequence[torch.Tensor]
+    projections: torch.Tensor,
+    geometry: Geometry,
+    grid: VolumeGrid,
+    bodies: Sequence[torch.Tensor],
+    device: torch.device | None = None,
 ) -> list[float | None]:
     """Mean over pairs of neighbouring voxels of whether two half scans see the same one as the denser.
 
@@ -43,6 +47,8 @@ def halves_agree(
     geometry, grid : Geometry, VolumeGrid
     bodies : sequence of (nz, ny, nx) bool tensors
         Voxels of a kind of matter each.
+    device : torch.device, optional
+        Where the volumes are made; where the projections are by default.
 
     Returns
     -------
@@ -56,7 +62,7 @@ def halves_agree(
         return nothing
     halves = []
     for half in (0, 1):
-        volume = _half(projections, geometry, grid, np.flatnonzero(places % 2 == half))
+        volume = _half(projections, geometry, grid, np.flatnonzero(places % 2 == half), device)
         if volume is None:
             return nothing
         halves.append(volume.to(bodies[0].device))
@@ -88,13 +94,18 @@ def _signs(one: torch.Tensor, other: torch.Tensor, body: torch.Tensor) -> tuple[
 
 
 def _half(
-    projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid, views: np.ndarray
+    projections: torch.Tensor,
+    geometry: Geometry,
+    grid: VolumeGrid,
+    views: np.ndarray,
+    device: torch.device | None,
 ) -> torch.Tensor | None:
     some = geometry.select(views)
     if not fits_fdk(some, grid)[0]:
         return None
     values = projections[torch.from_numpy(views).to(projections.device)]
-    volume = fdk_on_gpu(values, some, grid, _UNEVEN) if values.is_cuda else None
+    device = values.device if device is None else device
+    volume = fdk_on_gpu(values, some, grid, _UNEVEN, device) if device.type == "cuda" else None
     if volume is None and math.prod(grid.shape) * geometry.views <= _MOST_ADDITIONS:
         array = values.cpu().numpy()
         filled = fill_invalid(array, np.isfinite(array))

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tomo_polysplat.free_memory import free_bytes, in_gigabytes
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, to_astra
 from tomo_polysplat.start.filters import ramp_response
 from tomo_polysplat.start.orbit import Orbit
@@ -69,8 +70,10 @@ def fdk_cuda(
     """ASTRA's FDK_CUDA for a scan that `suits_fdk_cuda`; parameters and result are those of `fdk`."""
     import torch
 
-    values = torch.from_numpy(np.ascontiguousarray(projections, dtype=np.float32)).to(device)
-    return fdk_cuda_tensor(values, geometry, grid, orbit, filter_name).cpu().numpy()
+    from tomo_polysplat.start.slabs import fdk_on_device
+
+    values = torch.from_numpy(np.ascontiguousarray(projections, dtype=np.float32))
+    return fdk_on_device(values, geometry, grid, orbit, filter_name, torch.device(device)).cpu().numpy()
 
 
 def fdk_cuda_tensor(
@@ -81,7 +84,7 @@ def fdk_cuda_tensor(
     Raises
     ------
     RuntimeError
-        If ASTRA left any voxel unwritten.
+        If ASTRA left any voxel unwritten, which is how it tells that it had no room.
     """
     import astra
     import torch
@@ -118,7 +121,12 @@ def fdk_cuda_tensor(
             astra.data3d.delete(identifier)
     torch.cuda.synchronize(index)
     if not bool(torch.isfinite(volume).all()):
-        raise RuntimeError("ASTRA's FDK_CUDA left voxels unwritten; is its GPU out of memory?")
+        of_rays, of_voxels, free = sinogram.nbytes, volume.nbytes, free_bytes(sinogram.device)
+        raise RuntimeError(
+            f"ASTRA's FDK_CUDA left voxels unwritten: beside its {in_gigabytes(of_rays)} of projections and"
+            f" {in_gigabytes(of_voxels)} of voxels it needs about {in_gigabytes(of_rays)}, and"
+            f" {in_gigabytes(free)} of {sinogram.device} are free."
+        )
     return volume
 
 

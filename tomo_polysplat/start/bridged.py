@@ -73,6 +73,8 @@ def bridged_start(
         return volume, ""
     if method != "fdk":
         return volume, "; metal not bridged: too few views, or not an orbit"
+    if values.is_cuda and not volume.is_cuda:
+        return volume, "; metal not bridged: the GPU has no room for it"
     on_gpu = values.is_cuda and astra_has_gpu()
     if not on_gpu and math.prod(geometry.shape) * max(grid.shape) > _MOST_STEPS:
         return volume, "; metal not bridged: it would take a CPU minutes"

@@ -37,25 +37,28 @@ _FEWEST_ROWS = 4
 
 
 def initial_volume_on(
-    projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid
+    projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid, device: torch.device | None = None
 ) -> tuple[torch.Tensor, dict[str, Any]]:
-    """As `initial_volume` for projections on a device, where the volume is, too."""
-    volume, reason, where = None, "", projections.device.type
-    if projections.is_cuda:
+    """As `initial_volume` for projections on a device, where the volume is, too, if it fits there.
+
+    The device, that of the projections by default, may be a GPU that had no room for them.
+    """
+    device = projections.device if device is None else device
+    volume, reason, where = None, "", device.type
+    if where == "cuda":
         fits, reason = _method(geometry, grid)
         try:
             if fits:
                 wide, wider, longer = continued(fill_rows(projections), geometry, grid)
-                volume = fdk_on_gpu(wide, wider, grid)
+                volume = fdk_on_gpu(wide, wider, grid, device=device)
                 reason += longer
         except RuntimeError as problem:
             # Torch's, or ASTRA's, whose memory comes on top of torch's.
             _log.warning("The start is made on the CPU: %s", problem)
             where = "cpu"
     if volume is None:
-        device = projections.device
         found, done = initial_volume(projections.cpu().numpy(), geometry, grid, device=where)
-        return torch.from_numpy(np.ascontiguousarray(found)).to(device), done
+        return torch.from_numpy(np.ascontiguousarray(found)).to(projections.device), done
     invalid = int((~torch.isfinite(projections)).sum())
     _log.info("Start from FDK: %s; %d invalid pixels.", reason, invalid)
     beyond, near = _beyond_sources(geometry, grid)

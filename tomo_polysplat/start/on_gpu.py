@@ -14,24 +14,37 @@ _AT_ONCE = 1 << 24
 
 
 def fdk_on_gpu(
-    projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid, uneven: float = 0.02
+    projections: torch.Tensor,
+    geometry: Geometry,
+    grid: VolumeGrid,
+    uneven: float = 0.02,
+    device: torch.device | None = None,
 ) -> torch.Tensor | None:
     """Smooth filtered backprojection (nz, ny, nx), or None where ASTRA cannot do this scan on a GPU.
 
     Parameters
     ----------
-    projections : (views, rows, columns) float32 CUDA tensor
+    projections : (views, rows, columns) float32 tensor
         -log(I/I0) of a scan that `fits_fdk`; pixels that are not finite are interpolated from their row.
     uneven : float
         Largest difference between the steps from view to view, as a share of their mean.
+    device : torch.device, optional
+        The GPU; that of the projections by default.
+
+    Raises
+    ------
+    RuntimeError
+        If the GPU has no room for it, by slabs either; with bytes needed and bytes free.
     """
-    from tomo_polysplat.start.astra_fdk import fdk_cuda_tensor, suits_fdk_cuda
+    from tomo_polysplat.start.astra_fdk import suits_fdk_cuda
+    from tomo_polysplat.start.slabs import fdk_on_device
 
     orbit, _ = find_orbit(geometry)
     if orbit is None or not suits_fdk_cuda(geometry, grid, orbit, uneven)[0]:
         return None
     # Smooth: the noise of a sharp filter would be seeded as if it were matter.
-    return fdk_cuda_tensor(fill_rows(projections), geometry, grid, orbit, "hann")
+    device = projections.device if device is None else device
+    return fdk_on_device(fill_rows(projections), geometry, grid, orbit, "hann", device)
 
 
 def fill_rows(projections: torch.Tensor) -> torch.Tensor:

@@ -1,0 +1,139 @@
+"""Filtered backprojection slab by slab of z: of the detector a slab needs the rows alone that its rays end in."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tomo_polysplat.free_memory import free_bytes, in_gigabytes
+from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.start.orbit import Orbit
+
+if TYPE_CHECKING:
+    import torch
+
+__all__ = ["fdk_of_slabs", "fdk_on_device", "rows_of", "slab_of"]
+
+logger = logging.getLogger(__name__)
+
+# Rows beyond those that voxels' centres fall on: the next one is interpolated with.
+_MARGIN = 2
+# Bytes on a GPU: of a number of a slab's projections (the piece itself, ASTRA's sinogram, and a copy of some views that
+# its backprojection makes), of a voxel of it (and whether it is finite), and what the filter takes besides.
+_OF_RAY, _OF_VOXEL, _FILTER = 12, 5, 4 << 27
+# Of what is free: the rest is for what ASTRA's own context takes. And how often less is tried where that was too much.
+_SHARE, _TIMES = 0.8, 3
+
+
+def slab_of(grid: VolumeGrid, first: int, last: int) -> VolumeGrid:
+    """The slices of a grid from the first up to, and without, the last."""
+    lower, upper, height = grid.lower.copy(), grid.upper.copy(), grid.voxel_size[2]
+    lower[2], upper[2] = grid.lower[2] + first * height, grid.lower[2] + last * height
+    return VolumeGrid((last - first, *grid.shape[1:]), lower, upper)
+
+
+def rows_of(geometry: Geometry, grid: VolumeGrid) -> tuple[int, int]:
+    """The first row of the detector that rays through a grid end in, and the one behind the last; two at least."""
+    corners = np.stack(np.meshgrid(*zip(grid.lower, grid.upper), indexing="ij"), axis=-1).reshape(-1, 3)
+    rows = geometry.project_points(corners)[..., 1]
+    if not np.isfinite(rows).all():
+        return 0, geometry.rows
+    first = int(np.clip(np.floor(rows.min()) - _MARGIN, 0, max(geometry.rows - 2, 0)))
+    last = int(np.clip(np.ceil(rows.max()) + _MARGIN + 1, min(first + 2, geometry.rows), geometry.rows))
+    return first, last
+
+
+def fdk_of_slabs(
+    make: Callable[[tuple[int, int], Geometry, VolumeGrid], torch.Tensor],
+    geometry: Geometry,
+    grid: VolumeGrid,
+    depth: int,
+    whole: torch.Tensor,
+) -> None:
+    """Fill a volume by slabs of so many slices.
+
+    Parameters
+    ----------
+    make : callable
+        Gets the rows (first, behind the last) that a slab needs, the geometry of these alone and the slab's grid, and
+        gives its volume.
+    geometry, grid : Geometry, VolumeGrid
+        Of a scan that filtered backprojection fits.
+    depth : int
+    whole : (nz, ny, nx) tensor
+        The same as made in one piece, to rounding; it may lie anywhere.
+    """
+    for first in range(0, grid.shape[0], depth):
+        last = min(first + depth, grid.shape[0])
+        slab = slab_of(grid, first, last)
+        rows = rows_of(geometry, slab)
+        whole[first:last] = make(rows, geometry.cropped(rows, (0, geometry.columns)), slab)
+
+
+def fdk_on_device(
+    projections: torch.Tensor,
+    geometry: Geometry,
+    grid: VolumeGrid,
+    orbit: Orbit,
+    filter_name: str,
+    device: torch.device,
+) -> torch.Tensor:
+    """`fdk_cuda_tensor` of projections that may be on the host, in one piece or by slabs, as there is room.
+
+    Returns
+    -------
+    (nz, ny, nx) tensor
+        On the device; on the host where that has no room for it.
+
+    Raises
+    ------
+    RuntimeError
+        If the device has no room for a slab either; with bytes needed and bytes free.
+    """
+    import torch
+
+    from tomo_polysplat.start.astra_fdk import fdk_cuda_tensor
+
+    def make(rows: tuple[int, int], cropped: Geometry, slab: VolumeGrid) -> torch.Tensor:
+        piece = projections[:, rows[0] : rows[1]].to(device)
+        return fdk_cuda_tensor(piece, cropped, slab, orbit, filter_name)
+
+    nz, ny, nx = grid.shape
+    for attempt in range(_TIMES):
+        room = _SHARE * free_bytes(device) / 2**attempt
+        depth = _depth(geometry, grid, room, projections.is_cuda)
+        # A second volume of this size is what whatever looks at it takes at least.
+        place = device if 8 * nz * ny * nx < room else torch.device("cpu")
+        try:
+            if depth >= nz and place == device:
+                return make((0, geometry.rows), geometry, grid)
+            whole = torch.empty(grid.shape, dtype=torch.float32, device=place)
+            fdk_of_slabs(make, geometry, grid, depth, whole)
+            logger.info("Filtered backprojection by slabs of %d of %d slices.", depth, nz)
+            return whole
+        except RuntimeError as problem:
+            if attempt + 1 == _TIMES or depth == 1:
+                raise
+            logger.info("%s Slabs are tried that take less than %s.", problem, in_gigabytes(room / 2))
+            # What torch holds for later is of no use to ASTRA.
+            torch.cuda.empty_cache()
+    raise AssertionError("unreachable")
+
+
+def _depth(geometry: Geometry, grid: VolumeGrid, room: float, resident: bool) -> int:
+    """Slices of a slab for which there is room."""
+    nz, ny, nx = grid.shape
+    # In the middle: nearest to the source's plane, where the cone is as wide as anywhere along the axis.
+    depth = nz
+    while depth > 1:
+        first = (nz - depth) // 2
+        low, high = rows_of(geometry, slab_of(grid, first, first + depth))
+        rays = (high - low) * geometry.views * geometry.columns
+        of_ray = _OF_RAY - 4 if resident and depth == nz else _OF_RAY
+        if of_ray * rays + _OF_VOXEL * depth * ny * nx + _FILTER <= room:
+            break
+        depth = -(-depth // 2)
+    return depth
