@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import os
 import signal
 import time
@@ -11,7 +12,7 @@ from collections.abc import Callable
 __all__ = ["FAILED", "child", "killed"]
 
 FAILED = 99
-_LONGEST = 120.0
+_LONGEST = 60.0
 
 
 def child(action: Callable[[], int | None]) -> int:
@@ -43,6 +44,8 @@ def _fork(action: Callable[[], int | None]) -> tuple[int, int]:
     if number:
         os.close(tell)
         return number, begun
+    # One that waits for what it will never get says where.
+    faulthandler.dump_traceback_later(_LONGEST, exit=True)
     try:
         os.write(tell, b".")
         os._exit(action() or 0)

@@ -1,7 +1,7 @@
 """What is fuzzed: each takes hostile input, and either gives something sound or refuses it in words.
 
 Everything else is a finding: another exception, a number that is not finite where it matters, and, watched from
-outside by `campaign.py`, a crash, a hang or a gigabyte.
+outside by `python -m tests.campaign`, a crash, a hang or a gigabyte.
 """
 
 import math

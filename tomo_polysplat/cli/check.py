@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from tomo_polysplat.checks import visible
 from tomo_polysplat.cli.options import add_scan_options
 
 NAME = "check"
@@ -48,12 +49,12 @@ def run(arguments: argparse.Namespace) -> int:
         lines["rotation axis"] = f"column {scan.notes['centre']:.2f}, {how}"
     width = max(map(len, lines))
     for name, text in lines.items():
-        print(f"{name:{width}}  {text}")
+        print(f"{name:{width}}  {visible(text)}")
     findings = check_scan(scan)
     print()
     width = max(len(finding.probe) for finding in findings)
     for finding in findings:
-        print(f"{SIGNS[finding.verdict]:4}  {finding.probe:{width}}  {finding.text}")
+        print(f"{SIGNS[finding.verdict]:4}  {finding.probe:{width}}  {visible(finding.text)}")
         if finding.remedy:
-            print(f"{'':4}  {'':{width}}  -> {finding.remedy}")
+            print(f"{'':4}  {'':{width}}  -> {visible(finding.remedy)}")
     return DEFECT_STATUS if any(finding.verdict == "defect" for finding in findings) else 0
