@@ -34,7 +34,6 @@ _TYPES = {
     "LONG": "i4",
     "BYTE": "u1",
 }
-_ENTRY = re.compile(r"([^=;{}]+?)\s*=\s*([^;]*?)\s*;")
 
 
 class EdfFrames:
@@ -98,8 +97,9 @@ def _header(file: Path, start: int) -> tuple[dict[str, str] | None, int]:
     end = re.compile(rb"\}[ \r]*\n").search(text, opened.end())
     if end is None:
         raise fail("path", "an EDF header", f"one without an end in {file}", "copy or write the file again")
-    entries = _ENTRY.findall(text[opened.end() : end.start()].decode("latin-1"))
-    return {key.strip().upper(): value.strip() for key, value in entries}, start + end.end()
+    inside = text[opened.end() : end.start()].decode("latin-1").split(";")
+    entries = [entry.partition("=") for entry in inside if "=" in entry]
+    return {key.strip().upper(): value.strip() for key, _, value in entries}, start + end.end()
 
 
 def _size_and_type(file: Path, header: dict[str, str]) -> tuple[tuple[int, int], np.dtype]:
