@@ -57,7 +57,7 @@ def fail(
     argument: str, expected: str, got: Any, remedy: str = "", error: type[Exception] = ValueError
 ) -> Exception:
     """The exception to raise: ``raise fail("angles", "radians", "degrees", "use numpy.deg2rad")``."""
-    message = f"{_short(argument, 200)}: expected {expected}, got {_short(got, 400)}"
+    message = f"{_short(argument, 200)}: expected {visible(expected)}, got {_short(got, 400)}"
     return error(f"{message}; {visible(remedy)}" if remedy else message)
 
 

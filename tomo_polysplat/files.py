@@ -16,6 +16,7 @@ from tomo_polysplat.free_memory import available_memory
 __all__ = [
     "existing_file",
     "existing_parent",
+    "file_content",
     "flush_to_disk",
     "output_path",
     "replacing",
@@ -226,3 +227,21 @@ def existing_file(path: str | os.PathLike, argument: str = "path") -> Path:
     if file.stat().st_size == 0:
         raise fail(argument, "a file with contents", f"{file}, which is empty")
     return file
+
+
+def file_content(path: str | os.PathLike, most: int, argument: str = "path") -> bytes:
+    """All of a small file, such as a text: a pipe would be waited for, and a large file is none of this kind.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file, or something else in its place.
+    ValueError
+        If it is empty or has more than `most` bytes.
+    """
+    file = existing_file(path, argument)
+    with open(file, "rb") as stream:
+        content = stream.read(most + 1)
+    if len(content) > most:
+        raise fail(argument, f"a file of at most {most} bytes", f"{file.stat().st_size} in {file}")
+    return content

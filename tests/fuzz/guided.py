@@ -1,7 +1,7 @@
 """Fuzzing of the readers led by their own branches: ``python tests/fuzz/guided.py "npz scans" -max_total_time=60``.
 
 Needs atheris (python -m pip install atheris), whose options follow the target. It sees the branches of this package
-only; what NumPy and HDF5 do with a file is looked at by `campaign.py`.
+only; what NumPy and HDF5 do with a file is looked at by `python -m tests.campaign`.
 """
 
 import sys

@@ -69,6 +69,15 @@ def npy(array, header=None) -> bytes:
     return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + np.asarray(array).tobytes()
 
 
+def npy_archive(arrays, compression=zipfile.ZIP_STORED) -> bytes:
+    """Such arrays in a NumPy archive, pickles among them."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, array in arrays.items():
+            archive.writestr(f"{name}.npy", npy(array), compression)
+    return buffer.getvalue()
+
+
 @st.composite
 def npz_scans(draw) -> bytes:
     """An archive with other arrays, lying headers, bombs, and damaged bytes."""
@@ -233,7 +242,8 @@ def image(datasets, attributes, tricks) -> bytes:
 
 
 @st.composite
-def _hdf5(draw, datasets, attributes, values) -> bytes:
+def hdf5_files(draw, datasets, attributes, values) -> bytes:
+    """A file with other datasets and attributes, tricks, and damaged bytes."""
     content = draw(replaced(datasets, values))
     paths = sorted(
         {*datasets, "exchange", "polysplat", "polysplat/spectrum", "polysplat/geometry", "measurement"}
@@ -245,5 +255,5 @@ def _hdf5(draw, datasets, attributes, values) -> bytes:
     return draw(damaged(image(content, about, tricks)))
 
 
-HDF5_SCANS = _hdf5(EXCHANGE, ATTRIBUTES, ODD) | _hdf5(EXCHANGE | OURS, ATTRIBUTES, ODD)
-HDF5_RESULTS = _hdf5(RESULT, RESULT_ATTRIBUTES, ODD | JSON)
+HDF5_SCANS = hdf5_files(EXCHANGE, ATTRIBUTES, ODD) | hdf5_files(EXCHANGE | OURS, ATTRIBUTES, ODD)
+HDF5_RESULTS = hdf5_files(RESULT, RESULT_ATTRIBUTES, ODD | JSON)

@@ -1,19 +1,25 @@
 """What is fuzzed: each takes hostile input, and either gives something sound or refuses it in words.
 
 Everything else is a finding: another exception, a number that is not finite where it matters, and, watched from
-outside by `campaign.py`, a crash, a hang or a gigabyte.
+outside by `python -m tests.campaign`, a crash, a hang or a gigabyte.
 """
 
 import math
+import shutil
 import warnings
 from pathlib import Path
 
 import numpy as np
+from hostile_checkpoints import checkpoints, resumed
 from hostile_files import HDF5_RESULTS, HDF5_SCANS, npz_scans
+from hostile_folders import FILTER_MAPS, SPECTRUM_TABLES, folders, neXus, put
 from hostile_values import ARRAYS, NUMBERS, TEXTS, VALUES, mostly, replaced, replaced_values
 from hypothesis import strategies as st
 
+from tomo_polysplat.checks import visible
+from tomo_polysplat.cli.options import filter_map_from
 from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.physics.spectrum_file import read_spectrum_table
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import from_astra, projections_from_astra
 from tomo_polysplat.scan.io import load_scan
@@ -31,12 +37,18 @@ def refused(action):
     except REFUSALS as error:
         assert "expected" in str(error), f"{type(error).__name__} without saying what was expected: {error}"
         assert len(str(error)) < 3000, "a message that nobody reads"
+        assert visible(error) == str(error).replace("\n", " "), "control characters in a message"
         return None
 
 
 def read_scan(content: bytes, folder: Path) -> bool:
     path = folder / "scan"
     path.write_bytes(content)
+    return loaded(path)
+
+
+def loaded(path: Path) -> bool:
+    """Whether a file or folder is read as a scan that is sound."""
     scan = refused(lambda: load_scan(path))
     if scan is None:
         return False
@@ -46,8 +58,42 @@ def read_scan(content: bytes, folder: Path) -> bool:
     if scan.spectrum is not None:
         assert np.isfinite(scan.spectrum.weights).all()
     refused(lambda: from_astra(scan.proj_geom, scan.vol_geom))
+    assert visible(repr(scan)) == repr(scan)
     repr(scan).encode()
     return True
+
+
+def read_folder(files: dict, folder: Path) -> bool:
+    path = folder / "folder"
+    shutil.rmtree(path, ignore_errors=True)
+    put(files, path)
+    return loaded(path)
+
+
+def read_spectrum(content: bytes, folder: Path) -> bool:
+    path = folder / "spectrum.txt"
+    path.write_bytes(content)
+    made = refused(lambda: Spectrum(*read_spectrum_table(path)))
+    assert made is None or (np.isfinite(made.weights).all() and made.effective_energy > 0)
+    return made is not None
+
+
+def read_filter_map(case: tuple, folder: Path) -> bool:
+    name, content = case
+    path = folder / "filter"
+    shutil.rmtree(path, ignore_errors=True)
+    put({} if content is None else {name: content}, path)
+    found = refused(lambda: filter_map_from(f"Al:{path / name}"))
+    assert found is None or (found[1].dtype.kind in "fiu" and found[1].nbytes < 2**26)
+    return found is not None
+
+
+def resume(content: bytes, folder: Path) -> bool:
+    path = folder / "fit.npz"
+    path.write_bytes(content)
+    result = refused(lambda: resumed(path))
+    assert result is None or np.isfinite(result.volume).all()
+    return result is not None
 
 
 def read_result(content: bytes, folder: Path) -> bool:
@@ -113,10 +159,25 @@ TUBE = {"kvp": 90.0, "anode": "W", "filters": {"Al": 0.1}}
 FILTERS = TEXTS | st.sampled_from(["Al", "Cu", "iron"])
 NAMES = st.sampled_from(list(make_settings().to_dict()))
 
-TARGETS = {
+# What is in files, and what is in arguments.
+FILES = {
     "npz scans": (read_scan, npz_scans()),
-    "HDF5 scans": (read_scan, HDF5_SCANS),
-    "HDF5 results": (read_result, HDF5_RESULTS),
+    "Data Exchange": (read_scan, HDF5_SCANS),
+    "NXtomo": (read_scan, neXus("nxtomo")),
+    "CIL NeXus": (read_scan, neXus("cil")),
+    "TIFF folders": (read_folder, folders("tiffs")),
+    "scan.toml": (read_folder, folders("tiffs", ("scan.toml", "angles.txt"))),
+    "SkyScan": (read_folder, folders("skyscan")),
+    "Nikon": (read_folder, folders("nikon")),
+    "EDF": (read_folder, folders("edf")),
+    ".npy": (read_folder, folders("npy")),
+    "RTK, MetaImage": (read_folder, folders("rtk")),
+    "spectrum tables": (read_spectrum, SPECTRUM_TABLES),
+    "filter maps": (read_filter_map, FILTER_MAPS),
+    "results": (read_result, HDF5_RESULTS),
+    "checkpoints": (resume, checkpoints()),
+}
+ARGUMENTS = {
     "geometries": (
         geometry,
         st.tuples(
@@ -137,3 +198,4 @@ TARGETS = {
         ),
     ),
 }
+TARGETS = FILES | ARGUMENTS

@@ -1,4 +1,4 @@
-"""A short run of what `campaign.py` does at length."""
+"""A short run of what `python -m tests.campaign` does at length."""
 
 import pytest
 from hypothesis import HealthCheck, given, settings

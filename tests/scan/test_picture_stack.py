@@ -1,6 +1,7 @@
 """A plain stack of TIFFs: what is stated, what is guessed and said, and which part is read."""
 
 import logging
+import time
 
 import numpy as np
 import pytest
@@ -251,3 +252,13 @@ def test_npz_stacks_with_their_angles_and_without(tmp_path):
         tps.load_scan(path, scanner=stated)
     with pytest.raises(ValueError, match="the distances and the pixel of the scanner"):
         tps.load_scan(path, scanner={"arc": 360})
+
+
+def test_an_edf_header_of_blanks_takes_no_time(tmp_path):
+    picture = np.arange(35, dtype="u2").reshape(5, 7)
+    content = edf_bytes(picture)
+    (tmp_path / "a.edf").write_bytes(content.replace(b"}\n", b" " * 64_000 + b"}\n", 1))
+    begun = time.process_time()
+    frames = EdfFrames([tmp_path / "a.edf"])
+    assert time.process_time() - begun < 1.0  # by a pattern with blanks in two places it was 20
+    np.testing.assert_array_equal(frames.read(0, slice(0, 5), slice(0, 7)), picture)

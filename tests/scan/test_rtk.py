@@ -109,7 +109,7 @@ def test_geometries_that_do_not_fit(folder, old, new, message):
 def test_a_damaged_stack_is_refused(folder):
     content = (folder / "projections.mha").read_bytes()
     (folder / "projections.mha").write_bytes(content[:2000])
-    with pytest.raises(ValueError, match=r"a readable MetaImage file|as much data as its header declares"):
+    with pytest.raises(ValueError, match="234432 bytes of numbers, got"):
         tps.load_scan(folder)
 
 

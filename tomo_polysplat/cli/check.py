@@ -7,6 +7,7 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from tomo_polysplat.checks import visible
 from tomo_polysplat.cli.options import add_scan_options
 
 if TYPE_CHECKING:
@@ -38,14 +39,14 @@ def run(arguments: argparse.Namespace) -> int:
     lines = _described(scan)
     width = max(map(len, lines))
     for name, text in lines.items():
-        print(f"{name:{width}}  {text}")
+        print(f"{name:{width}}  {visible(text)}")
     findings = check_scan(scan)
     print()
     width = max(len(finding.probe) for finding in findings)
     for finding in findings:
-        print(f"{SIGNS[finding.verdict]:4}  {finding.probe:{width}}  {finding.text}")
+        print(f"{SIGNS[finding.verdict]:4}  {finding.probe:{width}}  {visible(finding.text)}")
         if finding.remedy:
-            print(f"{'':4}  {'':{width}}  -> {finding.remedy}")
+            print(f"{'':4}  {'':{width}}  -> {visible(finding.remedy)}")
     defects, unknown = (
         sum(finding.verdict == verdict for finding in findings) for verdict in ("defect", "unknown")
     )

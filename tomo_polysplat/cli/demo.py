@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from tomo_polysplat.checks import visible
 from tomo_polysplat.cli.options import add_solver_options
 from tomo_polysplat.files import require_replaceable, require_writable
 from tomo_polysplat.progress import progress_reports
@@ -42,5 +43,5 @@ def run(arguments: argparse.Namespace) -> int:
         outcome = run_demo(folder, device=arguments.device, seed=arguments.seed, progress=progress)
     print(as_text(outcome["methods"], "cm"))
     for name in FILES:
-        print(f"wrote {folder / name}")
+        print(f"wrote {visible(folder / name)}")
     return 0

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from tomo_polysplat.checks import fail
+from tomo_polysplat.checks import fail, visible
 from tomo_polysplat.cli.options import add_scan_options, add_spectrum_options, scan_from, spectrum_from
 from tomo_polysplat.files import require_replaceable, require_writable
 
@@ -68,8 +68,8 @@ def run(arguments: argparse.Namespace) -> int:
         binning=arguments.binning,
     )
     save_scan(scan, output, overwrite=arguments.overwrite)
-    print(scan)
-    print(f"wrote {output}")
+    print(visible(scan))
+    print(f"wrote {visible(output)}")
     return 0
 
 

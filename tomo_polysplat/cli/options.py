@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.files import existing_file
 
 if TYPE_CHECKING:
     from tomo_polysplat.physics.spectrum import Spectrum
@@ -69,20 +68,12 @@ def spectrum_from(arguments: argparse.Namespace) -> Spectrum | None:
 
 def filter_map_from(text: str) -> tuple[str, Any]:
     """Material and thickness at each pixel, of MATERIAL:FILE."""
-    import numpy as np
+    from tomo_polysplat.scan.filter_map_file import thickness_of
 
     material, _, name = text.partition(":")
     if not name:
         raise fail("--filter-map", "MATERIAL:FILE, such as Al:bowtie.npy", repr(text))
-    file = existing_file(name, "--filter-map")
-    if file.suffix.lower() == ".npy":
-        return material, np.load(file, allow_pickle=False)
-    if file.suffix.lower() in (".tif", ".tiff"):
-        import tifffile
-
-        return material, tifffile.imread(file)
-    with open(file, encoding="utf-8") as stream:
-        return material, np.loadtxt((line.replace(",", " ") for line in stream), ndmin=2)
+    return material, thickness_of(name, "--filter-map")
 
 
 def add_scan_options(parser: argparse.ArgumentParser) -> None:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import tomo_polysplat
-from tomo_polysplat.checks import fail
+from tomo_polysplat.checks import fail, visible
 from tomo_polysplat.cli.options import (
     INTERRUPTED,
     add_scan_options,
@@ -152,7 +152,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.filter_map is not None:
         scan = replace(scan, filter_map=filter_map_from(arguments.filter_map))
     require_room_of(arguments, scan)
-    print(scan)
+    print(visible(scan))
     # What a run will take is said without -v as well.
     logging.getLogger("tomo_polysplat.plan.expected").setLevel(logging.INFO)
     with progress_reports(None) as progress:
@@ -176,7 +176,7 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.energy is not None:
             result = replace(result, energy_kev=arguments.energy)
         result.provenance = {"scan": scan.name} | result.provenance
-        print(result)
+        print(visible(result))
         write_outputs(result, scan, arguments)
     stop = result.plan.get("stop")
     interrupted = stop is not None and stop.value == StopReason.INTERRUPTED

@@ -216,7 +216,7 @@ def _rescue(result: Result, arguments: argparse.Namespace) -> None:
         logger.error("Nor could the result be kept in %s: %s", folder, error)
         folder.rmdir()
     else:
-        print(f"the whole result is in {path}")
+        print(f"the whole result is in {visible(path)}")
 
 
 def _errors(result: Result, scan: Scan) -> dict[str, Any] | None:

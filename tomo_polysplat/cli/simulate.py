@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from tomo_polysplat.checks import visible
 from tomo_polysplat.cli.options import add_spectrum_options, spectrum_from
 from tomo_polysplat.files import require_replaceable, require_room, require_writable
 
@@ -59,6 +60,6 @@ def run(arguments: argparse.Namespace) -> int:
         geometry=arguments.geometry,
     )
     save_scan(scan, output, overwrite=arguments.overwrite)
-    print(scan)
-    print(f"wrote {output}")
+    print(visible(scan))
+    print(f"wrote {visible(output)}")
     return 0

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.files import existing_file
+from tomo_polysplat.files import file_content
 
 __all__ = ["read_spectrum_table"]
 
@@ -41,12 +41,9 @@ def read_spectrum_table(path: str | Path, argument: str = "path") -> tuple[np.nd
     ValueError
         For a line that is no two numbers, by its number, or a file without any.
     """
-    file = existing_file(path, argument)
-    if (size := file.stat().st_size) > _LARGEST:
-        expected = f"a table of at most {_LARGEST} bytes"
-        raise fail(argument, expected, f"{size} in {file}", "rebin the spectrum")
+    file, content = Path(path), file_content(path, _LARGEST, argument)
     rows: list[tuple[float, float]] = []
-    for number, line in enumerate(_text(file.read_bytes(), file, argument).splitlines(), start=1):
+    for number, line in enumerate(_text(content, file, argument).splitlines(), start=1):
         words = line.strip()
         if not words or words.startswith(_REMARKS):
             continue

@@ -42,7 +42,7 @@ FORMAT = 18
 _LARGEST_SHARE = 0.05
 _FITTED = tuple(name for name in PARTS if name != "group")
 # What taking apart something else than the expected raises.
-_DAMAGES = (KeyError, TypeError, AttributeError, RecursionError, OverflowError)
+_DAMAGES = (KeyError, IndexError, TypeError, AttributeError, RecursionError, OverflowError)
 _NAMES = (
     *(f"{kind}/{name}" for kind in ("gaussians", "best") for name in PARTS),
     *(f"{moment}/{name}" for moment in ("first", "second") for name in _FITTED),

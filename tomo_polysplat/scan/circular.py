@@ -20,6 +20,9 @@ __all__ = ["cone_geometry", "parallel_geometry", "volume_seen"]
 
 logger = logging.getLogger(__name__)
 
+# Along an axis; more is a pixel of a size that no detector has.
+_MOST_VOXELS = 1 << 31
+
 
 # One parameter for each option that a caller names.
 def cone_geometry(
@@ -118,12 +121,12 @@ def volume_seen(
 ) -> dict[str, Any]:
     """ASTRA's volume geometry of what a detector sees about the z axis; see `cone_geometry` for the arguments."""
     width, height = geometry.pixel_size_at(np.zeros(3))
-    size = width if voxel is None else require_number("voxel", voxel, above=0.0)
+    name, value = ("pixel", width) if voxel is None else ("voxel", voxel)
+    size = require_number(name, value, above=0.0)
     shape = _voxels(voxels)
     if shape is None:
-        across, high = (
-            max(1, round(n * step / size)) for n, step in ((geometry.columns, width), (geometry.rows, height))
-        )
+        seen = (n * step / size for n, step in ((geometry.columns, width), (geometry.rows, height)))
+        across, high = (max(1, round(require_number(name, n, at_most=_MOST_VOXELS))) for n in seen)
         shape = (high, across, across)
     half = 0.5 * size * np.array(shape[::-1])
     middle = np.array([0.0, 0.0, _height_seen(geometry)])

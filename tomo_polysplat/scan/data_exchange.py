@@ -116,7 +116,7 @@ def _line_integrals(
                 "none",
                 "or pass input='transmission' or 'attenuation'",
             )
-        for frames in filter(None, (white, dark)):
+        for frames in (one for one in (white, dark) if one is not None):
             _require_few(frames, data)
         no_light, open_beam = None if dark is None else read_block(dark), read_block(white)
         flat, background = flat_and_dark(open_beam, no_light, (rows, columns))

@@ -47,7 +47,7 @@ def held_files() -> Iterator[None]:
             _held.reset(token)
 
 
-def member(group: h5py.Group, path: str) -> Any:
+def member(group: h5py.Group, path: str | bytes) -> Any:
     """The object at a path below a group, or None.
 
     Raises
@@ -58,6 +58,8 @@ def member(group: h5py.Group, path: str) -> Any:
     """
     import h5py
 
+    # h5py gives names that are no UTF-8 as bytes.
+    path = os.fsdecode(path)
     here: Any = group.file if path.startswith("/") else group
     names, links, steps = _names(path), 0, 0
     while names:

@@ -34,7 +34,6 @@ _TYPES = {
     "LONG": "i4",
     "BYTE": "u1",
 }
-_ENTRY = re.compile(r"([^=;{}]+?)\s*=\s*([^;]*?)\s*;")
 
 
 class EdfFrames:
@@ -82,9 +81,7 @@ def _pictures(path: Path, require):  # type: ignore[no-untyped-def]
                 "path", f"{count} bytes of a picture", f"{total - begin} in {file}", "copy the file again"
             )
         yield file, begin, size, dtype
-        start = begin + max(
-            count, int(header.get("SIZE", "0") or 0) if header.get("SIZE", "").isdecimal() else 0
-        )
+        start = begin + max(count, _whole(header.get("SIZE", "")))
 
 
 def _header(file: Path, start: int) -> tuple[dict[str, str] | None, int]:
@@ -100,8 +97,9 @@ def _header(file: Path, start: int) -> tuple[dict[str, str] | None, int]:
     end = re.compile(rb"\}[ \r]*\n").search(text, opened.end())
     if end is None:
         raise fail("path", "an EDF header", f"one without an end in {file}", "copy or write the file again")
-    entries = _ENTRY.findall(text[opened.end() : end.start()].decode("latin-1"))
-    return {key.strip().upper(): value.strip() for key, value in entries}, start + end.end()
+    inside = text[opened.end() : end.start()].decode("latin-1").split(";")
+    entries = [entry.partition("=") for entry in inside if "=" in entry]
+    return {key.strip().upper(): value.strip() for key, _, value in entries}, start + end.end()
 
 
 def _size_and_type(file: Path, header: dict[str, str]) -> tuple[tuple[int, int], np.dtype]:
@@ -111,8 +109,13 @@ def _size_and_type(file: Path, header: dict[str, str]) -> tuple[tuple[int, int],
         raise fail(
             "path", "EDF pictures that are not compressed", header["COMPRESSION"], "write them again without"
         )
-    if name not in _TYPES or not all(side.isdecimal() and 0 < int(side) < 2**31 for side in sides):
+    if name not in _TYPES or not all(0 < _whole(side) < 2**31 for side in sides):
         got = f"DataType {header.get('DATATYPE', 'none')}, Dim_2 {sides[0] or 'none'}, Dim_1 {sides[1] or 'none'}"
         raise fail("path", "EDF pictures of numbers, of two axes", f"{got} in {file}")
     order = ">" if header.get("BYTEORDER", "LowByteFirst").upper().startswith("HIGH") else "<"
     return (int(sides[0]), int(sides[1])), np.dtype(order + _TYPES[name])
+
+
+def _whole(text: str) -> int:
+    """A number of so many digits as a size may have, or 0."""
+    return int(text) if text.isdecimal() and len(text) < 16 else 0

@@ -109,7 +109,7 @@ class TiffFrames:
             raise fail("path", "TIFF files", "none")
         first = self._files[0]
         with _page(first, 0) as page:
-            pages = len(page.parent.pages)
+            pages = _count(first, page)
             self.dtype = np.dtype(page.dtype)
             rows, columns = page.shape
         if len(self._files) > 1 and pages > 1:
@@ -129,6 +129,14 @@ class TiffFrames:
                 raise _unreadable(file, error) from error
 
 
+def _count(file: Path, page: Any) -> int:
+    """Pictures of the file of a page."""
+    try:
+        return len(page.parent.pages)
+    except Exception as error:  # its parser raises whatever it meets
+        raise _unreadable(file, error) from error
+
+
 @contextmanager
 def _page(file: Path, number: int) -> Iterator[Any]:
     """One picture of a TIFF file, which is open meanwhile."""
@@ -141,9 +149,10 @@ def _page(file: Path, number: int) -> Iterator[Any]:
     with tiff:
         try:
             page = tiff.pages[number]
+            size = int(page.nbytes)  # which takes its shape and type apart
         except Exception as error:
             raise _unreadable(file, error) from error
-        _require_picture(file, page)
+        _require_picture(file, page, size)
         yield page
 
 
@@ -152,9 +161,9 @@ def _unreadable(file: Path, error: Exception) -> Exception:
     return fail("path", "a readable TIFF file", f"{file} ({str(error)[:120]})", remedy)
 
 
-def _require_picture(file: Path, page: Any) -> None:
+def _require_picture(file: Path, page: Any, size: int) -> None:
     """Refuse colours, and a header that promises more than the file can hold."""
     if len(page.shape) != 2 or 0 in page.shape or page.dtype is None or page.dtype.kind not in "fiu":
         got = f"{page.dtype} of shape {page.shape} in {file}"
         raise fail("path", "TIFF pictures of one channel, (rows, columns)", got, "save them as grey values")
-    require_plausible_size(file.name, page.nbytes, file.stat().st_size)
+    require_plausible_size(file.name, size, file.stat().st_size)

@@ -6,7 +6,8 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-from tomo_polysplat.checks import fail, visible
+from tomo_polysplat.checks import fail, require_number, visible
+from tomo_polysplat.files import file_content
 
 __all__ = ["IniText"]
 
@@ -23,14 +24,11 @@ class IniText:
     """
 
     def __init__(self, path: Path) -> None:
-        size = path.stat().st_size
-        if size > _MOST_BYTES:
-            raise fail("path", f"a text of at most {_MOST_BYTES} bytes", f"{size} in {path}")
         self._path = path
         self._values: dict[str, tuple[str, str]] = {}
         self._asked: set[str] = set()
         section = ""
-        for line in path.read_bytes().decode("utf-8", "replace").splitlines():
+        for line in file_content(path, _MOST_BYTES).decode("utf-8", "replace").splitlines():
             text = line.strip()
             if text.startswith("[") and text.endswith("]"):
                 section = text[1:-1].strip()
@@ -61,7 +59,7 @@ class IniText:
         text = self.text(*keys)
         match = _NUMBER.match(text.strip())
         if match is not None:
-            return float(match[0])
+            return require_number(keys[0], match[0])
         if otherwise is not None:
             return otherwise
         got = f"{text!r}" if text else "none"

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from tomo_polysplat.checks import fail
+from tomo_polysplat.checks import fail, require_number
+from tomo_polysplat.files import file_content
 from tomo_polysplat.physics.filter_text import filters_of
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
 from tomo_polysplat.scan.readers.files_of_scans import the_one
@@ -82,6 +83,7 @@ def _pictures(folder: Path, text: IniText, name: str) -> list[Path]:
 
 def _setup(text: IniText, folder: Path, views: int) -> tuple[Setup, list[str]]:
     near, far = text.number("SrcToObject"), text.number("SrcToDetector")
+    require_number("SrcToDetector", far, above=0.0)
     pixel = (text.number("DetectorPixelSizeX"), text.number("DetectorPixelSizeY"))
     height = pixel[1] * text.number("DetectorPixelsY", otherwise=0.0)
     top, bottom = (text.number(f"CentreOfRotation{end}", otherwise=0.0) for end in ("Top", "Bottom"))
@@ -123,11 +125,9 @@ def _degrees(text: IniText, folder: Path, views: int) -> tuple[np.ndarray, list[
 
 def _measured(file: Path) -> np.ndarray:
     """The second number of each line that begins with the number of a picture."""
-    if file.stat().st_size > _MOST_BYTES:
-        raise fail("path", f"angles in at most {_MOST_BYTES} bytes", f"{file.stat().st_size} in {file}")
     found = []
-    for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
-        match = re.match(r"\s*(\d+)\s*[:,;\s]\s*([-+]?\d+(?:\.\d*)?)", line)
+    for line in file_content(file, _MOST_BYTES).decode("utf-8", "replace").splitlines():
+        match = re.match(r"\s*(\d{1,9})\s*[:,;\s]\s*([-+]?\d{1,9}(?:\.\d*)?)", line)
         if match is not None:
             found.append((int(match[1]), float(match[2])))
     return np.array([angle for _, angle in sorted(found)])

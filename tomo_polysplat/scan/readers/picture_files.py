@@ -50,7 +50,7 @@ class NpyFrames:
     def _mapped(self, index: int) -> np.ndarray:
         try:
             return np.load(self._files[index], mmap_mode="r", allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
+        except Exception as error:  # headers are texts of Python, whose parser raises whatever it meets
             got = f"{self._files[index]} ({str(error)[:120]})"
             raise fail("path", "a .npy file of numbers", got, "save it again with numpy.save") from error
 

@@ -16,11 +16,12 @@ from xml.etree import ElementTree
 import numpy as np
 
 from tomo_polysplat.checks import fail, require_number
+from tomo_polysplat.files import file_content
 from tomo_polysplat.scan.geometry import Geometry
 from tomo_polysplat.scan.readers.acquisition import Acquisition
 from tomo_polysplat.scan.readers.files_of_scans import the_one
 from tomo_polysplat.scan.readers.frames import Frames, TiffFrames
-from tomo_polysplat.scan.readers.itk_frames import ITK_SUFFIXES, ItkFrames
+from tomo_polysplat.scan.readers.metaimage import METAIMAGE_SUFFIXES, MetaImageFrames
 from tomo_polysplat.scan.readers.picture_names import has_word, named_files, tiffs_in
 from tomo_polysplat.scan.readers.stated import require_known, stated_over
 
@@ -116,11 +117,10 @@ def _is_rtk(file: Path) -> bool:
 
 def _table(path: Path) -> dict[str, np.ndarray]:
     """Each parameter of each view; what is the same for all may stand once."""
-    size = path.stat().st_size
-    content = path.read_bytes() if size <= _MOST_BYTES else b""
+    content = file_content(path, _MOST_BYTES)
     # Entities could grow without end, and RTK writes none.
-    if not content or b"<!ENTITY" in content:
-        raise fail("path", "a geometry as RTK writes it", f"{size} bytes in {path}, or entities")
+    if b"<!ENTITY" in content:
+        raise fail("path", "a geometry as RTK writes it", f"entities in {path}")
     try:
         root = ElementTree.fromstring(content)
     except ElementTree.ParseError as error:
@@ -153,17 +153,17 @@ def _pictures(
     if "projections" in known:
         files = named_files(folder, known["projections"], "projections")
     else:
-        files = [file for file in sorted(folder.iterdir()) if file.suffix.lower() in ITK_SUFFIXES]
+        files = [file for file in sorted(folder.iterdir()) if file.suffix.lower() in METAIMAGE_SUFFIXES]
         files = files or [
             f for f in tiffs_in(folder) if not (has_word(f.stem, "flats") or has_word(f.stem, "darks"))
         ]
-    if not files or (len(files) > 1 and files[0].suffix.lower() in ITK_SUFFIXES):
+    if not files or (len(files) > 1 and files[0].suffix.lower() in METAIMAGE_SUFFIXES):
         got = ", ".join(file.name for file in files) or "none"
         raise fail(
             "path", "one .mha file or TIFFs beside the geometry", got, "pass scanner={'projections': ...}"
         )
-    if files[0].suffix.lower() in ITK_SUFFIXES:
-        stack = ItkFrames(files[0])
+    if files[0].suffix.lower() in METAIMAGE_SUFFIXES:
+        stack = MetaImageFrames(files[0])
         return stack, stack.origin, stack.spacing, []
     frames = TiffFrames(files)
     if "pixel" not in known:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from tomo_polysplat.checks import fail
+from tomo_polysplat.checks import fail, require_number
 from tomo_polysplat.physics.filter_text import filters_of
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
 from tomo_polysplat.scan.readers.files_of_scans import the_one
@@ -30,6 +30,7 @@ __all__ = ["KIND", "read", "recognises"]
 KIND = "Bruker SkyScan (.log)"
 _START_BYTES = 4096
 _ROUND = 0.005
+_MOST_DIGITS = 20
 
 
 def recognises(path: Path) -> bool:
@@ -80,7 +81,8 @@ def _is_skyscan(file: Path) -> bool:
 def _pictures(folder: Path, log: IniText, stem: str) -> list[Path]:
     """The numbered pictures: those of the log's prefix, or of the log's own name where the folder was renamed."""
     tiffs = tiffs_in(folder)
-    digits = int(log.number("Filename Index Length", otherwise=4))
+    length = log.number("Filename Index Length", otherwise=4)
+    digits = int(require_number("Filename Index Length", length, at_least=0, at_most=_MOST_DIGITS))
     for prefix in (log.text("Filename Prefix"), stem, ""):
         name = re.compile(rf"{re.escape(prefix)}_*\d{{{digits}}}" if prefix else rf".*\d{{{digits}}}", re.I)
         chosen = [file for file in tiffs if name.fullmatch(file.stem)]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from tomo_polysplat.checks import did_you_mean, fail, require_array, require_choice, require_number
-from tomo_polysplat.files import existing_file
+from tomo_polysplat.files import file_content
 from tomo_polysplat.physics.filter_text import require_filters
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
 from tomo_polysplat.scan.readers.picture_files import frames_of
@@ -65,9 +65,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     ValueError
         If it is none, or large.
     """
-    if path.stat().st_size > _MOST_BYTES:
-        raise fail("path", f"a TOML file of at most {_MOST_BYTES} bytes", f"{path.stat().st_size}")
-    text = path.read_text(encoding="utf-8", errors="replace")
+    text = file_content(path, _MOST_BYTES).decode("utf-8", "replace").replace("\r\n", "\n")
     try:
         if sys.version_info >= (3, 11):
             import tomllib
@@ -168,7 +166,7 @@ def view_degrees(stated: Mapping[str, Any], folder: Path, views: int) -> np.ndar
 def _angle_file(name: str | Path, folder: Path) -> np.ndarray:
     """The last number of each line."""
     path = folder / name if (folder / name).is_file() else Path(name)
-    lines = existing_file(path, "degrees").read_text(encoding="utf-8", errors="replace").splitlines()
+    lines = file_content(path, _MOST_BYTES, "degrees").decode("utf-8", "replace").splitlines()
     try:
         fields = [line.replace(",", " ").replace(";", " ").split() for line in lines]
         return np.array([float(words[-1]) for words in fields if words and not words[0].startswith("#")])
