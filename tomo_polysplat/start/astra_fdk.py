@@ -121,13 +121,18 @@ def fdk_cuda_tensor(
             astra.data3d.delete(identifier)
     torch.cuda.synchronize(index)
     if not bool(torch.isfinite(volume).all()):
-        of_rays, of_voxels, free = sinogram.nbytes, volume.nbytes, free_bytes(sinogram.device)
-        raise RuntimeError(
-            f"ASTRA's FDK_CUDA left voxels unwritten: beside its {in_gigabytes(of_rays)} of projections and"
-            f" {in_gigabytes(of_voxels)} of voxels it needs about {in_gigabytes(of_rays)}, and"
-            f" {in_gigabytes(free)} of {sinogram.device} are free."
-        )
+        raise RuntimeError(_no_room(sinogram, volume))
     return volume
+
+
+def _no_room(sinogram: torch.Tensor, volume: torch.Tensor) -> str:
+    """What ASTRA needed and what there is, in words."""
+    of_rays, of_voxels, free = sinogram.nbytes, volume.nbytes, free_bytes(sinogram.device)
+    return (
+        f"ASTRA's FDK_CUDA left voxels unwritten: beside its {in_gigabytes(of_rays)} of projections and"
+        f" {in_gigabytes(of_voxels)} of voxels it needs about {in_gigabytes(of_rays)}, and"
+        f" {in_gigabytes(free)} of {sinogram.device} are free."
+    )
 
 
 def _filter(sinogram: torch.Tensor, geometry: Geometry, filter_name: str) -> None:
