@@ -49,6 +49,7 @@ class _Known:
     agreement: list[float | None] | None = None
     photons: float | None = None
     solid: bool = False
+    taken: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,6 +228,45 @@ class Problem:
                 known = (light, level.sub_(dimmed), constant)
             self._known.level[device] = known
         return known[1:]
+
+    @property
+    def taken(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """What `take_out` was given, gains and drift, one after the other."""
+        return self._known.taken
+
+    @property
+    def gains(self) -> np.ndarray:
+        """(rows, columns) of log-gains that were taken out of what was measured."""
+        shape = (self.geometry.rows, self.geometry.columns)
+        return sum((gains for gains, _ in self.taken), np.zeros(shape))
+
+    @property
+    def drift(self) -> np.ndarray:
+        """(views,) of log-factors of the light, likewise."""
+        return sum((drift for _, drift in self.taken), np.zeros(len(self.projections)))
+
+    def take_out(self, gains: np.ndarray | None = None, drift: np.ndarray | None = None) -> None:
+        """Take -log of each pixel's gain and of each view's light out of what was measured, in place.
+
+        The copies on devices change, and so do all rays that were made of them.
+        """
+        shape = (self.geometry.rows, self.geometry.columns)
+        parts = (
+            np.zeros(shape) if gains is None else gains,
+            np.zeros(len(self.projections)) if drift is None else drift,
+        )
+        rounded = (parts[0].astype(np.float32), parts[1].astype(np.float32))
+        self.taken.append(rounded)
+        for values in [*self._known.copies.values(), *(known[1] for known in self._known.level.values())]:
+            values -= torch.from_numpy(rounded[0]).to(values.device)
+            values -= torch.from_numpy(rounded[1]).to(values.device)[:, None, None]
+
+    def told_light(self) -> dict[str, np.ndarray]:
+        """Gains and drift that were taken out, where any were, the views in the caller's order."""
+        gains, drift = self.gains.astype(np.float32), self.drift.astype(np.float32)
+        if self.order is not None:
+            drift = drift[np.argsort(self.order)]
+        return {name: part for name, part in (("gains", gains), ("drift", drift)) if part.any()}
 
     def let_go_of_level(self) -> None:
         """Forget rays made level for physics that is not used: they take as much memory as those measured."""

@@ -61,6 +61,10 @@ class Result:
         Words on what it was made from and with: scanner, volume, spectrum, device and software.
     geometry : dict, optional
         ASTRA's vector geometry of the projections, in `unit`: as told, or as ``align`` has found it.
+    gains : float32 array (rows, columns), optional
+        Logarithm of each pixel's gain, less the sign: what was taken out of -log(I/I0); None where none was.
+    drift : float32 array (views,), optional
+        Likewise of each view's light.
     seconds : float
         Time that the reconstruction took.
     flipped_2d : bool
@@ -80,6 +84,8 @@ class Result:
     settings: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
     geometry: dict[str, Any] | None = None
+    gains: np.ndarray | None = None
+    drift: np.ndarray | None = None
     seconds: float = 0.0
     flipped_2d: bool = False
 
