@@ -7,7 +7,7 @@ the first reconstruction on happens in them, so that no choice, and not even rou
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -18,6 +18,7 @@ from tomo_polysplat.checks import require_choice
 from tomo_polysplat.fit.inside import matter_is_inside
 from tomo_polysplat.fit.memory import projections_stay
 from tomo_polysplat.fit.surroundings import widened_grid
+from tomo_polysplat.fit.taken_out import Step, TakenOut
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.filter_map import FilterMap
 from tomo_polysplat.physics.scatter import Scatter, made_level, without_scatter
@@ -49,7 +50,7 @@ class _Known:
     agreement: list[float | None] | None = None
     photons: float | None = None
     solid: bool = False
-    taken: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
+    taken: list[Step] = field(default_factory=list)
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,43 +231,15 @@ class Problem:
         return known[1:]
 
     @property
-    def taken(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """What `take_out` was given, gains and drift, one after the other."""
-        return self._known.taken
+    def taken(self) -> TakenOut:
+        """Gains and drift that were taken out of what was measured."""
+        known = self._known
 
-    @property
-    def gains(self) -> np.ndarray:
-        """(rows, columns) of log-gains that were taken out of what was measured."""
-        shape = (self.geometry.rows, self.geometry.columns)
-        return sum((gains for gains, _ in self.taken), np.zeros(shape))
+        def copies() -> Iterator[torch.Tensor]:
+            yield from known.copies.values()
+            yield from (level[1] for level in known.level.values())
 
-    @property
-    def drift(self) -> np.ndarray:
-        """(views,) of log-factors of the light, likewise."""
-        return sum((drift for _, drift in self.taken), np.zeros(len(self.projections)))
-
-    def take_out(self, gains: np.ndarray | None = None, drift: np.ndarray | None = None) -> None:
-        """Take -log of each pixel's gain and of each view's light out of what was measured, in place.
-
-        The copies on devices change, and so do all rays that were made of them.
-        """
-        shape = (self.geometry.rows, self.geometry.columns)
-        parts = (
-            np.zeros(shape) if gains is None else gains,
-            np.zeros(len(self.projections)) if drift is None else drift,
-        )
-        rounded = (parts[0].astype(np.float32), parts[1].astype(np.float32))
-        self.taken.append(rounded)
-        for values in [*self._known.copies.values(), *(known[1] for known in self._known.level.values())]:
-            values -= torch.from_numpy(rounded[0]).to(values.device)
-            values -= torch.from_numpy(rounded[1]).to(values.device)[:, None, None]
-
-    def told_light(self) -> dict[str, np.ndarray]:
-        """Gains and drift that were taken out, where any were, the views in the caller's order."""
-        gains, drift = self.gains.astype(np.float32), self.drift.astype(np.float32)
-        if self.order is not None:
-            drift = drift[np.argsort(self.order)]
-        return {name: part for name, part in (("gains", gains), ("drift", drift)) if part.any()}
+        return TakenOut(self.projections.shape, known.taken, copies)
 
     def let_go_of_level(self) -> None:
         """Forget rays made level for physics that is not used: they take as much memory as those measured."""

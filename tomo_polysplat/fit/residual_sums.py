@@ -29,8 +29,8 @@ class ResidualSums:
     ----------
     weight, total : (blocks, rows, columns) array
         By pixel, of the fitted rays; see `nuisances.gain_estimate.gains_of_pixels`.
-    count, by_depth : (views, depths) array
-        By view, likewise; see `nuisances.gain_estimate.drift_of_views`.
+    count, by_depth : (2, views, depths) array
+        By view, of the left half of the detector and of the right one; see `nuisances.gain_estimate.drift_of_views`.
     view, pixel : (n,) int array
         Of the rays held out.
     residual, deviation : (n,) array
@@ -61,10 +61,13 @@ def residual_sums(gaussians: Gaussians, scene: FitScene, rays: Rays, settings: S
     allowed = max(settings.model_error, _LEAST_ERROR)
     views, rows, columns = len(rays.views), rays.views.rows, rays.views.columns
     blocks = min(_BLOCKS, views)
-    block = _blocks(views, blocks)
-    weight, total = torch.zeros((2, blocks, rows, columns), dtype=torch.float64, device=rays.target)
-    count, by_depth = torch.zeros((2, views, len(_DEPTHS) + 1), dtype=torch.float64, device=rays.target)
-    ends = torch.tensor(_DEPTHS, device=rays.target)
+    double = torch.zeros((), dtype=torch.float64, device=rays.target)
+    block = torch.from_numpy(_blocks(views, blocks)).to(rays.target)
+    weight, total = double.new_zeros((2, blocks, rows, columns))
+    ends, many = torch.tensor(_DEPTHS, device=rays.target), len(_DEPTHS) + 1
+    count, by_depth = double.new_zeros((2, views, 2, many))
+    # The right half's depths come after the left one's, and what is not fitted after both.
+    right = many * (torch.arange(columns, device=rays.target) >= columns // 2)
     held: list[list[torch.Tensor]] = []
     for first in range(0, views, _AT_ONCE):
         some = np.arange(first, min(first + _AT_ONCE, views))
@@ -73,13 +76,13 @@ def residual_sums(gaussians: Gaussians, scene: FitScene, rays: Rays, settings: S
         far = _FAR * allowed / fitted.clamp(min=1e-12)
         left = (measured - predicted).maximum(-far).minimum(far)
         trust = fitted.square()
-        for k, view in enumerate(some.tolist()):
-            weight[block[view]] += trust[k]
-            total[block[view]] += trust[k] * left[k]
-            used = trust[k] > 0
-            depth = torch.bucketize(predicted[k][used], ends)
-            count[view] += torch.bincount(depth, minlength=len(_DEPTHS) + 1)
-            by_depth[view] += torch.bincount(depth, left[k][used].double(), minlength=len(_DEPTHS) + 1)
+        weight.index_add_(0, block[first : some[-1] + 1], trust.double())
+        total.index_add_(0, block[first : some[-1] + 1], (trust * left).double())
+        depth = torch.where(trust > 0, torch.bucketize(predicted, ends) + right, 2 * many)
+        depth = depth.flatten(1) + (2 * many + 1) * torch.arange(len(some), device=depth.device)[:, None]
+        for into, values in ((count, None), (by_depth, left.double().flatten())):
+            found = torch.bincount(depth.flatten(), values, minlength=len(some) * (2 * many + 1))
+            into[some[0] : some[-1] + 1] = found.reshape(len(some), -1)[:, :-1].reshape(-1, 2, many)
         where = (aside > 0).nonzero(as_tuple=True)
         held.append(
             [
@@ -90,7 +93,8 @@ def residual_sums(gaussians: Gaussians, scene: FitScene, rays: Rays, settings: S
             ]
         )
     aside_parts = [torch.cat(parts).cpu().numpy() for parts in zip(*held)]
-    maps = [part.cpu().numpy() for part in (weight, total, count, by_depth)]
+    sums = (weight, total, count.transpose(0, 1), by_depth.transpose(0, 1))
+    maps = [part.cpu().numpy() for part in sums]
     return ResidualSums(*maps, *aside_parts)
 
 

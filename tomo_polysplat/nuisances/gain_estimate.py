@@ -11,17 +11,19 @@ import math
 
 import numpy as np
 
-__all__ = ["drift_of_views", "gains_of_pixels"]
+__all__ = ["drift_of_views", "gains_of_pixels", "less_rings"]
 
 # Blocks of pixels over which a variance is averaged: one pixel's is rough.
 _AROUND = 7
 # Deviation, in waves per detector, over which the power of waves is averaged.
 _WAVES = 3.0
+# Share of what opposite pixels have in common that is taken for gains (docs/gains.md).
+_OF_RINGS = 0.5
 # What lies beyond so many deviations of the most is one pixel's fault and does not count for all.
 _FAR = 4.0
 # The median of an exponential distribution in its means; a normal deviation in median absolute ones.
 _MEDIAN, _NORMAL = math.log(2), 1.4826
-_ROUNDS = 8
+_ROUNDS, _FEWEST_VIEWS = 8, 5
 
 
 def gains_of_pixels(weight: np.ndarray, total: np.ndarray) -> np.ndarray:
@@ -52,6 +54,25 @@ def gains_of_pixels(weight: np.ndarray, total: np.ndarray) -> np.ndarray:
     waves = np.fft.fft2(believed) * np.minimum(1.0, floor / np.maximum(_averaged(power), floor))
     waves[0, 0] = 0.0
     return np.where(good, np.fft.ifft2(waves).real, 0.0)
+
+
+def less_rings(gains: np.ndarray, axis: float) -> np.ndarray:
+    """Gains, (rows, columns), less a part of what the object can show as rings.
+
+    Pixels as far from the axis of rotation, on both sides, see the same ring: what they have in common is as well the
+    object's, and the residual of it as well an error of the fit.
+
+    Parameters
+    ----------
+    gains : (rows, columns) array
+    axis : float
+        Column of the axis of rotation. A pixel without another on the other side has all in common with itself.
+    """
+    columns = np.arange(gains.shape[1])
+    others = np.rint(2 * axis - columns).astype(int)
+    others = np.where((others >= 0) & (others < len(columns)), others, columns)
+    common = 0.5 * (gains + gains[:, others])
+    return gains - (1 - _OF_RINGS) * common
 
 
 def _means(weight: np.ndarray, total: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -100,30 +121,41 @@ def drift_of_views(count: np.ndarray, total: np.ndarray) -> np.ndarray:
     """Log-factor of the light of each view, (views,), without mean.
 
     Rays of like depth go together: those beside the object, which hardly any model misses, differ between views by
-    little else than the source, and count most. Each depth's weight is the inverse of the variance that it shows.
+    little else than the source, and count most. By how much a depth is wrong is told by the two halves of the
+    detector, which see the same source; what both have in common is believed.
 
     Parameters
     ----------
-    count, total : (views, depths) array
-        Number of rays and sum of measurement less model.
+    count, total : (2, views, depths) array
+        Number of rays and sum of measurement less model, of the left half of the detector and of the right one.
     """
-    enough = count > 0
-    depths = enough.mean(axis=0) > 0.5
-    if not depths.any() or len(count) < 3:
-        return np.zeros(len(count))
-    count, total, enough = count[:, depths], total[:, depths], enough[:, depths]
-    mean = np.where(enough, total / np.maximum(count, 1), 0.0)
-    apart = np.zeros(mean.shape[1])
-    trust = np.ones(mean.shape[1])
+    there = (count[0] > 0) & (count[1] > 0)
+    depths = there.mean(axis=0) > 0.5
+    count, total, there = count[..., depths], total[..., depths], there[:, depths]
+    halves = np.where(there, total / np.maximum(count, 1), 0.0)
+    views = len(there)
+    if not depths.any() or views < _FEWEST_VIEWS:
+        return np.zeros(views)
+    apart = [_without_means(half, there) for half in halves]
+    own = ((apart[0] - apart[1]) ** 2).sum(axis=0) / there.sum(axis=0)
+    trust = np.where(there, 1 / np.maximum(own, 1e-16), 0.0)
+    left, right = (_drift_of_half(half, trust, there) for half in halves)
+    drift, noise = 0.5 * (left + right), 0.25 * float((left - right).var())
+    excess = max(0.0, float(drift.var()) - noise)
+    return drift * excess / (excess + noise) if excess > 0 else np.zeros(views)
+
+
+def _drift_of_half(mean: np.ndarray, trust: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """(views,) weighted mean of (views, depths), each depth less its own mean over the views."""
     drift = np.zeros(len(mean))
     for _ in range(_ROUNDS):
-        weight = np.where(enough, trust, 0.0)
-        drift = (weight * (mean - apart)).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-300)
+        apart = _without_means(mean - drift[:, None], there) + drift[:, None] * there
+        drift = (trust * apart).sum(axis=1) / np.maximum(trust.sum(axis=1), 1e-300)
         drift -= drift.mean()
-        apart = np.where(enough, mean - drift[:, None], 0.0).sum(axis=0) / enough.sum(axis=0)
-        left = np.where(enough, (mean - apart - drift[:, None]) ** 2, 0.0).sum(axis=0) / enough.sum(axis=0)
-        # One depth alone would explain itself: no variance is less than a share of the usual.
-        trust = 1 / np.maximum(left, 1e-2 * np.median(left) + 1e-16)
-    noise = 1 / trust.sum()
-    excess = max(0.0, float(drift.var()) - noise)
-    return drift * excess / (excess + noise) if excess > 0 else np.zeros(len(drift))
+    return drift
+
+
+def _without_means(values: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """(views, depths) less the mean of each depth over the views; 0 where there is none."""
+    means = np.where(there, values, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
+    return np.where(there, values - means, 0.0)

@@ -25,6 +25,7 @@ from tomo_polysplat.files import replacing, require_replaceable, require_writabl
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.snapshot import PARTS, Snapshot
 from tomo_polysplat.fit.stopping import StopReason
+from tomo_polysplat.fit.taken_out import Step
 from tomo_polysplat.json_text import parse_json
 from tomo_polysplat.model.gaussians import OF_ALL, Gaussians
 from tomo_polysplat.plan.decision import When
@@ -86,7 +87,7 @@ class Checkpoint:
         self.scan, self.options = _digest(problem), json.loads(json.dumps(dict(options)))
         self.plan: Plan | None = None
         self.snapshot: Snapshot | None = None
-        self._taken: list[tuple[np.ndarray, np.ndarray]] = []
+        self._taken: list[Step] = []
         self._written, self._took = 0.0, 0.0
         if self.path.exists():
             self._read()
@@ -99,8 +100,8 @@ class Checkpoint:
     def share_taken(self, problem: Problem) -> None:
         """Take out of what was measured what the run had taken out, and keep what it will, from now on."""
         for gains, drift in self._taken:
-            problem.take_out(gains, drift)
-        self._taken = problem.taken
+            problem.taken.add(gains, drift)
+        self._taken = problem.taken.steps
 
     def offer(self, make: Callable[[], Snapshot], *, now: bool) -> None:
         """Write what ``make`` returns, unless that has only just been done; ``now`` writes it in any case.
@@ -231,7 +232,7 @@ def _finite(values: list[Any]) -> bool:
     )
 
 
-def _taken(arrays: dict[str, np.ndarray], rays: tuple[int, ...]) -> list[tuple[np.ndarray, np.ndarray]]:
+def _taken(arrays: dict[str, np.ndarray], rays: tuple[int, ...]) -> list[Step]:
     """Gains and drift that had been taken out, in their order."""
     if "taken/gains" not in arrays and "taken/drift" not in arrays:
         return []

@@ -15,7 +15,7 @@ from tomo_polysplat.fit.optimise import Run
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.residual_sums import ResidualSums, residual_sums
 from tomo_polysplat.nuisances.drift import Drift
-from tomo_polysplat.nuisances.gain_estimate import drift_of_views, gains_of_pixels
+from tomo_polysplat.nuisances.gain_estimate import drift_of_views, gains_of_pixels, less_rings
 from tomo_polysplat.nuisances.gains import Gains
 from tomo_polysplat.nuisances.nuisance import Nuisance
 from tomo_polysplat.plan.answer import Answer, Status
@@ -67,13 +67,14 @@ class SteadyLight:
         fitter = run.fitter
         sums = residual_sums(fitter.gaussians, fitter.scene, fitter.rays, fitter.settings)
         if self.wanted[Drift.name] is not False:
-            taken = self.problem.drift
+            taken = self.problem.taken.drift
             found = drift_of_views(sums.count, sums.by_depth + sums.count * taken[:, None])
             change = self._judge(Drift, found, taken, sums, sums.view)
             sums = sums.without_drift(change)
         if self.wanted[Gains.name] is not False:
-            taken = self.problem.gains
+            taken = self.problem.taken.gains
             found = gains_of_pixels(sums.weight, sums.total + sums.weight * taken)
+            found = less_rings(found, _axis_column(self.problem))
             self._judge(Gains, found, taken, sums, sums.pixel)
 
     def _in_vain(self, asked: int) -> bool:
@@ -95,13 +96,19 @@ class SteadyLight:
         kept = verdict.kept or (self.wanted[kind.name] is True and evidence["rms"] > 0)
         change = found - taken if kept else -taken
         if change.any():
-            self.problem.take_out(**{kind.name: change})
+            self.problem.taken.add(**{kind.name: change})
         value = evidence["rms"] if kept else 0.0
         told = {name: number for name, number in evidence.items() if math.isfinite(number)}
         told["asked"] = float(self.asked)
         self.plan.facts[kind.name] = Answer(value, verdict.why, Status.ASKED, told)
         logger.info("%s: %s, %s.", kind.name.capitalize(), "taken out" if kept else "none", verdict.why)
         return change
+
+
+def _axis_column(problem: Problem) -> float:
+    """Where the axis of rotation is seen, in the mean of the views."""
+    seen = problem.geometry.project_points(-problem.centre[None] / problem.length)
+    return float(np.mean(seen[..., 0]))
 
 
 def _evidence(
