@@ -223,6 +223,7 @@ def reconstruct(
                 settings=run_options.settings.to_dict() | {"seed": run_options.seed, "quality": quality},
                 provenance=provenance(geometry, grid, unit, spectrum, run_options.device),
                 geometry=to_astra(problem.told_geometry(), grid)[0],
+                **problem.taken.told(problem.order),
             )
     result.plan["stop"] = _stopped(outcome, interruption.asked)
     if compiled_seconds() > compiled:

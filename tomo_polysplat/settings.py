@@ -46,6 +46,7 @@ _CHOICES = {
     "density_check": ("refuse", "warn"),
     "kernel": ("auto", "triton", "numba", "reference"),
 }
+_SWITCHES = ("gains", "drift")
 
 
 @dataclass(frozen=True)
@@ -165,6 +166,11 @@ class Settings:
     pixel_rays: int | None = None
     """Rays a pixel and axis over which the light is averaged; 1: infinitely thin rays."""
 
+    gains: bool | None = None
+    """Whether each pixel's gain is found and taken out; None: where held-out rays confirm it."""
+    drift: bool | None = None
+    """Whether each view's light is, likewise."""
+
     # The misfit.
     loss: str = "huber"
     """"huber" or "weighted-l1", both weighted by photon statistics, or "l1" (the paper's)."""
@@ -202,6 +208,8 @@ class Settings:
                 _require_changes(name, value)
             elif field.name == "memory":
                 object.__setattr__(self, field.name, bytes_of(value, name))
+            elif field.name in _SWITCHES:
+                _require_switch(name, value)
             elif field.name in _CHOICES:
                 require_choice(name, value, _CHOICES[field.name])
             else:
@@ -230,6 +238,11 @@ def _number(name: str, value: Any, kind: str) -> float | int:
     if number != int(number):
         raise fail(name, "a whole number", repr(value))
     return int(number)
+
+
+def _require_switch(name: str, value: Any) -> None:
+    if not isinstance(value, bool):
+        raise fail(name, "True, False, or None for the rays to decide", repr(value), error=TypeError)
 
 
 def _require_changes(name: str, value: Any) -> None:

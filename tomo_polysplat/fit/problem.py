@@ -7,7 +7,7 @@ the first reconstruction on happens in them, so that no choice, and not even rou
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -18,6 +18,7 @@ from tomo_polysplat.checks import require_choice
 from tomo_polysplat.fit.inside import matter_is_inside
 from tomo_polysplat.fit.memory import projections_stay
 from tomo_polysplat.fit.surroundings import widened_grid
+from tomo_polysplat.fit.taken_out import Step, TakenOut
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.filter_map import FilterMap
 from tomo_polysplat.physics.scatter import Scatter, made_level, without_scatter
@@ -49,6 +50,7 @@ class _Known:
     agreement: list[float | None] | None = None
     photons: float | None = None
     solid: bool = False
+    taken: list[Step] = field(default_factory=list)
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,6 +235,17 @@ class Problem:
                 known = (light, level.sub_(dimmed), constant)
             self._known.level[device] = known
         return known[1:]
+
+    @property
+    def taken(self) -> TakenOut:
+        """Gains and drift that were taken out of what was measured."""
+        known = self._known
+
+        def copies() -> Iterator[torch.Tensor]:
+            yield from known.copies.values()
+            yield from (level[1] for level in known.level.values())
+
+        return TakenOut(self.projections.shape, known.taken, copies)
 
     def let_go_of_level(self) -> None:
         """Forget rays made level for physics that is not used: they take as much memory as those measured."""

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from tomo_polysplat.nuisances.alignment import Alignment
 from tomo_polysplat.nuisances.detector_blur import BlurOfDetector
+from tomo_polysplat.nuisances.drift import Drift
 from tomo_polysplat.nuisances.filters import Filters
+from tomo_polysplat.nuisances.gains import Gains
 from tomo_polysplat.nuisances.nuisance import Nuisance
 from tomo_polysplat.nuisances.open_beam import OpenBeam
 from tomo_polysplat.nuisances.pixel_light import PixelLight
@@ -22,6 +24,8 @@ NUISANCES: tuple[type[Nuisance], ...] = (
     Filters,
     BlurOfDetector,
     PixelLight,
+    Gains,
+    Drift,
 )
 # Those that a known density tells, by name.
 SPECTRAL = {kind.name: kind for kind in NUISANCES if issubclass(kind, SpectralFactor)}

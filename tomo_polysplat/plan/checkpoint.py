@@ -25,6 +25,7 @@ from tomo_polysplat.files import replacing, require_replaceable, require_writabl
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.snapshot import PARTS, Snapshot
 from tomo_polysplat.fit.stopping import StopReason
+from tomo_polysplat.fit.taken_out import Step
 from tomo_polysplat.json_text import parse_json
 from tomo_polysplat.model.gaussians import OF_ALL, Gaussians
 from tomo_polysplat.plan.decision import When
@@ -37,7 +38,7 @@ __all__ = ["Checkpoint"]
 
 logger = logging.getLogger(__name__)
 
-FORMAT = 18
+FORMAT = 19
 # Writing takes at most this share of the time.
 _LARGEST_SHARE = 0.05
 _FITTED = tuple(name for name in PARTS if name != "group")
@@ -46,7 +47,7 @@ _DAMAGES = (KeyError, IndexError, TypeError, AttributeError, RecursionError, Ove
 _NAMES = (
     *(f"{kind}/{name}" for kind in ("gaussians", "best") for name in PARTS),
     *(f"{moment}/{name}" for moment in ("first", "second") for name in _FITTED),
-    *("pull", "order", "about"),
+    *("pull", "order", "about", "taken/gains", "taken/drift"),
 )
 
 
@@ -82,10 +83,11 @@ class Checkpoint:
         self._lock = FileLock(self.path, "checkpoint")
         # Another run may have written it and ended since.
         require_replaceable(self.path, resume, remedy, "checkpoint")
-        self._views = len(problem.projections)
+        self._views, self._pixels = len(problem.projections), problem.projections.shape
         self.scan, self.options = _digest(problem), json.loads(json.dumps(dict(options)))
         self.plan: Plan | None = None
         self.snapshot: Snapshot | None = None
+        self._taken: list[Step] = []
         self._written, self._took = 0.0, 0.0
         if self.path.exists():
             self._read()
@@ -94,6 +96,12 @@ class Checkpoint:
     def seconds(self) -> float:
         """What the run has taken so far."""
         return 0.0 if self.snapshot is None else self.snapshot.numbers["seconds"]
+
+    def share_taken(self, problem: Problem) -> None:
+        """Take out of what was measured what the run had taken out, and keep what it will, from now on."""
+        for gains, drift in self._taken:
+            problem.taken.add(gains, drift)
+        self._taken = problem.taken.steps
 
     def offer(self, make: Callable[[], Snapshot], *, now: bool) -> None:
         """Write what ``make`` returns, unless that has only just been done; ``now`` writes it in any case.
@@ -115,6 +123,8 @@ class Checkpoint:
         about = {"format": FORMAT, "scan": self.scan, "options": self.options, "plan": self.plan.to_dict()}
         text = json.dumps(about | {"numbers": snapshot.numbers}, default=str)
         arrays = snapshot.arrays() | {"about": np.frombuffer(text.encode(), np.uint8)}
+        for name, parts in zip(("taken/gains", "taken/drift"), zip(*self._taken)):
+            arrays[name] = np.stack(parts)
         needed = sum(array.nbytes for array in arrays.values())
         with (
             replacing(self.path, overwrite=True, needed_bytes=needed) as temporary,
@@ -130,6 +140,7 @@ class Checkpoint:
             self.plan = _plan(about["plan"])
             _require_calibration(self.plan, self.options.get("calibration"))
             _require_moves(self.plan, self.options.get("align"))
+            self._taken = _taken(arrays, self._pixels)
             self.snapshot = _snapshot(arrays, dict(about["numbers"]), self._views)
         except _DAMAGES as error:
             raise self._damaged(f"{type(error).__name__} {error}") from error
@@ -219,6 +230,18 @@ def _finite(values: list[Any]) -> bool:
     return all(
         _finite(v) if isinstance(v, list) else type(v) in (int, float) and math.isfinite(v) for v in values
     )
+
+
+def _taken(arrays: dict[str, np.ndarray], rays: tuple[int, ...]) -> list[Step]:
+    """Gains and drift that had been taken out, in their order."""
+    if "taken/gains" not in arrays and "taken/drift" not in arrays:
+        return []
+    gains, drift = arrays["taken/gains"], arrays["taken/drift"]
+    good = gains.shape[1:] == rays[1:] and drift.shape[1:] == rays[:1] and len(gains) == len(drift)
+    finite = all(part.dtype == np.float32 and np.isfinite(part).all() for part in (gains, drift))
+    if not (good and finite):
+        raise TypeError("gains and drift")
+    return list(zip(gains, drift))
 
 
 def _snapshot(arrays: dict[str, np.ndarray], numbers: dict[str, Any], views: int) -> Snapshot:

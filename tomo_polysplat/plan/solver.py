@@ -29,6 +29,7 @@ from tomo_polysplat.plan.never_worse import judge, note_seeds
 from tomo_polysplat.plan.order import ask_between, decide
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.preparation import PreparedFit, RunOptions, calibrate, physics, prepare, under
+from tomo_polysplat.plan.steady_light import SteadyLight
 
 __all__ = ["Solver"]
 
@@ -36,6 +37,8 @@ logger = logging.getLogger(__name__)
 
 # Seconds that are kept for what comes after the fit besides the volume, where there is a time budget.
 _FINISHING = 0.03
+# Facts that a run which begins anew does not find again.
+_STAYS = ("alignment", "gains", "drift")
 
 
 @dataclass(frozen=True)
@@ -85,6 +88,8 @@ class Solver:
         problem, plan = physics(problem, wanted, self.run_options, self.saved, self.report)
         plan.facts |= alignment
         prepared = prepare(problem, plan, self.run_options, self.saved, self.report)
+        if self.saved is not None:
+            self.saved.share_taken(problem)
         outcome = self._fit(prepared, problem, ask_scatter)
         if outcome.restart is not None:
             problem, prepared, outcome = self._anew(problem, prepared, outcome)
@@ -127,8 +132,7 @@ class Solver:
         """What `solve` gives, under other physics than those that a fit had begun with."""
         found = so_far.restart
         other, plan = under(problem, found)
-        if "alignment" in prepared.plan.facts:
-            plan.facts["alignment"] = prepared.plan.facts["alignment"]
+        plan.facts |= {name: fact for name, fact in prepared.plan.facts.items() if name in _STAYS}
         try:
             anew = prepare(other, plan, self.run_options, self.saved, self.report)
             outcome = self._fit(anew, other, ask_scatter=False)
@@ -200,7 +204,13 @@ class Solver:
         lab.calibrate, lab.gaussians = scatter if ask_scatter else None, prepared.gaussians
         decide(lab, When.DURING)
         lab.gaussians = None
-        return lambda run: ask_between(lab, run)
+        steady = SteadyLight(problem, prepared.plan, options.settings)
+
+        def between(run: Run) -> None:
+            steady.between(run)
+            ask_between(lab, run)
+
+        return between
 
     def _deadline(self, prepared: PreparedFit) -> float | None:
         """When the fit ends at the latest, so that the volume is made in time."""

@@ -60,6 +60,8 @@ _TOLD = {
     "detector_blur": "The detector's blur",
     "fitted_blur": "The blur that was found",
     "pixel_rays": "Rays a pixel and axis",
+    "gains": "Gains of the pixels, rms of their logarithm",
+    "drift": "The source's light from view to view, rms of its logarithm",
     "photons_per_ray": "The noise (photons of an open ray)",
     "hardening": "Beam hardening (the largest -log(I/I0))",
     "curves": "Material curves",
@@ -115,6 +117,7 @@ def _of_nuisances(plan: Mapping[str, Answer]) -> dict[str, Any]:
     values |= plan["calibration"].value["fitted"] if "calibration" in plan else {}
     if "fitted_blur" in plan and plan["detector_blur"].status is Status.ASKED:
         values["blur"] = plan["fitted_blur"].value
+    values |= {name: plan[name].value for name in ("gains", "drift") if name in plan}
     return values | ({"pixel_rays": plan["pixel_rays"].value} if "pixel_rays" in plan else {})
 
 

@@ -127,6 +127,7 @@ def residuals_of(
     spectrum = result.spectrum if result.materials is not None else None
     correction = scan.water_correction if spectrum is not None else None
     values, _ = usable_rays(scan.projections, scan.proj_geom, scan.usable, correction, spectrum)
+    values = _as_steady(values, result)
     geometry, grid = from_astra(scan.proj_geom, scan.vol_geom)
     count = min(most_views, geometry.views)
     chosen = np.unique(np.linspace(0, geometry.views - 1, count).round().astype(int))
@@ -140,6 +141,14 @@ def residuals_of(
     unseen = HeldOut(geometry, grid, values, float(result.settings.get("held_out", 0.0)))
     photons = photons_per_ray(values, model.dimmed)
     return _collected(model, values, chosen, photons, MisfitMap(some, grid), unseen)
+
+
+def _as_steady(values: np.ndarray, result: Result) -> np.ndarray:
+    """The projections (views, rows, columns) less gains and drift that the fit has taken out, in place."""
+    for part, shape in ((result.gains, values.shape[1:]), (result.drift, (len(values), 1, 1))):
+        if part is not None:
+            values -= np.asarray(part, values.dtype).reshape(shape)
+    return values
 
 
 class _Model:

@@ -60,6 +60,8 @@ _RANGES = {
 }
 # Numbers in a part of a Gaussian: its rotation has them.
 _MOST_PARTS = 4
+# Dimensions of what was taken out of the rays, and the largest logarithm of a gain.
+_LIGHT, _STRONGEST = {"gains": 2, "drift": 1}, 1e3
 JSON_PARTS = ("history", "plan", "counts", "settings", "provenance", "geometry")
 
 
@@ -116,6 +118,9 @@ def _write_model(group: Any, result: Result) -> None:
     basis.attrs["unit"] = "g/cm3" if result.materials is not None else f"1/{result.unit}"
     for name, values in result.gaussians.items():
         group[f"gaussians/{name}"] = values
+    for name in _LIGHT:
+        if (part := getattr(result, name)) is not None:
+            group[name] = part
     write_spectrum(group, result.spectrum)
     if result.materials is not None:
         group["materials"] = json.dumps(plain(list(result.materials)))
@@ -152,6 +157,7 @@ def load_hdf5(path: str | os.PathLike) -> Result:
             spectrum=read_spectrum(group),
             gaussians=_read_gaussians(group, planar=basis.shape[1] == 1),
             **_read_parts(group),
+            **_read_light(group),
             seconds=require_number(
                 "seconds in the file", number_attribute(group, "seconds") or 0.0, at_least=0
             ),
@@ -187,6 +193,18 @@ def _read_gaussians(group: Any, planar: bool) -> dict[str, np.ndarray]:
     if planar:
         _require_range("gaussians/scale", parts["scale"], 0.0, math.inf)
     return parts
+
+
+def _read_light(group: Any) -> dict[str, Any]:
+    """Gains and drift that were taken out, where there are any."""
+    found: dict[str, Any] = {}
+    for name, dimensions in _LIGHT.items():
+        if find_array(group, name) is not None:
+            found[name] = read_numbers(group, name).astype(np.float32)
+            if found[name].ndim != dimensions:
+                raise fail(f"/polysplat/{name}", f"{dimensions} dimensions", f"{found[name].shape}")
+            _require_range(name, found[name], -_STRONGEST, _STRONGEST)
+    return found
 
 
 def _require_range(name: str, values: np.ndarray, low: float, high: float) -> None:

@@ -67,6 +67,10 @@ class Result:
         ASTRA's vector geometry of the projections, in `unit`: as told, or as ``align`` has found it.
     residuals : Residuals, optional
         How well the rays are explained, once :meth:`explain` or a report has looked at the scan; it is saved.
+    gains : float32 array (rows, columns), optional
+        Logarithm of each pixel's gain, less the sign: what was taken out of -log(I/I0); None where none was.
+    drift : float32 array (views,), optional
+        Likewise of each view's light.
     seconds : float
         Time that the reconstruction took.
     flipped_2d : bool
@@ -86,6 +90,8 @@ class Result:
     settings: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
     geometry: dict[str, Any] | None = None
+    gains: np.ndarray | None = None
+    drift: np.ndarray | None = None
     seconds: float = 0.0
     flipped_2d: bool = False
     residuals: Residuals | None = None

@@ -1,0 +1,67 @@
+"""Sums of residuals against loops over the rays."""
+
+import numpy as np
+import torch
+
+from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.residual_sums import residual_sums
+from tomo_polysplat.fit.taken_out import TakenOut
+from tomo_polysplat.kernels.views import DetectorViews
+from tomo_polysplat.settings import Settings
+
+VIEWS, ROWS, COLUMNS, PREDICTED = 19, 5, 7, 0.4
+
+
+class FlatScene:
+    """Predicts the same for every ray."""
+
+    def projections(self, gaussians, views):
+        return torch.full((len(views), ROWS, COLUMNS), PREDICTED), 0
+
+
+def rays(values, held_out=0.2):
+    views = DetectorViews(True, np.zeros((VIEWS, 3)), np.zeros((VIEWS, 3, 3)), ROWS, COLUMNS)
+    return Rays(torch.from_numpy(values), views, 1e4, 0.015, held_out)
+
+
+def measured():
+    values = np.random.default_rng(0).normal(PREDICTED, 0.01, (VIEWS, ROWS, COLUMNS)).astype(np.float32)
+    values[3, 1, 2] = values[:, 4, 4] = np.nan
+    return values
+
+
+def test_every_usable_ray_is_counted_once():
+    values = measured()
+    sums = residual_sums(None, FlatScene(), rays(values), Settings())
+    assert sums.count.sum() + len(sums.residual) == np.isfinite(values).sum()
+    assert not sums.weight[:, 4, 4].any()
+    left = values[sums.view, sums.pixel // COLUMNS, sums.pixel % COLUMNS] - PREDICTED
+    np.testing.assert_allclose(sums.residual, left, atol=1e-6)
+    aside = np.zeros(values.shape, bool)
+    aside[sums.view, sums.pixel // COLUMNS, sums.pixel % COLUMNS] = True
+    fitted = np.where(aside | np.isnan(values), 0.0, values - PREDICTED)
+    np.testing.assert_allclose(sums.by_depth.sum(axis=(0, 2)), fitted.sum(axis=(1, 2)), atol=1e-5)
+
+
+def test_a_light_that_is_taken_out_of_sums_is_that_of_the_rays():
+    values, drift = measured(), np.repeat(np.linspace(-0.01, 0.01, 8), [3, 2, 3, 2, 2, 3, 2, 2])
+    before = residual_sums(None, FlatScene(), rays(values), Settings())
+    after = residual_sums(
+        None, FlatScene(), rays((values - drift[:, None, None]).astype(np.float32)), Settings()
+    )
+    told = before.without_drift(drift)
+    np.testing.assert_allclose(told.residual, after.residual, atol=1e-6)
+    np.testing.assert_allclose(told.by_depth.sum(axis=2), after.by_depth.sum(axis=2), atol=1e-4)
+    np.testing.assert_allclose(told.total, after.total, atol=2e-3)
+
+
+def test_what_is_taken_out_is_kept_in_order():
+    values = torch.zeros((VIEWS, ROWS, COLUMNS))
+    taken = TakenOut(tuple(values.shape), [], lambda: [values])
+    gains, drift = np.full((ROWS, COLUMNS), 0.25), np.arange(VIEWS) / 4
+    taken.add(gains=gains)
+    taken.add(drift=drift)
+    assert np.array_equal(values.numpy(), np.broadcast_to(-0.25 - drift[:, None, None], values.shape))
+    assert np.array_equal(taken.gains, gains) and np.array_equal(taken.drift, drift)
+    order = np.roll(np.arange(VIEWS), 5)
+    assert np.array_equal(taken.told(order)["drift"][order], drift.astype(np.float32))

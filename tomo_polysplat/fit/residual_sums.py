@@ -1,0 +1,103 @@
+"""Sums over the rays of measurement less model: by pixel, by view, and of the rays held out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.settings import Settings
+
+__all__ = ["ResidualSums", "residual_sums"]
+
+# Blocks of views that differ by chance; ends of depths, -log(I/I0); views looked at together.
+_BLOCKS, _DEPTHS, _AT_ONCE = 8, (0.01, 0.05, 0.15, 0.3, 0.6, 1.0, 1.5, 2.0, 3.0, 4.0), 8
+# Residuals beyond so many allowed deviations count as so many.
+_FAR = 4.0
+_LEAST_ERROR = 1e-3
+
+
+@dataclass(frozen=True)
+class ResidualSums:
+    """What rays leave.
+
+    Attributes
+    ----------
+    weight, total : (blocks, rows, columns) array
+        By pixel, of the fitted rays; see `nuisances.gain_estimate.gains_of_pixels`.
+    count, by_depth : (2, views, depths) array
+        By view, of the left half of the detector and of the right one; see `nuisances.gain_estimate.drift_of_views`.
+    view, pixel : (n,) int array
+        Of the rays held out.
+    residual, deviation : (n,) array
+        Of these, measurement less model and what of it is allowed.
+    """
+
+    weight: np.ndarray
+    total: np.ndarray
+    count: np.ndarray
+    by_depth: np.ndarray
+    view: np.ndarray
+    pixel: np.ndarray
+    residual: np.ndarray
+    deviation: np.ndarray
+
+    def without_drift(self, drift: np.ndarray) -> ResidualSums:
+        """As if the views had this log-factor, (views,), less; the rays of a pixel weigh alike in a block of views."""
+        block = _blocks(len(drift), len(self.weight))
+        mean = np.bincount(block, drift) / np.bincount(block)
+        total = self.total - self.weight * mean[:, None, None]
+        by_depth = self.by_depth - self.count * drift[:, None]
+        return replace(self, total=total, by_depth=by_depth, residual=self.residual - drift[self.view])
+
+
+@torch.no_grad()
+def residual_sums(gaussians: Gaussians, scene: FitScene, rays: Rays, settings: Settings) -> ResidualSums:
+    """Those of all views."""
+    allowed = max(settings.model_error, _LEAST_ERROR)
+    views, rows, columns = len(rays.views), rays.views.rows, rays.views.columns
+    blocks = min(_BLOCKS, views)
+    double = torch.zeros((), dtype=torch.float64, device=rays.target)
+    block = torch.from_numpy(_blocks(views, blocks)).to(rays.target)
+    weight, total = double.new_zeros((2, blocks, rows, columns))
+    ends, many = torch.tensor(_DEPTHS, device=rays.target), len(_DEPTHS) + 1
+    count, by_depth = double.new_zeros((2, views, 2, many))
+    # The right half's depths come after the left one's, and what is not fitted after both.
+    right = many * (torch.arange(columns, device=rays.target) >= columns // 2)
+    held: list[list[torch.Tensor]] = []
+    for first in range(0, views, _AT_ONCE):
+        some = np.arange(first, min(first + _AT_ONCE, views))
+        seen, measured, fitted, aside = rays.batch(some)
+        predicted, _ = scene.projections(gaussians, seen)
+        far = _FAR * allowed / fitted.clamp(min=1e-12)
+        left = (measured - predicted).maximum(-far).minimum(far)
+        trust = fitted.square()
+        weight.index_add_(0, block[first : some[-1] + 1], trust.double())
+        total.index_add_(0, block[first : some[-1] + 1], (trust * left).double())
+        depth = torch.where(trust > 0, torch.bucketize(predicted, ends) + right, 2 * many)
+        depth = depth.flatten(1) + (2 * many + 1) * torch.arange(len(some), device=depth.device)[:, None]
+        for into, values in ((count, None), (by_depth, left.double().flatten())):
+            found = torch.bincount(depth.flatten(), values, minlength=len(some) * (2 * many + 1))
+            into[some[0] : some[-1] + 1] = found.reshape(len(some), -1)[:, :-1].reshape(-1, 2, many)
+        where = (aside > 0).nonzero(as_tuple=True)
+        held.append(
+            [
+                where[0] + first,
+                where[1] * columns + where[2],
+                (measured - predicted)[where],
+                allowed / aside[where],
+            ]
+        )
+    aside_parts = [torch.cat(parts).cpu().numpy() for parts in zip(*held)]
+    sums = (weight, total, count.transpose(0, 1), by_depth.transpose(0, 1))
+    maps = [part.cpu().numpy() for part in sums]
+    return ResidualSums(*maps, *aside_parts)
+
+
+def _blocks(views: int, blocks: int) -> np.ndarray:
+    """In which block each view is: those beside each other in one."""
+    return np.arange(views) * blocks // views

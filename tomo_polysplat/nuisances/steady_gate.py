@@ -1,0 +1,28 @@
+"""The gate that gains and drift have in common: rays that nobody has fitted are explained better."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from tomo_polysplat.nuisances.nuisance import Verdict
+
+__all__ = ["steady_gate"]
+
+# In standard errors of the mean difference, each ray with the correction and without.
+_SURE = 3.0
+
+
+def steady_gate(evidence: Mapping[str, float]) -> Verdict:
+    """Whether the misfit of held-out rays falls.
+
+    Parameters
+    ----------
+    evidence : mapping of str to float
+        ``rms`` of what was found; ``better``, by what share the mean misfit of the held-out rays falls with it, and
+        ``error``, the standard error of that.
+    """
+    if not evidence["rms"] > 0:
+        return Verdict(False, "none beyond the noise")
+    better, error = evidence["better"], evidence["error"]
+    words = f"the misfit of held-out rays falls by {better:.1%} (standard error {error:.1%})"
+    return Verdict(better > _SURE * error, f"{evidence['rms']:.2%} rms; {words}")
