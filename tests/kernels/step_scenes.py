@@ -90,7 +90,8 @@ def compare_steps(make, device, truth, kind="cone", polychromatic=True, **change
     """
     outcomes, faster = [], changes.pop("faster", 1.0)
     for form, where, kernel in ((make, device, "triton"), (EagerStep, *truth)):
-        problem = fit_problem(kind, polychromatic, where, kernel, **changes)
+        # Few: Triton's interpreter takes a tenth of a second for each.
+        problem = fit_problem(kind, polychromatic, where, kernel, count=9, **changes)
         gaussians = problem[0]
         before = gaussians.copy()
         step = form(*problem) if form is EagerStep else form(*problem, BATCH)

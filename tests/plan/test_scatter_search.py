@@ -26,13 +26,19 @@ def reconstruct(scan, **options):
     return tps.reconstruct(scan.projections, scan.proj_geom, scan.vol_geom, **options)
 
 
+@cache
+def usual(scatter=0.0, calibrate=None):
+    """A run without anything special, which several tests compare with."""
+    return reconstruct(pins(scatter), calibrate=calibrate)
+
+
 def error(result, scan):
     return float(np.sqrt(np.mean((result.volume - scan.truth) ** 2)))
 
 
 def test_scatter_that_nobody_told_of_is_modelled():
     scan = pins(0.05)
-    asked, told, without = (reconstruct(scan, calibrate=calibrate) for calibrate in (None, True, False))
+    asked, told, without = (usual(0.05, calibrate) for calibrate in (None, True, False))
     assert asked.plan["scatter"].why.startswith("modelled: ")
     assert asked.plan["calibration"].value["fitted"]["scatter"] == pytest.approx(0.05, rel=0.1)
     assert asked.plan["scatter"].value == told.plan["scatter"].value
@@ -43,8 +49,7 @@ def test_scatter_that_nobody_told_of_is_modelled():
 
 
 def test_a_scan_without_any_is_fitted_as_if_nobody_had_asked():
-    scan = pins()
-    asked, without = reconstruct(scan), reconstruct(scan, calibrate=False)
+    asked, without = usual(), usual(0.0, False)
     assert asked.plan["scatter"].why.startswith("the rays show") and "calibration" not in asked.plan
     assert np.array_equal(asked.volume, without.volume)
 
@@ -82,7 +87,7 @@ def test_an_interrupted_run_goes_on_whether_it_had_begun_anew_or_not(passes, tmp
         if len(seen) > passes:
             raise Stopped
 
-    whole = reconstruct(scan)
+    whole = usual(0.05)
     with pytest.raises(Stopped):
         reconstruct(scan, checkpoint=path, callbacks=[stop])
     rest = reconstruct(scan, checkpoint=path, resume=True)
@@ -121,7 +126,7 @@ def test_what_ends_the_short_fits_does_not_end_the_run(monkeypatch, caplog):
     monkeypatch.setattr(calibration, "short_fit", no_room)
     result = reconstruct(pins(0.05))
     assert result.plan["scatter"].why == "out of memory" and "out of memory" in caplog.text
-    assert np.array_equal(result.volume, reconstruct(pins(0.05), calibrate=False).volume)
+    assert np.array_equal(result.volume, usual(0.05, False).volume)
 
 
 def test_a_beam_that_may_drift_is_left_alone_where_no_air_tells():
