@@ -57,7 +57,9 @@ def probe_order(measured: Measured) -> Finding:
     # Views count in pairs of neighbours.
     doubt = _DEVIATION / np.sqrt(count / 2)
     numbers = {"ratio": ratio, "rank": rank, "misplaced": 1.0}
-    if ratio > _UNLIKE and rank > max(0.5 - 3 * doubt, _RANDOM):
+    # In disorder the ratio is 1, as far as noise lets it be told.
+    blurred = float(views.error(usual)) / usual / np.sqrt(count / 2)
+    if ratio > max(_UNLIKE, _SURE * blurred) and rank > max(0.5 - 3 * doubt, _RANDOM):
         text = f"of any two views {100 * rank:.0f} % are more alike than those from neighbouring places"
         remedy = "the angles do not belong to the views in this order: check the order of the files"
         return Finding(ORDER, DEFECT, text, remedy, numbers, doubt)

@@ -13,8 +13,9 @@ SCALE = "base of the logarithm"
 _BINS, _FEWEST = 12, 40
 # Slope of ln(variance) by P: 1 of natural logarithms, ln 10 of those to the base of 10.
 _NATURAL, _DECADIC = 1.0, float(np.log(10.0))
-# Standard errors by which one of them has to be ruled out, by which the other may be off, and the largest that tells.
-_RULED_OUT, _EXPLAINED = 4.0, 3.0
+# Standard errors by which one of them has to be ruled out, and by which the other may be off: downwards, and upwards to
+# those of base 10. Detail that is taken for noise makes a law steeper.
+_RULED_OUT, _EXPLAINED, _STEEPER = 4.0, 3.0, 1.0
 # Noise of few photons, clipped at one, grows less: the other base is far.
 _FAR = 6.0
 # Of the scan's large values: beyond, other noise than that of counts may rule.
@@ -43,7 +44,8 @@ def probe_scale(measured: Measured) -> Finding:
     slope, error = found
     numbers = {"slope": slope}
     text = f"the noise grows as exp({slope:.2f} P) (standard error {error:.2g})"
-    if slope - _NATURAL > _RULED_OUT * error and abs(slope - _DECADIC) < _EXPLAINED * error + 0.25:
+    beyond = slope - _DECADIC
+    if slope - _NATURAL > _RULED_OUT * error and -_EXPLAINED * error - 0.25 < beyond < _STEEPER * error:
         return Finding(
             SCALE,
             DEFECT,
@@ -54,7 +56,7 @@ def probe_scale(measured: Measured) -> Finding:
         )
     if abs(slope - _NATURAL) < _EXPLAINED * error + 0.25 and _DECADIC - slope > _FAR * error:
         return Finding(SCALE, OK, f"{text}, as of natural logarithms", "", numbers, error)
-    if slope - _DECADIC > _RULED_OUT * error:
+    if beyond > _RULED_OUT * error:
         # Steeper than any logarithm of counts: it is not noise.
         text = hidden
     return Finding(SCALE, UNKNOWN, text, _NEEDS, numbers, error)
