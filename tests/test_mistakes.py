@@ -61,8 +61,8 @@ OPTIONS = {
 COMMANDS = {
     "recon scan.h5": "required: -o/--output",
     "recon none.h5 -o x.h5": "path: expected an existing file, got none.h5",
-    "recon empty -o x.h5": "got empty, which is neither; name the folder or the file that the scanner wrote",
-    "recon words.txt -o x.h5": "got words.txt, which is neither; name the folder",
+    "recon empty -o x.h5": "got empty, which is none of these; name the folder or the file that the scanner wrote",
+    "recon words.txt -o x.h5": "got words.txt, which is none of these; name the folder",
     "recon slice.tif -o x.h5": "expected the distances and the pixel of the scanner",
     "recon scan.h5 -o x.jpg": "--output: expected a name ending in .h5",
     "recon scan.h5 -o nowhere/x.h5": "--output: expected a file in an existing folder, got nowhere/x.h5; create",

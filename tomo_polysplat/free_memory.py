@@ -121,21 +121,26 @@ def require_memory(needed: Mapping[str, tuple[str, float]], remedies: Mapping[st
     if there is None or total <= there:
         return
     worst = max(needed, key=lambda name: needed[name][1])
+    where, remedy = f"the {in_gigabytes(there)} of memory that are free", remedies[worst]
+    limit = _LIMITS.get({}).get("cpu")
+    if limit is not None and total > limit - _held():
+        where = f"the {in_gigabytes(there)} that settings['memory'] leaves beside what the process holds"
+        remedy = f"raise settings['memory'], or {remedy}"
     parts = ", ".join(
         f"{words} {in_gigabytes(size)}" for words, size in needed.values() if size > 0.01 * total
     )
     raise fail(
         worst,
-        f"what fits into the {in_gigabytes(there)} of memory that are free",
+        f"what fits into {where}",
         f"about {in_gigabytes(total)} ({parts})",
-        remedies[worst],
+        remedy,
         MemoryError,
     )
 
 
 def in_gigabytes(size: float) -> str:
-    """Bytes as text."""
-    return f"{size / 1e9:.2f} GB"
+    """Bytes as text: in GB, or in MB where that is less than a tenth."""
+    return f"{size / 1e9:.2f} GB" if size >= 1e8 else f"{size / 1e6:.3g} MB"
 
 
 def _held() -> int:

@@ -95,4 +95,4 @@ def test_check_says_it(tmp_path, capsys):
     save_scan(cone(12, 24), tmp_path / "scan.h5")
     main(["check", str(tmp_path / "scan.h5"), "--time", "--device", "cpu"])
     last = capsys.readouterr().out.splitlines()[-1]
-    assert last.startswith("recon  about") and "GB" in last and "steps of" in last
+    assert last.startswith("recon  about") and "MB" in last and "steps of" in last

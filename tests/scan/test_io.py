@@ -218,7 +218,7 @@ def test_other_files_are_refused(tmp_path):
     with pytest.raises(ValueError, match="empty"):
         load_scan(path)
     path.write_text("not a scan at all")
-    with pytest.raises(ValueError, match="neither"):
+    with pytest.raises(ValueError, match="none of these"):
         load_scan(path)
     with pytest.raises(FileNotFoundError):
         load_scan(tmp_path / "missing.h5")

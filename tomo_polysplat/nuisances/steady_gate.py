@@ -24,5 +24,6 @@ def steady_gate(evidence: Mapping[str, float]) -> Verdict:
     if not evidence["rms"] > 0:
         return Verdict(False, "none beyond the noise")
     better, error = evidence["better"], evidence["error"]
-    words = f"the misfit of held-out rays falls by {better:.1%} (standard error {error:.1%})"
+    way = "rises" if better < 0 else "falls"
+    words = f"the misfit of held-out rays {way} by {abs(better):.1%} (standard error {error:.1%})"
     return Verdict(better > _SURE * error, f"{evidence['rms']:.2%} rms; {words}")

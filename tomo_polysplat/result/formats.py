@@ -105,7 +105,9 @@ def format_of(path: str | bytes | os.PathLike, argument: str = "path") -> Format
     remedy = did_you_mean(Path(name).suffix, ENDINGS)
     if name.endswith(".dcm"):
         remedy = "a DICOM series is a folder, of a name ending in .dicom"
-    raise fail(argument, f"a name ending in {', '.join(ENDINGS)}", repr(os.fsdecode(path)), remedy)
+    endings = ", ".join(ending for ending in ENDINGS if ending != "/")
+    expected = f"a name ending in {endings}, or in / (a folder of TIFF slices)"
+    raise fail(argument, expected, repr(os.fsdecode(path)), remedy)
 
 
 def save_as(

@@ -49,6 +49,6 @@ def acquisition_of(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     raise fail(
         "path",
         f"a Data Exchange HDF5 file, an .npz scan, or one of: {kinds}",
-        f"{path}, which is neither",
+        f"{path}, which is none of these",
         _REMEDY,
     )
