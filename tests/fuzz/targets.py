@@ -172,7 +172,7 @@ FILES = {
     "Nikon": (read_folder, folders("nikon")),
     "EDF": (read_folder, folders("edf")),
     ".npy": (read_folder, folders("npy")),
-    "RTK, MetaImage": (read_folder, folders("rtk")),
+    "RTK and MetaImage": (read_folder, folders("rtk")),
     "Zeiss .txrm": (read_folder, XRADIA),
     ".npz stacks": (read_folder, NPZ_STACKS),
     "spectrum tables": (read_spectrum, SPECTRUM_TABLES),
