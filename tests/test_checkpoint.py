@@ -185,6 +185,38 @@ def with_answer(path, **values):
     return np.frombuffer(json.dumps(about).encode(), np.uint8)
 
 
+def with_answers(path, **answers):
+    with np.load(path) as file:
+        about = json.loads(file["about"].tobytes())
+    about["plan"]["answers"] |= answers
+    return np.frombuffer(json.dumps(about).encode(), np.uint8)
+
+
+def with_fact(path, name, **parts):
+    with np.load(path) as file:
+        about = json.loads(file["about"].tobytes())
+    fact = {"value": 0.0, "why": "", "status": "asked", "evidence": {"asked": 1.0}}
+    about["plan"]["facts"][name] = fact | parts
+    return np.frombuffer(json.dumps(about).encode(), np.uint8)
+
+
+def test_what_a_plan_does_not_know_is_refused_by_name(tmp_path):
+    """Nothing would read it: who set it meant something else."""
+    path = tmp_path / "fit.npz"
+    killed_after(1, fan(), path, settings=LONG)
+    with np.load(path) as file:
+        answer = json.loads(file["about"].tobytes())["plan"]["answers"]["seed_spacing"]
+    whole = path.read_bytes()
+    for changed, word in (
+        (lambda: with_numbers(path, "plan", reference=1e300), "answers and facts, got reference"),
+        (lambda: with_answers(path, spacing=answer), "known questions, got one to spacing"),
+    ):
+        rewritten(path, about=changed())
+        with pytest.raises(ValueError, match=word):
+            reconstruct(fan(), checkpoint=path, resume=True, settings=LONG)
+        path.write_bytes(whole)
+
+
 @pytest.mark.parametrize(
     "damage",
     [
@@ -210,6 +242,9 @@ def with_answer(path, **values):
         lambda path: rewritten(path, about=with_answer(path, seed_spacing=1e30)),
         lambda path: rewritten(path, about=with_answer(path, curves=True)),
         lambda path: rewritten(path, about=with_numbers(path, stop=["tired", "of it"])),
+        lambda path: rewritten(path, about=with_fact(path, "drift", evidence={"asked": "often"})),
+        lambda path: rewritten(path, about=with_fact(path, "gains", evidence={"rms": float("nan")})),
+        lambda path: rewritten(path, about=with_fact(path, "gains", value="some")),
         lambda path: rewritten(path, about=with_answer(path, tv_corner=["a", "tenth"])),
     ],
 )

@@ -51,6 +51,33 @@ def test_forked_processes_side_by_side_give_what_one_gives_alone():
     assert in_processes("fork", [0, 1]) == alone and alone[0] != alone[1]
 
 
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="this system cannot fork")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_forked_process_saves_and_explains_what_its_parent_has_made(tmp_path):
+    """Outside of a solve, where torch has as many threads as it likes: in the parent they wait, in a child they lack."""
+    scan = fan()
+    result = reconstruct(scan)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        (torch.rand(1 << 21) > 0.5).sum()
+        result.save(tmp_path / "a.nii.gz")
+        child = multiprocessing.get_context("fork").Process(target=_use, args=(result, scan, tmp_path))
+        child.start()
+        child.join(SECONDS)
+        child.kill()
+        assert child.exitcode == 0
+        assert (tmp_path / "a.nii.gz").read_bytes() == (tmp_path / "b.nii.gz").read_bytes()
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
+def _use(result, scan, folder):
+    result.save(folder / "b.nii.gz")
+    result.explain(scan)
+
+
 def test_a_spawned_process_on_one_core_gives_the_same():
     assert in_processes("spawn", [0], pinned) == [digest()]
 

@@ -7,6 +7,7 @@ compiler's own thread pool this may be used from several threads at once and aft
 from __future__ import annotations
 
 import os
+import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -21,6 +22,17 @@ __all__ = ["contiguous", "copy_array", "cpu_threads", "kept_threads", "run_tasks
 _COPIED_AT_ONCE = 1 << 21  # bytes of a task, so that the copy takes longer than to hand it to a thread
 # The process that keeps threads, and its threads.
 _kept: ContextVar[tuple[int, ThreadPoolExecutor] | None] = ContextVar("_kept", default=None)
+
+
+def _without_torch_threads() -> None:
+    """Let torch work alone in a forked process: it would wait for ever for the threads that only the parent has."""
+    torch = sys.modules.get("torch")
+    if hasattr(torch, "set_num_threads"):
+        torch.set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_without_torch_threads)
 
 
 def cpu_threads() -> int:

@@ -9,16 +9,11 @@ counts to those of earlier runs. It needs Unix, and Linux for the disks of its o
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import time
 from pathlib import Path
 
 from .record import FAULTS, Record
-
-# Of OpenMP a forked child has no threads, and would wait for them; said before anything is imported that has any.
-for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[name] = "1"
 
 PARTS = ("threads", "kills", "disks", "files")
 # Of the time that is left when a part begins.

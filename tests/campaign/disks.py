@@ -68,7 +68,8 @@ def _bytes_of(writer: Writer, place: Path) -> tuple[int, int]:
     """The largest file and all files of the new state."""
     path = place / f"size.{writer.file}"
     writer.write(path, 1)
-    sizes = [inner.stat().st_size for inner in path.iterdir()] if path.is_dir() else [path.stat().st_size]
+    files = path.rglob("*") if path.is_dir() else [path]
+    sizes = [inner.stat().st_size for inner in files if inner.is_file()]
     return max(sizes), sum(sizes)
 
 

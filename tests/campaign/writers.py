@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import re
 import shutil
@@ -10,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 
@@ -47,7 +49,8 @@ class Writer:
 def content(path: Path) -> object:
     """All that is in a file or a folder but what is drawn by lot; None where there is none."""
     if path.is_dir():
-        return {inner.name: inner.read_bytes() for inner in sorted(path.iterdir())}
+        files = sorted(inner for inner in path.rglob("*") if inner.is_file())
+        return {str(inner.relative_to(path)): inner.read_bytes() for inner in files}
     return _LOT.sub(b"", path.read_bytes()) if path.exists() else None
 
 
@@ -70,6 +73,27 @@ def _saved(ending: str) -> Writer:
         result(state).save(f"{path}/" if ending.endswith("/") else path, overwrite=True)
 
     return Writer(f"result {ending}", write)
+
+
+def _zarr() -> Writer:
+    """Of blocks so small that there are many."""
+
+    def write(path: Path, state: int) -> None:
+        with mock.patch("tomo_polysplat.result.ome_zarr._BLOCK", 16):
+            result(state).save(path, overwrite=True)
+
+    return Writer("result ome.zarr", write)
+
+
+def _dicom() -> Writer:
+    """With identifiers that are counted, which are else drawn by lot."""
+
+    def write(path: Path, state: int) -> None:
+        count = itertools.count(10**37 * (1 + state))
+        with mock.patch("pydicom.uid.generate_uid", lambda prefix: f"2.25.{next(count)}"):
+            result(state).save(path, overwrite=True)
+
+    return Writer("result dicom", write)
 
 
 def _imported(place: Path) -> Writer:
@@ -99,7 +123,7 @@ def writers(place: Path, names: list[str] | None = None) -> list[Writer]:
     """All of them, or those that are named; what they need is made in the folder."""
     from tomo_polysplat.result.files import write_json
 
-    some = [_saved(ending) for ending in ENDINGS]
+    some = [*(_saved(ending) for ending in ENDINGS), _zarr(), _dicom()]
     for ending in ("npz", "h5"):
         some.append(
             Writer(f"scan {ending}", lambda path, state: tps.save_scan(scan(state), path, overwrite=True))

@@ -79,10 +79,10 @@ def npy_archive(arrays, compression=zipfile.ZIP_STORED) -> bytes:
 
 
 @st.composite
-def npz_scans(draw) -> bytes:
+def npz_files(draw, whole) -> bytes:
     """An archive with other arrays, lying headers, bombs, and damaged bytes."""
-    arrays = draw(replaced(ARCHIVE, ODD))
-    lying = draw(mostly(st.just(set()), st.sets(st.sampled_from(sorted(ARCHIVE)), min_size=1, max_size=2)))
+    arrays = draw(replaced(whole, ODD))
+    lying = draw(mostly(st.just(set()), st.sets(st.sampled_from(sorted(whole)), min_size=1, max_size=2)))
     methods = mostly(st.sampled_from(METHODS), st.sampled_from(RARE_METHODS))
     method, buffer = draw(methods), io.BytesIO()
     with warnings.catch_warnings(), zipfile.ZipFile(buffer, "w") as archive:

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 from hostile_checkpoints import checkpoints, resumed
-from hostile_files import HDF5_RESULTS, HDF5_SCANS, npz_scans
+from hostile_files import ARCHIVE, HDF5_RESULTS, HDF5_SCANS, npz_files
 from hostile_folders import FILTER_MAPS, SPECTRUM_TABLES, folders, neXus, put
+from hostile_stacks import NPZ_STACKS, XRADIA
 from hostile_values import ARRAYS, NUMBERS, TEXTS, VALUES, mostly, replaced, replaced_values
 from hypothesis import strategies as st
 
@@ -161,7 +162,7 @@ NAMES = st.sampled_from(list(make_settings().to_dict()))
 
 # What is in files, and what is in arguments.
 FILES = {
-    "npz scans": (read_scan, npz_scans()),
+    "npz scans": (read_scan, npz_files(ARCHIVE)),
     "Data Exchange": (read_scan, HDF5_SCANS),
     "NXtomo": (read_scan, neXus("nxtomo")),
     "CIL NeXus": (read_scan, neXus("cil")),
@@ -171,7 +172,9 @@ FILES = {
     "Nikon": (read_folder, folders("nikon")),
     "EDF": (read_folder, folders("edf")),
     ".npy": (read_folder, folders("npy")),
-    "RTK, MetaImage": (read_folder, folders("rtk")),
+    "RTK and MetaImage": (read_folder, folders("rtk")),
+    "Zeiss .txrm": (read_folder, XRADIA),
+    ".npz stacks": (read_folder, NPZ_STACKS),
     "spectrum tables": (read_spectrum, SPECTRUM_TABLES),
     "filter maps": (read_filter_map, FILTER_MAPS),
     "results": (read_result, HDF5_RESULTS),

@@ -28,6 +28,8 @@ from tomo_polysplat.fit.stopping import StopReason
 from tomo_polysplat.fit.taken_out import Step
 from tomo_polysplat.json_text import parse_json
 from tomo_polysplat.model.gaussians import OF_ALL, Gaussians
+from tomo_polysplat.nuisances.drift import Drift
+from tomo_polysplat.nuisances.gains import Gains
 from tomo_polysplat.plan.decision import When
 from tomo_polysplat.plan.order import ORDER
 from tomo_polysplat.plan.plan import Plan
@@ -140,6 +142,7 @@ class Checkpoint:
             self.plan = _plan(about["plan"])
             _require_calibration(self.plan, self.options.get("calibration"))
             _require_moves(self.plan, self.options.get("align"))
+            _require_light(self.plan)
             self._taken = _taken(arrays, self._pixels)
             self.snapshot = _snapshot(arrays, dict(about["numbers"]), self._views)
         except _DAMAGES as error:
@@ -195,6 +198,8 @@ def _content(about: np.ndarray) -> dict[str, Any]:
 
 def _plan(parts: dict[str, Any]) -> Plan:
     plan = Plan.from_dict(parts)
+    if unknown := sorted(plan.answers.keys() - {kind.name for kind in ORDER}):
+        raise TypeError(f"answers to known questions, got one to {', '.join(unknown)}"[:200])
     for kind in ORDER:
         missing = kind.name not in plan.answers
         if missing and kind.when is not When.DURING:
@@ -223,6 +228,14 @@ def _require_moves(plan: Plan, asked: Any) -> None:
         numbers = value if isinstance(value, list) else [value]
         if name not in MOVES or not _finite(numbers):
             raise TypeError(f"moves of the scanner, got {name} = {value!r}"[:200])
+
+
+def _require_light(plan: Plan) -> None:
+    """See to it that what it tells of gains and drift are numbers."""
+    for name in (Drift.name, Gains.name):
+        told = plan.facts.get(name)
+        if told is not None and not _finite([told.value, *told.evidence.values()]):
+            raise TypeError(f"numbers of {name}, got {told.value!r} by {told.evidence}"[:200])
 
 
 def _finite(values: list[Any]) -> bool:

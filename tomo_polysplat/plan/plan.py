@@ -58,11 +58,10 @@ class Plan:
     @classmethod
     def from_dict(cls, parts: Mapping[str, Any]) -> Plan:
         """The plan of `to_dict`; raises TypeError or KeyError for anything else."""
-        kinds = (
-            {name: Answer.from_dict(one) for name, one in parts[kind].items()}
-            for kind in ("answers", "facts")
-        )
-        return cls(*kinds)
+        kinds = ("answers", "facts")
+        if unknown := sorted(set(parts) - set(kinds)):
+            raise TypeError(f"a plan of answers and facts, got {', '.join(unknown)} as well"[:200])
+        return cls(*({name: Answer.from_dict(one) for name, one in parts[kind].items()} for kind in kinds))
 
     @property
     def reference(self) -> float:
