@@ -173,7 +173,7 @@ def test_a_compressed_checkpoint_is_refused(tmp_path):
 def with_numbers(path, part="numbers", **changes):
     with np.load(path) as file:
         about = json.loads(file["about"].tobytes())
-    about[part] |= changes
+    (about if part is None else about[part]).update(changes)
     return np.frombuffer(json.dumps(about).encode(), np.uint8)
 
 
@@ -231,6 +231,7 @@ def test_what_a_plan_does_not_know_is_refused_by_name(tmp_path):
         lambda path: rewritten(path, about=np.frombuffer(b"[" * 100_000, np.uint8)),
         lambda path: rewritten(path, about=np.frombuffer(b"{}", np.uint8)),
         lambda path: rewritten(path, about=with_numbers(path, steps=-1)),
+        lambda path: rewritten(path, about=with_numbers(path, None, numbers="none")),
         lambda path: rewritten(path, about=with_numbers(path, random={"bit_generator": "MT19937"})),
         lambda path: rewritten(path, about=with_numbers(path, seconds=float("nan"))),
         lambda path: rewritten(path, about=with_numbers(path, largest=["much", 1.0])),

@@ -144,7 +144,7 @@ class Checkpoint:
             _require_moves(self.plan, self.options.get("align"))
             _require_light(self.plan)
             self._taken = _taken(arrays, self._pixels)
-            self.snapshot = _snapshot(arrays, dict(about["numbers"]), self._views)
+            self.snapshot = _snapshot(arrays, about["numbers"], self._views)
         except _DAMAGES as error:
             raise self._damaged(f"{type(error).__name__} {error}") from error
         logger.info("Going on after %s steps from %s", self.snapshot.numbers.get("steps"), self.path)
@@ -276,6 +276,8 @@ def _snapshot(arrays: dict[str, np.ndarray], numbers: dict[str, Any], views: int
 
 
 def _require_numbers(numbers: dict[str, Any]) -> None:
+    if not isinstance(numbers, dict):
+        raise TypeError(f"the numbers of a run, got {numbers!r}"[:200])
     counts = ("steps", "steps_made", "pace", "skipped_pairs", "relocated", "most")
     if any(not isinstance(numbers[name], int) or numbers[name] < 0 for name in counts):
         raise TypeError(f"whole numbers for {', '.join(counts)}")
