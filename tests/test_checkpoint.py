@@ -177,6 +177,14 @@ def with_numbers(path, part="numbers", **changes):
     return np.frombuffer(json.dumps(about).encode(), np.uint8)
 
 
+def with_huge(path, name):
+    """One number is finite, and its square is not."""
+    with np.load(path) as file:
+        array = file[name]
+    array.reshape(-1)[0] = 1e38
+    return array
+
+
 def with_answer(path, **values):
     with np.load(path) as file:
         about = json.loads(file["about"].tobytes())
@@ -225,6 +233,7 @@ def test_what_a_plan_does_not_know_is_refused_by_name(tmp_path):
         lambda path: rewritten(path, pull=None),
         lambda path: rewritten(path, pull=np.zeros(3, np.float32)),
         lambda path: rewritten(path, **{"gaussians/position": np.full((4, 3), np.nan, np.float32)}),
+        lambda path: rewritten(path, **{"gaussians/own_material": with_huge(path, "gaussians/own_material")}),
         lambda path: rewritten(path, **{"gaussians/group": np.array([2**40])}),
         lambda path: rewritten(path, order=np.array([10**6])),
         lambda path: rewritten(path, order=np.array([{}], dtype=object)),

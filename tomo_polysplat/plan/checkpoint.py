@@ -43,6 +43,8 @@ logger = logging.getLogger(__name__)
 FORMAT = 19
 # Writing takes at most this share of the time.
 _LARGEST_SHARE = 0.05
+# Of any parameter of a Gaussian; lengths are in those of the object, and the square of a material number is taken.
+_LARGEST = 1e6
 _FITTED = tuple(name for name in PARTS if name != "group")
 # What taking apart something else than the expected raises.
 _DAMAGES = (KeyError, IndexError, TypeError, AttributeError, RecursionError, OverflowError)
@@ -311,6 +313,8 @@ def _cloud(arrays: dict[str, np.ndarray], kind: str, count: tuple[int, ...]) -> 
         if name not in OF_ALL
     }
     whole = {n: _tensor(arrays[f"{kind}/{n}"], s) for n, s in zip(OF_ALL, ((groups,), (1,)))}
+    if any((part.abs() > _LARGEST).any() for part in (*parts.values(), *whole.values())):
+        raise TypeError(f"{kind} with parameters of at most {_LARGEST:g}")
     group = arrays[f"{kind}/group"]
     indices = group.dtype == np.int64 and group.shape == count
     if len(count) != 1 or dims not in (2, 3) or not indices or (group < -1).any() or (group >= groups).any():
