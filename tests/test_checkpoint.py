@@ -173,8 +173,16 @@ def test_a_compressed_checkpoint_is_refused(tmp_path):
 def with_numbers(path, part="numbers", **changes):
     with np.load(path) as file:
         about = json.loads(file["about"].tobytes())
-    about[part] |= changes
+    (about if part is None else about[part]).update(changes)
     return np.frombuffer(json.dumps(about).encode(), np.uint8)
+
+
+def with_huge(path, name):
+    """One number is finite, and its square is not."""
+    with np.load(path) as file:
+        array = file[name]
+    array.reshape(-1)[0] = 1e38
+    return array
 
 
 def with_answer(path, **values):
@@ -225,12 +233,14 @@ def test_what_a_plan_does_not_know_is_refused_by_name(tmp_path):
         lambda path: rewritten(path, pull=None),
         lambda path: rewritten(path, pull=np.zeros(3, np.float32)),
         lambda path: rewritten(path, **{"gaussians/position": np.full((4, 3), np.nan, np.float32)}),
+        lambda path: rewritten(path, **{"gaussians/own_material": with_huge(path, "gaussians/own_material")}),
         lambda path: rewritten(path, **{"gaussians/group": np.array([2**40])}),
         lambda path: rewritten(path, order=np.array([10**6])),
         lambda path: rewritten(path, order=np.array([{}], dtype=object)),
         lambda path: rewritten(path, about=np.frombuffer(b"[" * 100_000, np.uint8)),
         lambda path: rewritten(path, about=np.frombuffer(b"{}", np.uint8)),
         lambda path: rewritten(path, about=with_numbers(path, steps=-1)),
+        lambda path: rewritten(path, about=with_numbers(path, None, numbers="none")),
         lambda path: rewritten(path, about=with_numbers(path, random={"bit_generator": "MT19937"})),
         lambda path: rewritten(path, about=with_numbers(path, seconds=float("nan"))),
         lambda path: rewritten(path, about=with_numbers(path, largest=["much", 1.0])),

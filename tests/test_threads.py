@@ -54,7 +54,7 @@ def test_forked_processes_side_by_side_give_what_one_gives_alone():
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="this system cannot fork")
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_a_forked_process_saves_and_explains_what_its_parent_has_made(tmp_path):
-    """Outside of a solve, where torch has as many threads as it likes: in the parent they wait, in a child they lack."""
+    """Outside of a solve, where torch has as many threads as it likes, which a child lacks."""
     scan = fan()
     result = reconstruct(scan)
     before = torch.get_num_threads()

@@ -26,9 +26,8 @@ _kept: ContextVar[tuple[int, ThreadPoolExecutor] | None] = ContextVar("_kept", d
 
 def _without_torch_threads() -> None:
     """Let torch work alone in a forked process: it would wait for ever for the threads that only the parent has."""
-    torch = sys.modules.get("torch")
-    if hasattr(torch, "set_num_threads"):
-        torch.set_num_threads(1)
+    if alone := getattr(sys.modules.get("torch"), "set_num_threads", None):
+        alone(1)
 
 
 if hasattr(os, "register_at_fork"):

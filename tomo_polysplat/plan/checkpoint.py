@@ -43,6 +43,8 @@ logger = logging.getLogger(__name__)
 FORMAT = 19
 # Writing takes at most this share of the time.
 _LARGEST_SHARE = 0.05
+# Of any parameter of a Gaussian; lengths are in those of the object, and the square of a material number is taken.
+_LARGEST = 1e6
 _FITTED = tuple(name for name in PARTS if name != "group")
 # What taking apart something else than the expected raises.
 _DAMAGES = (KeyError, IndexError, TypeError, AttributeError, RecursionError, OverflowError)
@@ -144,7 +146,7 @@ class Checkpoint:
             _require_moves(self.plan, self.options.get("align"))
             _require_light(self.plan)
             self._taken = _taken(arrays, self._pixels)
-            self.snapshot = _snapshot(arrays, dict(about["numbers"]), self._views)
+            self.snapshot = _snapshot(arrays, about["numbers"], self._views)
         except _DAMAGES as error:
             raise self._damaged(f"{type(error).__name__} {error}") from error
         logger.info("Going on after %s steps from %s", self.snapshot.numbers.get("steps"), self.path)
@@ -276,6 +278,8 @@ def _snapshot(arrays: dict[str, np.ndarray], numbers: dict[str, Any], views: int
 
 
 def _require_numbers(numbers: dict[str, Any]) -> None:
+    if not isinstance(numbers, dict):
+        raise TypeError(f"the numbers of a run, got {numbers!r}"[:200])
     counts = ("steps", "steps_made", "pace", "skipped_pairs", "relocated", "most")
     if any(not isinstance(numbers[name], int) or numbers[name] < 0 for name in counts):
         raise TypeError(f"whole numbers for {', '.join(counts)}")
@@ -309,6 +313,8 @@ def _cloud(arrays: dict[str, np.ndarray], kind: str, count: tuple[int, ...]) -> 
         if name not in OF_ALL
     }
     whole = {n: _tensor(arrays[f"{kind}/{n}"], s) for n, s in zip(OF_ALL, ((groups,), (1,)))}
+    if any((part.abs() > _LARGEST).any() for part in (*parts.values(), *whole.values())):
+        raise TypeError(f"{kind} with parameters of at most {_LARGEST:g}")
     group = arrays[f"{kind}/group"]
     indices = group.dtype == np.int64 and group.shape == count
     if len(count) != 1 or dims not in (2, 3) or not indices or (group < -1).any() or (group >= groups).any():
