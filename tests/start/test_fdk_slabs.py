@@ -103,3 +103,20 @@ def test_astra_by_slabs_is_astra_in_one_piece():
 
         fdk_of_slabs(make, geometry, grid, 7, found)
         assert float((found - whole).abs().max()) < 1e-5 * float(whole.abs().max())
+
+
+@pytest.mark.gpu
+def test_a_gpu_with_little_room_makes_slabs(monkeypatch):
+    made = astra.create_proj_geom("cone", 2.2, 1.7, 53, 60, TURN, 200.0, 120.0)
+    geometry, grid = from_astra(
+        made, astra.create_vol_geom(41, 29, 33, -14.5, 14.5, -20.5, 20.5, -16.5, 16.5)
+    )
+    values, cuda = torch.from_numpy(chords(geometry, SPHERES).astype(np.float32)), torch.device("cuda")
+    orbit = find_orbit(geometry)[0]
+    whole = slabs.fdk_on_device(values, geometry, grid, orbit, "hann", cuda)
+    assert whole.is_cuda
+    monkeypatch.setattr(slabs, "_FILTER", 0)
+    for room in (1e6, 3e6):
+        monkeypatch.setattr(slabs, "free_bytes", lambda device, room=room: room)
+        found = slabs.fdk_on_device(values, geometry, grid, orbit, "hann", cuda)
+        assert float((found.cpu() - whole.cpu()).abs().max()) < 1e-5 * float(whole.abs().max())

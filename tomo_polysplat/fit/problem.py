@@ -225,7 +225,8 @@ class Problem:
             # Let go of first: there may be no room for both.
             known = None
             self._known.level.pop(device, None)
-            values = values if projections_stay(values.nbytes, device) else torch.from_numpy(self.projections)
+            # Those on the device: of the caller's array nothing was taken out.
+            values = values if projections_stay(values.nbytes, device) else values.cpu()
             if dimmed is None:
                 known = (light, *made_level(values, self.scatter, self.beam))
             else:

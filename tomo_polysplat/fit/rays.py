@@ -84,6 +84,15 @@ class Rays:
     @functools.cached_property
     def totals(self) -> torch.Tensor:
         """(views,) weight of the fitted rays of each view."""
+        return self._added_up()
+
+    def weigh_anew(self) -> None:
+        """Bring `totals` up to date in place, where recorded steps read them, after values were changed in place."""
+        if "totals" in self.__dict__:
+            self.totals.copy_(self._added_up())
+        self.__dict__.pop("typical_weight", None)
+
+    def _added_up(self) -> torch.Tensor:
         sums, many = [], max(1, _CHUNK // (self.views.rows * self.views.columns))
         for first in range(0, len(self.views), many):
             _, _, weight, _ = self.batch(np.arange(first, min(first + many, len(self.views))))

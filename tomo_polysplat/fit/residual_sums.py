@@ -14,8 +14,10 @@ from tomo_polysplat.settings import Settings
 
 __all__ = ["ResidualSums", "residual_sums"]
 
-# Blocks of views that differ by chance; ends of depths, -log(I/I0); views looked at together.
-_BLOCKS, _DEPTHS, _AT_ONCE = 8, (0.01, 0.05, 0.15, 0.3, 0.6, 1.0, 1.5, 2.0, 3.0, 4.0), 8
+# Blocks of views that differ by chance; ends of depths, -log(I/I0).
+_BLOCKS, _DEPTHS = 8, (0.01, 0.05, 0.15, 0.3, 0.6, 1.0, 1.5, 2.0, 3.0, 4.0)
+# Views looked at together, and rays, beside a step's memory, which a GPU keeps.
+_AT_ONCE, _RAYS = 8, 1 << 24
 # Residuals beyond so many allowed deviations count as so many.
 _FAR = 4.0
 _LEAST_ERROR = 1e-3
@@ -62,37 +64,39 @@ def residual_sums(gaussians: Gaussians, scene: FitScene, rays: Rays, settings: S
     views, rows, columns = len(rays.views), rays.views.rows, rays.views.columns
     blocks = min(_BLOCKS, views)
     double = torch.zeros((), dtype=torch.float64, device=rays.target)
-    block = torch.from_numpy(_blocks(views, blocks)).to(rays.target)
+    block = _blocks(views, blocks).tolist()
     weight, total = double.new_zeros((2, blocks, rows, columns))
     ends, many = torch.tensor(_DEPTHS, device=rays.target), len(_DEPTHS) + 1
     count, by_depth = double.new_zeros((2, views, 2, many))
     # The right half's depths come after the left one's, and what is not fitted after both.
     right = many * (torch.arange(columns, device=rays.target) >= columns // 2)
     held: list[list[torch.Tensor]] = []
-    for first in range(0, views, _AT_ONCE):
-        some = np.arange(first, min(first + _AT_ONCE, views))
+    at_once = max(1, min(_AT_ONCE, _RAYS // (rows * columns)))
+    for first in range(0, views, at_once):
+        some = np.arange(first, min(first + at_once, views))
         seen, measured, fitted, aside = rays.batch(some)
         predicted, _ = scene.projections(gaussians, seen)
         far = _FAR * allowed / fitted.clamp(min=1e-12)
         left = (measured - predicted).maximum(-far).minimum(far)
         trust = fitted.square()
-        weight.index_add_(0, block[first : some[-1] + 1], trust.double())
-        total.index_add_(0, block[first : some[-1] + 1], (trust * left).double())
+        # View by view: a GPU would add in any order, and a copy in double precision be made of all.
+        for k, view in enumerate(some.tolist()):
+            weight[block[view]] += trust[k]
+            total[block[view]] += trust[k] * left[k]
         depth = torch.where(trust > 0, torch.bucketize(predicted, ends) + right, 2 * many)
         depth = depth.flatten(1) + (2 * many + 1) * torch.arange(len(some), device=depth.device)[:, None]
         for into, values in ((count, None), (by_depth, left.double().flatten())):
             found = torch.bincount(depth.flatten(), values, minlength=len(some) * (2 * many + 1))
             into[some[0] : some[-1] + 1] = found.reshape(len(some), -1)[:, :-1].reshape(-1, 2, many)
         where = (aside > 0).nonzero(as_tuple=True)
-        held.append(
-            [
-                where[0] + first,
-                where[1] * columns + where[2],
-                (measured - predicted)[where],
-                allowed / aside[where],
-            ]
+        parts = (
+            where[0] + first,
+            where[1] * columns + where[2],
+            (measured - predicted)[where],
+            allowed / aside[where],
         )
-    aside_parts = [torch.cat(parts).cpu().numpy() for parts in zip(*held)]
+        held.append([part.cpu() for part in parts])
+    aside_parts = [torch.cat(parts).numpy() for parts in zip(*held)]
     sums = (weight, total, count.transpose(0, 1), by_depth.transpose(0, 1))
     maps = [part.cpu().numpy() for part in sums]
     return ResidualSums(*maps, *aside_parts)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from tomo_polysplat.fit.memory import voxels_at_once
 from tomo_polysplat.fit.slabs import on_host
 from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
@@ -183,7 +184,9 @@ class FitScene:
         Where the fewer took longer, because kernels were compiled, they are timed again.
         """
         nz, ny, nx = self.box.shape
-        depth = -(-nz // _SLICES_TIMED)
+        # The larger of both numbers of slices has to fit into memory, as a slab of the volume does.
+        room = voxels_at_once(gaussians.position.device) // (2 * ny * nx)
+        depth = max(1, min(-(-nz // _SLICES_TIMED), room))
 
         def seconds(some: int) -> float:
             part = replace(self, box=self.box.part(((nz - some) // 2, 0, 0), (some, ny, nx)))

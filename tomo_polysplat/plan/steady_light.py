@@ -64,7 +64,7 @@ class SteadyLight:
             return
         if all(wanted is False for wanted in self.wanted.values()):
             return
-        fitter = run.fitter
+        fitter, before_it = run.fitter, len(self.problem.taken.steps)
         sums = residual_sums(fitter.gaussians, fitter.scene, fitter.rays, fitter.settings)
         if self.wanted[Drift.name] is not False:
             taken = self.problem.taken.drift
@@ -76,6 +76,9 @@ class SteadyLight:
             found = gains_of_pixels(sums.weight, sums.total + sums.weight * taken)
             found = less_rings(found, _axis_column(self.problem))
             self._judge(Gains, found, taken, sums, sums.pixel)
+        if len(self.problem.taken.steps) > before_it:
+            # As a run that goes on from a checkpoint weighs them.
+            fitter.rays.weigh_anew()
 
     def _in_vain(self, asked: int) -> bool:
         """Whether it was asked often enough for nothing."""

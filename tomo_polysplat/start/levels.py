@@ -51,7 +51,8 @@ def _mass_of_bits(values: torch.Tensor, high: int | None) -> torch.Tensor:
             chosen = first == high
             part, first = part[chosen], bits[chosen] & ((1 << _BITS) - 1)
         sums += torch.bincount(first, weights=part.double(), minlength=len(sums))
-    return sums
+    # On the host: sums that a GPU runs over may fall by their rounding, and end at bits that no value has.
+    return sums.cpu()
 
 
 def main_level(volume: np.ndarray | torch.Tensor) -> float:

@@ -101,25 +101,31 @@ def fdk_on_device(
         piece = projections[:, rows[0] : rows[1]].to(device)
         return fdk_cuda_tensor(piece, cropped, slab, orbit, filter_name)
 
+    def tried(depth: int, place: torch.device) -> torch.Tensor:
+        if depth >= nz and place == device:
+            return make((0, geometry.rows), geometry, grid)
+        whole = torch.empty(grid.shape, dtype=torch.float32, device=place)
+        fdk_of_slabs(make, geometry, grid, depth, whole)
+        logger.info("Filtered backprojection by slabs of %d of %d slices.", depth, nz)
+        return whole
+
     nz, ny, nx = grid.shape
+    of_whole = 4 * nz * ny * nx
     for attempt in range(_TIMES):
         room = _SHARE * free_bytes(device) / 2**attempt
         depth = _depth(geometry, grid, room, projections.is_cuda)
         # A second volume of this size is what whatever looks at it takes at least.
-        place = device if 8 * nz * ny * nx < room else torch.device("cpu")
+        place = device if 2 * of_whole < room else torch.device("cpu")
+        if depth < nz and place.type == "cuda":
+            depth = _depth(geometry, grid, room - of_whole, projections.is_cuda)
         try:
-            if depth >= nz and place == device:
-                return make((0, geometry.rows), geometry, grid)
-            whole = torch.empty(grid.shape, dtype=torch.float32, device=place)
-            fdk_of_slabs(make, geometry, grid, depth, whole)
-            logger.info("Filtered backprojection by slabs of %d of %d slices.", depth, nz)
-            return whole
+            return tried(depth, place)
         except RuntimeError as problem:
             if attempt + 1 == _TIMES or depth == 1:
                 raise
             logger.info("%s Slabs are tried that take less than %s.", problem, in_gigabytes(room / 2))
-            # What torch holds for later is of no use to ASTRA.
-            torch.cuda.empty_cache()
+        # What torch holds for later is of no use to ASTRA; only now does the error no longer hold the tensors.
+        torch.cuda.empty_cache()
     raise AssertionError("unreachable")
 
 
