@@ -74,7 +74,9 @@ class SteadyLight:
         if self.wanted[Gains.name] is not False:
             taken = self.problem.taken.gains
             found = gains_of_pixels(sums.weight, sums.total + sums.weight * taken)
-            found = less_rings(found, _axis_column(self.problem))
+            axis = _axis_column(self.problem)
+            # An axis that no view sees makes no rings.
+            found = less_rings(found, axis) if math.isfinite(axis) else found
             self._judge(Gains, found, taken, sums, sums.pixel)
         if len(self.problem.taken.steps) > before_it:
             # As a run that goes on from a checkpoint weighs them.
