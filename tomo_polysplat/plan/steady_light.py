@@ -28,8 +28,8 @@ logger = logging.getLogger(__name__)
 
 # Shares of the run after which the rays are asked, and how often in vain.
 _SHARES, _IN_VAIN = (0.1, 0.2, 0.3, 0.45, 0.6, 0.8), 3
-# Held-out rays that tell anything, and the deviations beyond which a residual counts absolutely.
-_FEWEST_RAYS, _CORNER = 30, 1.345
+# Held-out rays that tell anything.
+_FEWEST_RAYS = 30
 _KINDS: tuple[type[Nuisance], ...] = (Drift, Gains)
 
 
@@ -47,6 +47,7 @@ class SteadyLight:
 
     def __init__(self, problem: Problem, plan: Plan, settings: Settings) -> None:
         self.problem, self.plan = problem, plan
+        self.corner = settings.huber_corner
         self.wanted = {kind.name: getattr(settings, kind.name) for kind in _KINDS}
         self.asked = 0
         for name, wanted in self.wanted.items():
@@ -96,7 +97,7 @@ class SteadyLight:
         where: np.ndarray,
     ) -> np.ndarray:
         """Take out what was found as far as held-out rays confirm it; by how much that changes what was taken."""
-        evidence = _evidence(found, taken, sums, where)
+        evidence = _evidence(found, taken, sums, where, self.corner)
         verdict = kind.gate(evidence)
         kept = verdict.kept or (self.wanted[kind.name] is True and evidence["rms"] > 0)
         change = found - taken if kept else -taken
@@ -117,20 +118,21 @@ def _axis_column(problem: Problem) -> float:
 
 
 def _evidence(
-    found: np.ndarray, taken: np.ndarray, sums: ResidualSums, where: np.ndarray
+    found: np.ndarray, taken: np.ndarray, sums: ResidualSums, where: np.ndarray, corner: float
 ) -> dict[str, float]:
     """How much better the held-out rays are explained, each with what was found and without any."""
-    rays = len(sums.residual)
+    rays, rms = len(sums.residual), float(np.sqrt(np.mean(found**2)))
     if rays < _FEWEST_RAYS:
-        return {"rms": float(np.sqrt(np.mean(found**2))), "better": math.nan, "error": math.nan}
+        return {"rms": rms, "better": math.nan, "error": math.nan}
     without = sums.residual + taken.ravel()[where]
-    before, after = (_misfit(left / sums.deviation) for left in (without, without - found.ravel()[where]))
+    left = (without, without - found.ravel()[where])
+    before, after = (_misfit(residual / sums.deviation, corner) for residual in left)
     mean = max(float(before.mean()), 1e-300)
     better, error = float((before - after).mean()), float((before - after).std()) / math.sqrt(rays)
-    return {"rms": float(np.sqrt(np.mean(found**2))), "better": better / mean, "error": error / mean}
+    return {"rms": rms, "better": better / mean, "error": error / mean}
 
 
-def _misfit(deviations: np.ndarray) -> np.ndarray:
-    """Huber's, as the fit has it."""
+def _misfit(deviations: np.ndarray, corner: float) -> np.ndarray:
+    """Huber's, with the corner that the fit has (`fit.loss.weighted_huber`), ray by ray."""
     size = np.abs(deviations)
-    return np.where(size < _CORNER, 0.5 * size**2, _CORNER * (size - 0.5 * _CORNER))
+    return np.where(size < corner, 0.5 * size**2, corner * (size - 0.5 * corner))
