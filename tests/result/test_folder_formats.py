@@ -87,6 +87,10 @@ def test_blocks_of_zeros_are_left_out_and_16_bits_say_their_slope(tmp_path, monk
     array = about["slope"] * group["0"][:] + about["offset"]
     assert group["0"].dtype == np.uint16
     np.testing.assert_allclose(array, mu[0], atol=1e-5)
+    halved = about["slope"] * group["1"][:] + about["offset"]
+    assert group["1"].dtype == group["2"].dtype == np.uint16
+    # An eighth of one voxel, and the corner, which stands for all eight of its block.
+    np.testing.assert_allclose([halved[0, 1, 1], halved[4, 4, 4]], [1 / 8, 0.5], atol=1e-4)
 
 
 # DICOM

@@ -100,14 +100,15 @@ def _write_level(folder: Path, values: np.ndarray) -> None:
 
 
 def _halved(values: np.ndarray) -> np.ndarray:
-    """Means of 2 x 2 x 2 voxels; the last one of an odd number stands for two, a single one for itself."""
+    """Means of 2 x 2 x 2 voxels, in their type; the last of an odd number stands for two, a single one for itself."""
+    stored = values.dtype
     for axis, n in enumerate(values.shape):
         if n == 1:
             continue
         first = np.take(values, range(0, n, 2), axis)
         second = np.take(values, np.minimum(np.arange(1, n + 1, 2), n - 1), axis)
         values = 0.5 * (first.astype(np.float32) + second.astype(np.float32))
-    return values
+    return np.rint(values).astype(stored) if np.issubdtype(stored, np.integer) else values
 
 
 def _dataset(image: Image, level: int, factors: np.ndarray) -> dict[str, Any]:
