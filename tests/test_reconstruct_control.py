@@ -200,7 +200,8 @@ def test_what_a_volume_takes_is_told_by_some_of_its_slices(compiling):
         now[0] += 5 + self.box.shape[0] + (first.pop() if first else 0.0)
         return torch.zeros(1, *self.box.shape)
 
+    on_the_host = SimpleNamespace(position=torch.zeros(0, 3))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(FitScene, "basis", basis)
         patch.setattr("tomo_polysplat.fit.scene.time", SimpleNamespace(perf_counter=lambda: now[0]))
-        assert scene.seconds_of_basis(None) == pytest.approx(2 * (5 + 17))
+        assert scene.seconds_of_basis(on_the_host) == pytest.approx(2 * (5 + 17))
