@@ -4,13 +4,10 @@ The kernels themselves are compared with autograd in tests/kernels, in Triton's 
 """
 
 import logging
-import sys
-from dataclasses import replace
-from pathlib import Path
-
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
