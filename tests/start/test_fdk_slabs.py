@@ -84,7 +84,7 @@ def test_a_gpu_that_has_no_room_gets_smaller_slabs(monkeypatch):
     assert made[0] == 21 and max(made[1:]) <= 11, "less was tried"
 
 
-# Textures of a GPU interpolate by weights of 8 bits, which a slab's other coordinates round another way: 5e-5 on an H200.
+# Textures interpolate by weights of 8 bits, which the other coordinates of a slab round another way: 5e-5 on an H200.
 _TEXTURE = 2e-4
 
 
