@@ -22,6 +22,8 @@ _COLUMNS_AT_ONCE = 32
 _EXACT = 1e-5
 # Numbers, with what rows are padded by, that are filtered at once.
 _FILTERED_AT_ONCE = 1 << 24
+# What ASTRA takes for its copy of projections, in their size, and for itself.
+_OF_ASTRA = 1.1
 
 
 def suits_fdk_cuda(
@@ -88,6 +90,7 @@ def fdk_cuda_tensor(
     """
     import astra
     import torch
+    from astra.log import AstraError
 
     index = projections.device.index
     # ASTRA takes the origin for the centre of the orbit.
@@ -103,9 +106,11 @@ def fdk_cuda_tensor(
     _filter(sinogram[..., :columns], geometry, filter_name)
     linked = astra.data3d.GPULink(sinogram.data_ptr(), columns, views, rows, width * sinogram.element_size())
     volume = torch.full(grid.shape, torch.nan, dtype=torch.float32, device=sinogram.device)
-    # ASTRA works on streams of its own and asks for none of torch's.
+    # ASTRA works on streams of its own and asks for none of torch's, nor for the memory that torch keeps for later.
     torch.cuda.synchronize(index)
-    data, algorithm = [], None
+    if torch.cuda.mem_get_info(index)[0] < _OF_ASTRA * sinogram.nbytes:
+        torch.cuda.empty_cache()
+    data, algorithm, told = [], None, ""
     try:
         data.append(astra.data3d.link("-sino", proj_geom, linked))
         data.append(astra.data3d.link("-vol", vol_geom, volume))
@@ -114,6 +119,9 @@ def fdk_cuda_tensor(
         config["option"] = {"FilterType": "none", "GPUindex": index}
         algorithm = astra.algorithm.create(config)
         astra.algorithm.run(algorithm)
+    except AstraError as problem:
+        # Other releases say nothing and leave voxels unwritten.
+        told = f" ASTRA says: {problem}"
     finally:
         if algorithm is not None:
             astra.algorithm.delete(algorithm)
@@ -121,7 +129,7 @@ def fdk_cuda_tensor(
             astra.data3d.delete(identifier)
     torch.cuda.synchronize(index)
     if not bool(torch.isfinite(volume).all()):
-        raise RuntimeError(_no_room(sinogram, volume))
+        raise RuntimeError(_no_room(sinogram, volume) + told)
     return volume
 
 
