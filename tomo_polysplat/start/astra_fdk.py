@@ -78,6 +78,7 @@ def fdk_cuda(
     return fdk_on_device(values, geometry, grid, orbit, filter_name, torch.device(device)).cpu().numpy()
 
 
+# One call of ASTRA, with all that it needs before and leaves behind.
 def fdk_cuda_tensor(
     projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid, orbit: Orbit, filter_name: str
 ) -> torch.Tensor:
