@@ -106,7 +106,10 @@ def pixels_behind_a_filter_that_is_not_everywhere_as_thick(device):
 def the_slope_by_the_blur_behind_much_matter(device):
     """As large as the projections, and yet a sum of whole numbers."""
     slopes = []
-    for where, kernel, form in ((device, "triton", _fused), ("cpu", "reference", lambda *p: EagerStep(*p[:-1]))):
+    for where, kernel, form in (
+        (device, "triton", _fused),
+        ("cpu", "reference", lambda *p: EagerStep(*p[:-1])),
+    ):
         problem = fit_problem("cone", True, where, kernel, held_out=0.0, loss="l1")
         problem[0].blur.zero_()
         problem[0].attenuation.mul_(60.0)
