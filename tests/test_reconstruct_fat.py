@@ -14,7 +14,7 @@ SPECTRUM = tps.Spectrum.from_tube(90, filters={"Al": 0.1})
 def core_error(core, seed=0, **settings):
     """Relative error of the mean inside a disc of some matter in one of water, 6 cm wide."""
     projections, proj_geom, vol_geom = disc(core, SPECTRUM, half=3.0)
-    settings = {"passes": 10.0} | settings
+    settings = {"passes": 10.0, "views_per_step": 5} | settings
     result = tps.reconstruct(
         projections, proj_geom, vol_geom, spectrum=SPECTRUM, unit="cm", settings=settings, seed=seed
     )

@@ -110,4 +110,5 @@ def test_a_short_campaign_adds_to_its_record(tmp_path):
     record = Record(path)
     assert record.total("kill", "tried") == 7 + 4 and record.rows["kill: scan npz"]["tried"] > 7
     assert record.total("quota", "tried") + record.total("disk", "tried") == 4
-    assert "| **kill, all** | **11** |" in done.stdout
+    assert "| scan npz | " in done.stdout and "| **all** | **11** | " in done.stdout
+    assert "Faults: none." in done.stdout
