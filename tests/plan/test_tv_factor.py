@@ -69,8 +69,8 @@ def test_more_smoothing_is_taken_where_held_out_rays_want_it_and_lowers_the_erro
 @pytest.mark.parametrize("discs", [FLAT, RINGS])
 @pytest.mark.parametrize("passes", [10, 5])
 def test_a_tenth_of_the_attenuation_and_of_the_noise_gives_a_tenth_of_the_volume(discs, passes):
-    # Half the passes need as many steps.
-    errors, run = [], {"passes": passes, "views_per_step": 6 * passes // 10}
+    # Half the passes need all the steps that are usual.
+    errors, run = [], {"passes": passes, "views_per_step": 6 if passes == 10 else None}
     for denser in (1.0, 0.1):
         scan = slice_of(discs, 0.002 * denser, denser)
         errors.append(relative_error(fitted(scan, **run).volume, scan[3]))
