@@ -1,5 +1,7 @@
 """What the command line says to a slip: what is wrong first, then what was meant, in a few lines."""
 
+import os
+
 import numpy as np
 import pytest
 import tifffile
@@ -34,6 +36,21 @@ def test_a_slip_is_told_before_anything_else(argv, says, capsys):
     assert ended.value.code == 2
     first, *rest = said.splitlines()
     assert says in first and "usage" not in said and len(rest) == 1 and "--help tells" in rest[0]
+
+
+def test_a_memory_in_words_is_refused_before_the_scan_is_looked_for(tmp_path, capsys):
+    out = str(tmp_path / "out.h5")
+    assert main(["recon", "nowhere.h5", "-o", out, "--memory", "lots"]) == 2
+    assert "expected bytes" in capsys.readouterr().err
+
+
+def test_a_reader_that_goes_away_is_no_error(monkeypatch, capfd):
+    read, write = os.pipe()
+    os.close(read)
+    with open(write, "w") as nobody:
+        monkeypatch.setattr("sys.stdout", nobody)
+        assert main(["completion", "bash"]) == 141
+    assert not capfd.readouterr().err
 
 
 def files_of_other_kinds(folder):

@@ -17,6 +17,7 @@ from tomo_polysplat.simulate.scenes import scan_phantom, scene_phantom
 from tomo_polysplat.start.fdk import fdk
 
 ALL_BUT_ROUNDING = 1e-5
+FAST = {"quality": "fast", "settings": {"views_per_step": 4}}
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +34,7 @@ def metal_result(metal_scan):
         scan.vol_geom,
         spectrum=scan.spectrum,
         valid=scan.valid,
-        quality="fast",
+        **FAST,
     )
 
 
@@ -50,7 +51,7 @@ def test_metal_leaves_fewer_artefacts_than_filtered_backprojection(metal_scan, m
 
 
 def test_the_spectrum_is_what_removes_them(metal_scan, metal_result):
-    mono = reconstruct(metal_scan, spectrum=None, valid=metal_scan.valid, quality="fast", settings=None)
+    mono = reconstruct(metal_scan, spectrum=None, valid=metal_scan.valid, **FAST)
     assert psnr(metal_result.volume, metal_scan) > psnr(mono.volume, metal_scan) + 1
 
 
@@ -93,7 +94,7 @@ def mono_scan():
 
 
 def test_a_monochromatic_scan_needs_no_spectrum(mono_scan):
-    result = reconstruct(mono_scan, spectrum=None, settings={"passes": 5.0})
+    result = reconstruct(mono_scan, spectrum=None, settings={"passes": 5.0, "views_per_step": 4})
     assert result.energy_kev is None and result.is_monochromatic
     assert psnr(result.volume, mono_scan) > 18
     inside = mono_scan.truth > 0.15
@@ -158,7 +159,8 @@ def test_two_dimensional_images_come_as_astra_has_them(kind):
     astra.projector.delete(projector)
     if kind == "fanflat_vec":
         proj_geom = astra.geom_2vec(proj_geom)
-    result = tps.reconstruct(sinogram, proj_geom, vol_geom, unit="pixel", settings={"passes": 4.0})
+    settings = {"passes": 4.0, "views_per_step": 4}
+    result = tps.reconstruct(sinogram, proj_geom, vol_geom, unit="pixel", settings=settings)
     assert result.volume.shape == image.shape
     errors = {
         name: float(np.abs(np.asarray(result.volume) - other).mean())
@@ -221,7 +223,7 @@ def test_any_scanner_and_any_voxels(name):
     scan = scan_phantom(
         scene_phantom("pins", False), proj_geom, vol_geom, cone().spectrum, Scanner(noise=False)
     )
-    result = reconstruct(scan, settings={"passes": 3.0})
+    result = reconstruct(scan, settings={"passes": 3.0, "views_per_step": 2})
     _, grid = from_astra(proj_geom, vol_geom)
     z, y, x = np.meshgrid(*grid.axes()[::-1], indexing="ij")
     core = (np.hypot(x, y) < 1.6) & (np.abs(z) < (0.1 if name.startswith("one row") else 0.9))

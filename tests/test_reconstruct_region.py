@@ -11,6 +11,7 @@ from tomo_polysplat.fit.surroundings import cut_out, widened_grid
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.scan.geometry import from_astra, projections_from_astra
 
+QUICK = {"passes": 6.0, "views_per_step": 4}
 HOST = torch.device("cpu")
 
 SPECTRUM = tps.Spectrum.from_tube(90, filters={"Al": 0.1})
@@ -28,9 +29,7 @@ def region():
 
 
 def fitted(region, **settings):
-    return tps.reconstruct(
-        *region, spectrum=SPECTRUM, unit="cm", device="cpu", settings={"passes": 6.0} | settings
-    )
+    return tps.reconstruct(*region, spectrum=SPECTRUM, unit="cm", device="cpu", settings=QUICK | settings)
 
 
 def test_what_lies_around_is_fitted_and_cut_off(region):
@@ -52,7 +51,7 @@ def test_what_lies_around_is_fitted_and_cut_off(region):
 def test_callbacks_see_what_was_asked_for(region):
     shapes = []
     tps.reconstruct(
-        *region, spectrum=SPECTRUM, unit="cm", device="cpu", settings={"passes": 1.0},
+        *region, spectrum=SPECTRUM, unit="cm", device="cpu", settings=QUICK | {"passes": 1.0},
         callbacks=[lambda state: shapes.append(state.volume().shape)],
     )  # fmt: skip
     assert shapes and set(shapes) == {(27, 27)}

@@ -18,12 +18,23 @@ from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.settings import make_settings
 
+PASS = Options(None, {"passes": 1.0})
 ALL = [variant for variants in GROUPS.values() for variant in variants]
 
 
 @pytest.fixture(scope="module")
 def task(tmp_path_factory):
     return Task.of(cached_scan("pins", 15, 44, folder=tmp_path_factory.mktemp("scans")), "cpu")
+
+
+@pytest.fixture(scope="module")
+def default_volume(task):
+    return measure(DEFAULT.method(), task, PASS).volume
+
+
+@pytest.fixture(scope="module")
+def errors():
+    return affine_errors()
 
 
 def test_variants_differ_from_the_default_and_from_each_other():
@@ -45,11 +56,10 @@ def test_the_straight_line_is_one():
 
 
 @pytest.mark.parametrize("variant", [GROUPS["components"][0], GROUPS["nodes"][0], GROUPS["curve"][1]])
-def test_variants_run_and_change_the_volume(variant, task):
-    options = Options(None, {"passes": 1.0})
-    default, changed = (measure(v.method(), task, options) for v in (DEFAULT, variant))
+def test_variants_run_and_change_the_volume(variant, task, default_volume):
+    changed = measure(variant.method(), task, PASS)
     assert changed.volume is not None, changed.about
-    assert np.abs(changed.volume - default.volume).max() > 1e-3 * default.volume.max()
+    assert np.abs(changed.volume - default_volume).max() > 1e-3 * default_volume.max()
 
 
 def test_samples_of_the_spectrum_are_the_nodes(task):
@@ -85,9 +95,8 @@ def test_the_affine_projection_is_exact_for_rays_that_are_parallel():
     assert far / farther == pytest.approx(10, rel=0.2)
 
 
-def test_affine_errors_grow_with_the_cone_and_with_the_gaussians():
-    entries = affine_errors()
-    table = {(e["half_angle_degrees"], e["width"]): e["rms_percent"] for e in entries}
+def test_affine_errors_grow_with_the_cone_and_with_the_gaussians(errors):
+    table = {(e["half_angle_degrees"], e["width"]): e["rms_percent"] for e in errors}
     angles, widths = (sorted({key[place] for key in table}) for place in (0, 1))
     for width in widths:
         assert np.all(np.diff([table[angle, width] for angle in angles]) > 0)
@@ -101,7 +110,8 @@ def test_unknown_groups_are_refused():
             AblationBench(**wrong)
 
 
-def test_command_line(tmp_path, capsys):
+def test_command_line(tmp_path, capsys, errors, monkeypatch):
+    monkeypatch.setattr("tomo_polysplat.bench.ablation.affine_errors", lambda *_: errors)
     options = ["--scenes", "pins", "--size", "15", "--views", "20", "--groups", "relocation", "affine"]
     options += ["--device", "cpu", "--passes", "1", "--seeds", "2", "--cache", str(tmp_path)]
     assert main(["bench", "ablation", *options, "--record", str(tmp_path)]) == 0

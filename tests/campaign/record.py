@@ -10,7 +10,6 @@ from pathlib import Path
 __all__ = ["Record"]
 
 FAULTS = ("crashed", "mixed", "lost", "over time", "over memory", "no words")
-COLUMNS = ("tried", "accepted", *FAULTS)
 
 
 class Record:
@@ -54,16 +53,41 @@ class Record:
         return sum(row.get(column, 0) for what, row in self.rows.items() if what.split(":")[0] == kind)
 
     def table(self) -> str:
-        """In Markdown, a sum for each kind first."""
-        kinds = dict.fromkeys(what.split(":")[0] for what in self.rows)
-        lines = [f"| what | {' | '.join(COLUMNS)} |", f"|---|{'---|' * len(COLUMNS)}"]
+        """In Markdown: how often each was tried, what was accepted, and faults where there are any."""
+        kinds = dict.fromkeys(what.split(": ")[0] for what in self.rows)
+        groups: list[list[str]] = []
         for kind in kinds:
-            sums = [self.total(kind, column) for column in COLUMNS]
-            lines.append(f"| **{kind}, all** | {' | '.join(map(_bold, sums))} |")
-            for what, row in self.rows.items():
-                if what.split(":")[0] == kind:
-                    lines.append(f"| {what} | {' | '.join(str(row.get(column, 0)) for column in COLUMNS)} |")
-        return "\n".join(lines)
+            # What is killed and what finds a disk full are the same files.
+            like = [group for group in groups if self._names(group[0]) & self._names(kind)]
+            like[0].append(kind) if like else groups.append([kind])
+        return "\n\n".join([*map(self._table_of, groups), self._faults()])
+
+    def _names(self, kind: str) -> set[str]:
+        return {what.partition(": ")[2] for what in self.rows if what.split(": ")[0] == kind}
+
+    def _table_of(self, kinds: list[str]) -> str:
+        names = dict.fromkeys(what.partition(": ")[2] for what in self.rows if what.split(": ")[0] in kinds)
+        cells = [(kind, "tried") for kind in kinds]
+        cells += [(kind, "accepted") for kind in kinds if self.total(kind, "accepted")]
+        alone = len(kinds) == 1
+        heads = [
+            column if alone else kind if column == "tried" else f"{kind}, {column}" for kind, column in cells
+        ]
+        lines = [f"| {kinds[0] if alone else ''} | {' | '.join(heads)} |", f"|---|{'---|' * len(heads)}"]
+        for name in names:
+            rows = [self.rows.get(f"{kind}: {name}", {}).get(column, 0) for kind, column in cells]
+            lines.append(f"| {name} | {' | '.join(map(str, rows))} |")
+        sums = [f"**{self.total(kind, column)}**" for kind, column in cells]
+        return "\n".join([*lines, f"| **all** | {' | '.join(sums)} |"])
+
+    def _faults(self) -> str:
+        found = [
+            f"{row[fault]} {fault} ({what})"
+            for what, row in self.rows.items()
+            for fault in FAULTS
+            if row.get(fault)
+        ]
+        return f"Faults: {'; '.join(found) or 'none'}. Looked for: {', '.join(FAULTS)}."
 
     def conditions(self) -> str:
         """Where, how long, and the most that reading a file took."""
@@ -77,7 +101,3 @@ class Record:
             f"{self.seconds / 60:.0f} minutes.\n"
             f"The slowest file took {self.slowest:.2f} s of the CPU, the largest {self.most / 2**20:.0f} MB."
         )
-
-
-def _bold(number: int) -> str:
-    return f"**{number}**"

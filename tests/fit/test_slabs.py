@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.fit.slabs import slabs
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model import seed_samples
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.start import levels
+from tomo_polysplat.start.slabs import slabs
 
 SHAPE = (17, 13, 15)
 

@@ -21,9 +21,13 @@ SHAPE = (3, 2, 4)
 
 
 def deflated(megabytes=MEGABYTES):
-    packer = zlib.compressobj(9)
-    block = bytes(2**20)
-    return b"".join(packer.compress(block) for _ in range(megabytes)) + packer.flush()
+    """Zeros in zlib's format: one megabyte packed by itself, many times over."""
+    block, check = bytes(2**20), 1
+    packer, nothing = (zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS) for _ in range(2))
+    piece = packer.compress(block) + packer.flush(zlib.Z_FULL_FLUSH)
+    for _ in range(megabytes):
+        check = zlib.adler32(block, check)
+    return b"\x78\xda" + megabytes * piece + nothing.flush() + check.to_bytes(4, "big")
 
 
 BOMB = deflated()

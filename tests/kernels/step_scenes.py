@@ -86,16 +86,17 @@ def _gaussians(count, planar, device):
 def compare_steps(make, device, truth, kind="cone", polychromatic=True, **changes):
     """Both forms, from the same start with the same views, must read and change the same.
 
-    With ``faster`` by so many times in the last step.
+    With ``faster`` by so many times in the last step; with ``steps`` only so many of the last ones, in which materials
+    are fitted.
     """
-    outcomes, faster = [], changes.pop("faster", 1.0)
+    outcomes, faster, steps = [], changes.pop("faster", 1.0), changes.pop("steps", STEPS)
     for form, where, kernel in ((make, device, "triton"), (EagerStep, *truth)):
         # Few: Triton's interpreter takes a tenth of a second for each.
         problem = fit_problem(kind, polychromatic, where, kernel, count=9, **changes)
         gaussians = problem[0]
         before = gaussians.copy()
         step = form(*problem) if form is EagerStep else form(*problem, BATCH)
-        for k in range(STEPS):
+        for k in range(STEPS - steps, STEPS):
             if k == STEPS - 1 and faster != 1:
                 rates = step_rates(problem[4], problem[1])
                 step.set_rates({name: faster * rate for name, rate in rates.items()})
@@ -106,7 +107,7 @@ def compare_steps(make, device, truth, kind="cone", polychromatic=True, **change
         outcomes.append((read, moved, step.moments, step.pull.cpu(), step.done))
     (read, moved, moments, pull, done), (read_2, moved_2, moments_2, pull_2, done_2) = outcomes
     np.testing.assert_allclose(read, read_2, rtol=1e-4)
-    assert done == done_2 == STEPS
+    assert done == done_2 == steps
     _same(pull, pull_2, 1e-3, "pull")
     for name, expected in moved_2.items():
         _same(moved[name], expected, 2e-2, name)

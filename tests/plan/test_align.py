@@ -11,7 +11,7 @@ import tomo_polysplat as tps
 from tomo_polysplat.plan.alignment import _joined, moves_of
 from tomo_polysplat.scan.layout import vector_form
 
-QUICK = {"passes": 5.0, "pixel_rays": 1}
+QUICK = {"passes": 5.0, "views_per_step": 6, "pixel_rays": 1}
 
 
 @cache

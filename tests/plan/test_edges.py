@@ -1,5 +1,6 @@
 """Objects whose edges are known to be sharp or blurred, and when nobody needs to ask."""
 
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,6 +22,7 @@ from tomo_polysplat.start.joseph import JosephProjector
 SIZE, FINER = 31, 3
 
 
+@cache
 def walls(blur, views=44, size=SIZE):
     """Projections, geometry, grid and truth of nested shells, as they are or blurred by ``blur`` voxels."""
     angles = np.linspace(0, np.pi, views, endpoint=False)
@@ -67,9 +69,11 @@ def test_sharp_edges_come_out_sharper():
     proj_geom, vol_geom = to_astra(geometry, grid)
     rays = np.ascontiguousarray(projections.swapaxes(0, 1))
 
+    settings = {"passes": 6, "views_per_step": 4}
+
     def result(edges):
         return reconstruct(
-            rays, proj_geom, vol_geom, unit="cm", settings={"edges": edges, "passes": 6}, progress=False
+            rays, proj_geom, vol_geom, unit="cm", settings=settings | {"edges": edges}, progress=False
         )
 
     found, same, other = (result(edges) for edges in (None, "sharp", "blurred"))

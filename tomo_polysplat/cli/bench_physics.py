@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -47,15 +48,8 @@ def spectrum(arguments: argparse.Namespace, write: Callable[..., None], say: Cal
     from tomo_polysplat.bench.spectrum import SpectrumBench, as_markdown, run_spectrum_bench, write_figure
 
     names = ("scenes", "size", "views", "quality", "device", "seed")
-    chosen = {name: getattr(arguments, name) for name in names}
-    if arguments.cases:
-        chosen["cases"] = arguments.cases
-    record = run_spectrum_bench(
-        SpectrumBench(**chosen),
-        progress=say,
-        update=lambda so_far: write(arguments, "spectrum.json", so_far, quiet=True),
-    )
-    write(arguments, "spectrum.json", record)
+    bench = SpectrumBench(**_chosen(arguments, names, "cases"))
+    record = _recorded(arguments, "spectrum.json", write, partial(run_spectrum_bench, bench, progress=say))
     return _tell(arguments, "spectrum", record, as_markdown(record), write_figure)
 
 
@@ -64,16 +58,26 @@ def materials(arguments: argparse.Namespace, write: Callable[..., None], say: Ca
     from tomo_polysplat.bench.materials import MaterialsBench, as_markdown, run_materials_bench, write_figure
 
     names = ("kvp", "aluminium_cm", "largest", "size", "device")
-    chosen = {name: getattr(arguments, name) for name in names}
-    if arguments.rods:
-        chosen["rods"] = arguments.rods
-    record = run_materials_bench(
-        MaterialsBench(**chosen),
-        progress=say,
-        update=lambda so_far: write(arguments, "materials.json", so_far, quiet=True),
-    )
-    write(arguments, "materials.json", record)
+    bench = MaterialsBench(**_chosen(arguments, names, "rods"))
+    record = _recorded(arguments, "materials.json", write, partial(run_materials_bench, bench, progress=say))
     return _tell(arguments, "materials", record, as_markdown(record), write_figure)
+
+
+def _chosen(arguments: argparse.Namespace, names: tuple[str, ...], some: str) -> dict[str, Any]:
+    """Options by name, and those of which none means all."""
+    chosen = {name: getattr(arguments, name) for name in names}
+    if getattr(arguments, some):
+        chosen[some] = getattr(arguments, some)
+    return chosen
+
+
+def _recorded(
+    arguments: argparse.Namespace, file: str, write: Callable[..., None], run: Callable[..., dict[str, Any]]
+) -> dict[str, Any]:
+    """The record of a benchmark, saved as it grows and at its end."""
+    record = run(update=lambda so_far: write(arguments, file, so_far, quiet=True))
+    write(arguments, file, record)
+    return record
 
 
 def _tell(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 from collections.abc import Sequence
 
@@ -16,6 +17,8 @@ __all__ = ["main"]
 
 COMMANDS = (demo, import_scan, recon, view, simulate, check, bench, doctor, completion)
 BAD_INPUT, FAILED = 2, 1
+# What a shell tells of a command whose reader went away.
+UNREAD = 128 + 13
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -24,7 +27,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        0 when all went well, 1 for a failure of ours, 2 for bad input, 130 when interrupted.
+        0 when all went well, 1 for a failure of ours, 2 for bad input, 130 when interrupted, 141 when nobody reads
+        what is printed.
     """
     arguments = build_parser().parse_all(argv)
     level = logging.DEBUG if arguments.debug else logging.INFO if arguments.verbose else logging.WARNING
@@ -34,7 +38,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.debug:
         return arguments.run(arguments)
     try:
-        return arguments.run(arguments)
+        status = arguments.run(arguments)
+        sys.stdout.flush()
+        return status
+    except BrokenPipeError:
+        # Python flushes once more as it ends, and would tell of the pipe then.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return UNREAD
     except (ValueError, TypeError, OSError, MemoryError, ImportError) as error:
         return _complain(str(error) or type(error).__name__, BAD_INPUT)
     except KeyboardInterrupt as error:

@@ -23,6 +23,7 @@ from tomo_polysplat.cli.recon_outputs import require_outputs, require_room_of, w
 from tomo_polysplat.fit.stopping import StopReason
 from tomo_polysplat.interrupts import postponed_interrupts
 from tomo_polysplat.progress import progress_reports
+from tomo_polysplat.settings import make_settings
 
 if TYPE_CHECKING:
     from tomo_polysplat.physics.spectrum import Spectrum
@@ -147,6 +148,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Reconstruct, and write what was asked for."""
     require_outputs(arguments)
+    settings = _settings(arguments)
+    # Refused before the scan is read.
+    make_settings(arguments.quality, settings)
     scan = scan_from(arguments, spectrum_from(arguments))
     spectrum = _spectrum_of(scan, arguments)
     if arguments.filter_map is not None:
@@ -168,7 +172,7 @@ def run(arguments: argparse.Namespace) -> int:
             soft_density=arguments.soft_density,
             mend=not arguments.no_mend,
             progress=progress,
-            settings=_settings(arguments) or None,
+            settings=settings or None,
             checkpoint=arguments.checkpoint,
             resume=arguments.resume,
         )

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 import torch
 
 from tomo_polysplat.fit.memory import voxels_at_once
+from tomo_polysplat.start.slabs import slabs
 from tomo_polysplat.transfer import to_host
 
-__all__ = ["on_host", "slabs"]
+__all__ = ["on_host"]
 
 
 def on_host(
@@ -53,10 +54,3 @@ def on_host(
         for channel, values in zip(whole, part):
             channel[wanted] = to_host(values)
     return whole
-
-
-def slabs(slices: int, depth: int, halo: int) -> Iterator[tuple[slice, int, int]]:
-    """The slices of each slab, and the first and the one behind the last with a halo at both ends."""
-    for first in range(0, slices, depth):
-        last = min(first + depth, slices)
-        yield slice(first, last), max(first - halo, 0), min(last + halo, slices)

@@ -5,26 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from tomo_polysplat.nuisances.nuisance import Found, Nuisance, Parameter, Place, Verdict
-from tomo_polysplat.nuisances.steady_gate import steady_gate
+from tomo_polysplat.nuisances.nuisance import Parameter, Place
+from tomo_polysplat.nuisances.steady_light import SteadyLight
 
 __all__ = ["Drift"]
 
 
-class Drift(Nuisance):
+class Drift(SteadyLight):
     """One factor a view."""
 
     name = "drift"
     place = Place.LIGHT
     parameters = {"drift": Parameter("rms over the views of the log of their light", 0.0, 0.0, 1.0)}
-    found_by = Found.RESIDUALS
     gauge = "the open beam of all views together: the mean of the logarithms stays 0"
     cost = "none beside that of the gains"
-
-    @classmethod
-    def gate(cls, evidence: Mapping[str, float]) -> Verdict:
-        """The misfit of held-out rays falls by three times its standard error at least."""
-        return steady_gate(evidence)
 
     @classmethod
     def told(cls, values: Mapping[str, Any]) -> str:

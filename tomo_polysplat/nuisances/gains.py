@@ -5,29 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from tomo_polysplat.nuisances.nuisance import Found, Nuisance, Parameter, Place, Verdict
-from tomo_polysplat.nuisances.steady_gate import steady_gate
+from tomo_polysplat.nuisances.nuisance import Parameter, Place
+from tomo_polysplat.nuisances.steady_light import SteadyLight
 
 __all__ = ["Gains"]
 
 
-class Gains(Nuisance):
+class Gains(SteadyLight):
     """One log-gain a pixel, the same in all views."""
 
     name = "gains"
     place = Place.DETECTOR
     parameters = {"gains": Parameter("rms over the pixels of the log of their gain", 0.0, 0.0, 1.0)}
-    found_by = Found.RESIDUALS
     gauge = (
         "rings in the object, and what neighbouring pixels have in common, which is the object's or the"
         " spectrum's: gains are as strong for short waves across the detector as for long ones"
     )
     cost = "residuals of all rays after three to six passes, each a part of a pass"
-
-    @classmethod
-    def gate(cls, evidence: Mapping[str, float]) -> Verdict:
-        """The misfit of held-out rays falls by three times its standard error at least."""
-        return steady_gate(evidence)
 
     @classmethod
     def told(cls, values: Mapping[str, Any]) -> str:

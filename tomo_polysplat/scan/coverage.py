@@ -58,11 +58,16 @@ def unseen_share(geometry: Geometry, grid: VolumeGrid, pixels: np.ndarray | None
 def _share(geometry: Geometry, points: np.ndarray, pixels: np.ndarray | None) -> np.ndarray:
     """Share of the views that see each point, (n,)."""
     seen = np.zeros(len(points), np.float32)
-    for view in range(geometry.views):
-        place = geometry.select(slice(view, view + 1)).project_points(points)[0]
-        column, row = (np.floor(np.nan_to_num(place[:, k], nan=-1.0) + 0.5).astype(int) for k in (0, 1))
+    matrices, references = geometry.projection_matrices()
+    for matrix, reference in zip(matrices, references):
+        # Not by `project_points`, whose arrays of all views at once are several times as slow.
+        column, row, depth = matrix @ (points - reference).T
+        if geometry.beam == "cone":
+            depth[depth <= 0] = np.nan
+            column, row = column / depth, row / depth
+        column, row = column + 0.5, row + 0.5
         inside = (column >= 0) & (column < geometry.columns) & (row >= 0) & (row < geometry.rows)
         if pixels is not None:
-            inside[inside] = pixels[row[inside], column[inside]]
+            inside[inside] = pixels[row[inside].astype(int), column[inside].astype(int)]
         seen += inside
     return seen / geometry.views

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +15,7 @@ from tomo_polysplat.start.orbit import Orbit
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["fdk_of_slabs", "fdk_on_device", "rows_of", "slab_of"]
+__all__ = ["fdk_of_slabs", "fdk_on_device", "rows_of", "slab_of", "slabs"]
 
 logger = logging.getLogger(__name__)
 
@@ -26,6 +26,13 @@ _MARGIN = 2
 _OF_RAY, _OF_VOXEL, _FILTER = 12, 5, 4 << 27
 # Of what is free: the rest is for what ASTRA's own context takes. And how often less is tried where that was too much.
 _SHARE, _TIMES = 0.8, 3
+
+
+def slabs(slices: int, depth: int, halo: int = 0) -> Iterator[tuple[slice, int, int]]:
+    """The slices of each slab, and the first and the one behind the last with a halo at both ends."""
+    for first in range(0, slices, depth):
+        last = min(first + depth, slices)
+        yield slice(first, last), max(first - halo, 0), min(last + halo, slices)
 
 
 def slab_of(grid: VolumeGrid, first: int, last: int) -> VolumeGrid:
@@ -66,11 +73,10 @@ def fdk_of_slabs(
     whole : (nz, ny, nx) tensor
         The same as made in one piece, to rounding; it may lie anywhere.
     """
-    for first in range(0, grid.shape[0], depth):
-        last = min(first + depth, grid.shape[0])
+    for wanted, first, last in slabs(grid.shape[0], depth):
         slab = slab_of(grid, first, last)
         rows = rows_of(geometry, slab)
-        whole[first:last] = make(rows, geometry.cropped(rows, (0, geometry.columns)), slab)
+        whole[wanted] = make(rows, geometry.cropped(rows, (0, geometry.columns)), slab)
 
 
 def fdk_on_device(

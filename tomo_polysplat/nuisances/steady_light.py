@@ -1,0 +1,35 @@
+"""What gains and drift have in common: they stay as they are, and residuals of short fits tell them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from tomo_polysplat.nuisances.nuisance import Found, Nuisance, Verdict
+
+__all__ = ["SteadyLight"]
+
+# In standard errors of the mean difference, each ray with the correction and without.
+_SURE = 3.0
+
+
+class SteadyLight(Nuisance):
+    """Factors of the light, found by what a fit leaves of the rays."""
+
+    found_by = Found.RESIDUALS
+
+    @classmethod
+    def gate(cls, evidence: Mapping[str, float]) -> Verdict:
+        """Whether the misfit of held-out rays falls by three times its standard error at least.
+
+        Parameters
+        ----------
+        evidence : mapping of str to float
+            ``rms`` of what was found; ``better``, by what share the mean misfit of the held-out rays falls with it, and
+            ``error``, the standard error of that.
+        """
+        if not evidence["rms"] > 0:
+            return Verdict(False, "none beyond the noise")
+        better, error = evidence["better"], evidence["error"]
+        way = "rises" if better < 0 else "falls"
+        words = f"the misfit of held-out rays {way} by {abs(better):.1%} (standard error {error:.1%})"
+        return Verdict(better > _SURE * error, f"{evidence['rms']:.2%} rms; {words}")
