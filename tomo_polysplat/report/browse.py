@@ -62,7 +62,7 @@ def browser(
     pictures = [[_picture(volume[k], window) for k in chosen] for _, volume in volumes]
     # The middle may be at 1e-17.
     places = np.where(np.abs(heights) < 1e-6 * np.ptp(heights), 0.0, heights)
-    names = [f"slice {k + 1} of {count}, z = {places[k]:.3g} {unit}" for k in chosen]
+    names = [f"slice {k} of {count}, z = {places[k]:.3g} {unit}" for k in chosen]
     start = int(np.flatnonzero(chosen == first)[0])
     parts = [
         f'<figure><figcaption>{text(name)}</figcaption><img alt="axial slice of {text(name)}" '
