@@ -124,7 +124,13 @@ def _line_integrals(
     else:
         means = {}
     projections, valid, rays = line_integrals(
-        lambda part: read_block(data, part), data.shape, kind, flat, background, options.saturation
+        lambda part: read_block(data, part),
+        data.shape,
+        kind,
+        flat,
+        background,
+        options.saturation,
+        options.progress,
     )
     return projections, valid, {"input": kind, "rays": rays} | means
 
