@@ -125,6 +125,8 @@ def load_scan(
     if scanner:
         got = ", ".join(map(str, scanner))
         raise fail("scanner", "nothing for a scan that has its own geometry", got, "leave it out")
+    if reader is scan_from_hdf5:
+        return scan_from_hdf5(existing_file(path), options, part)
     scan = reader(existing_file(path), options)
     return scan if part.whole else scan_part(scan, part)
 
