@@ -11,7 +11,7 @@ NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 # Text that is replaced so that a test takes seconds; each must be there.
 SMALL = {
     "01_quickstart": {"SIZE, VIEWS, QUALITY = 48, 120": "SIZE, VIEWS, QUALITY = 24, 48"},
-    "02_tomopy_pipeline": {"COLUMNS, ROWS, VIEWS = 64, 8, 120": "COLUMNS, ROWS, VIEWS = 40, 4, 60"},
+    "02_tomopy_pipeline": {"COLUMNS, ROWS, VIEWS = 72, 12, 150": "COLUMNS, ROWS, VIEWS = 40, 4, 60"},
     "03_astra_cone_geometry": {"SIZE, VIEWS, QUALITY = 40, 120": "SIZE, VIEWS, QUALITY = 20, 48"},
     "04_spectrum_and_materials": {"SIZE, VIEWS, QUALITY = 40, 120": "SIZE, VIEWS, QUALITY = 32, 60"},
     "05_speed_against_error": {
