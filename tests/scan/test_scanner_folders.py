@@ -30,7 +30,7 @@ def test_another_library_opens_the_volume_of_a_folder(kind, tmp_path):
     """Voxel size, unit and orientation: the marker lies off every axis, where the simulated one does."""
     own = write_folder(kind, tmp_path / "folder")
     tps.baselines.fdk(tps.load_scan(tmp_path / "folder")).save(tmp_path / "volume.mha")
-    image = SimpleITK.ReadImage(tmp_path / "volume.mha")
+    image = SimpleITK.ReadImage(str(tmp_path / "volume.mha"))
     side = 1.6 * 100 / 250  # of a pixel, brought down to the axis, in mm
     np.testing.assert_allclose(image.GetSpacing(), [side] * 3, rtol=1e-6)
     values = SimpleITK.GetArrayFromImage(image)
