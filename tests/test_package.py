@@ -172,20 +172,6 @@ def test_constraints_cover_every_dependency():
     assert len(wanted) > 8 and wanted <= pinned
 
 
-def test_the_conda_recipe_has_the_dependencies_of_the_package():
-    """By other names where conda-forge has others."""
-    others = {"torch": "pytorch", "matplotlib": "matplotlib-base"}
-    text = (ROOT / "pyproject.toml").read_text()
-    block = text.split("dependencies = [", 1)[1].split("\n]", 1)[0]
-    wanted = [line.strip().strip('",').split(";")[0] for line in block.splitlines() if line.strip()]
-    recipe = (ROOT / "conda" / "meta.yaml").read_text()
-    told = {line.strip("- ").split("  #")[0].strip() for line in recipe.splitlines()}
-    for line in wanted:
-        name, least = line.strip().split(">=")
-        assert f"{others.get(name, name)} >={least}" in told
-    assert f'version = "{tomo_polysplat.__version__}"' in recipe
-
-
 def long_functions(path):
     """Functions of more than 40 lines, 6 parameters or 3 closures, and whether a comment above says why."""
     source = path.read_text(encoding="utf-8")

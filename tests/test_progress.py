@@ -8,7 +8,11 @@ import tqdm.auto
 import tqdm.notebook
 from small_scans import QUICK, fan, reconstruct
 
+import tomo_polysplat as tps
 from tomo_polysplat.progress import TimeLeft, progress_reports
+from tomo_polysplat.scan import in_blocks
+from tomo_polysplat.simulate.folders.scene import marked_scan
+from tomo_polysplat.simulate.folders.write import write_folder
 
 
 def seconds(told):
@@ -88,7 +92,7 @@ def test_a_notebook_shows_it_unasked(monkeypatch):
         report(0.5, "half")
     with progress_reports(False):
         pass
-    assert [options["disable"] for options in drawn] == [False, True]
+    assert [options["disable"] for options in drawn] == [False]
 
 
 def test_lines_of_the_log_stay_whole(capsys):
@@ -104,6 +108,26 @@ def test_lines_of_the_log_stay_whole(capsys):
         root.removeHandler(handler)
     lines = capsys.readouterr().err.replace("\r", "\n").split("\n")
     assert [line for line in lines if "dark" in line] == ["WARNING: a view is dark"]
+
+
+@pytest.mark.parametrize("kind", ["tiffs", "nxtomo", "h5"])
+def test_reading_is_shown_while_it_goes_on(kind, tmp_path, monkeypatch, capsys):
+    """Some views at a time; what is read at once has no bar."""
+    path = tmp_path / "scan"
+    scan = write_folder(kind if kind != "h5" else "tiffs", path, marked_scan(6, 9, 9))
+    if kind == "h5":
+        tps.save_scan(scan, path := tmp_path / "scan.h5")
+    for blocks, shares in ((None, [1.0]), (2, [1 / 3, 2 / 3, 1.0])):
+        if blocks is not None:
+            monkeypatch.setattr(in_blocks, "_BLOCK_BYTES", blocks * 9 * 9 * 8)
+        told = []
+        tps.load_scan(path, progress=lambda share, words, told=told: told.append((share, words)))
+        assert [share for share, _ in told] == pytest.approx(shares)
+        assert {words for _, words in told} == {"reading"}
+        monkeypatch.setattr("tomo_polysplat.progress._is_terminal", lambda _: True)
+        capsys.readouterr()
+        tps.load_scan(path)
+        assert ("reading" in capsys.readouterr().err) == (blocks is not None)
 
 
 def test_a_pass_is_shown_while_it_is_made(monkeypatch):

@@ -35,6 +35,13 @@ def test_every_block_of_the_readme_runs_in_order(tmp_path, monkeypatch):
     assert names["volume"].shape == names["result"].volume.shape
 
 
+def test_every_block_of_the_readme_runs_a_second_time():
+    """What was written the first time is in the way of nothing."""
+    lines = [line for _, _, text in BLOCK.findall(README) for line in text.splitlines()]
+    writing = [line for line in lines if re.search(r" -o | demo|\.save\(|\.report\(|save_scan\(", line)]
+    assert len(writing) == 6 and all("overwrite" in line for line in writing)
+
+
 def test_the_readme_has_at_most_1500_words():
     assert len(re.sub(r"^```.*?^```", "", README, flags=re.S | re.M).split()) <= 1500
 

@@ -38,6 +38,9 @@ def progress_reports(
         return
     if not (wanted is None or isinstance(wanted, (int, np.bool_))):
         raise fail("progress", "True, False, None or a function", repr(wanted), error=TypeError)
+    if wanted is not None and not wanted:
+        yield _silent
+        return
     tqdm, in_notebook = _bars()
     drawn = in_notebook or _is_terminal(sys.stderr) if wanted is None else bool(wanted)
     layout = "{l_bar}{bar}| {elapsed}{postfix}" if in_notebook else "{l_bar}{bar:24}| {elapsed}{postfix}"
@@ -53,6 +56,10 @@ def progress_reports(
             bar.refresh()
 
         yield report
+
+
+def _silent(share: float, words: str = "") -> None:
+    """For those who want no bar."""
 
 
 class TimeLeft:

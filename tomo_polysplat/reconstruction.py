@@ -226,7 +226,7 @@ def reconstruct(
                 **problem.taken.told(problem.order),
             )
     result.plan["stop"] = _stopped(outcome, interruption.asked)
-    if compiled_seconds() > compiled:
+    if time_budget is not None and compiled_seconds() > compiled:
         words = "seconds of compiling kernels, once a machine; a time budget does not count them"
         result.plan["compiling"] = Answer.found(compiled_seconds() - compiled, words)
     result.seconds = time.perf_counter() - begun

@@ -91,5 +91,5 @@ def npz_stacks(draw) -> dict[str, bytes]:
     return files | {name: draw(npz_files(arrays))}
 
 
-XRADIA = xradia_folders() | folders("xradia")
+XRADIA = xradia_folders() | folders("xradia") | folders("xrm")
 NPZ_STACKS = st.deferred(lambda: npz_stacks() | folders("npz"))

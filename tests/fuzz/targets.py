@@ -173,7 +173,7 @@ FILES = {
     "EDF": (read_folder, folders("edf")),
     ".npy": (read_folder, folders("npy")),
     "RTK and MetaImage": (read_folder, folders("rtk")),
-    "Zeiss .txrm": (read_folder, XRADIA),
+    "Zeiss .txrm and .xrm": (read_folder, XRADIA),
     ".npz stacks": (read_folder, NPZ_STACKS),
     "spectrum tables": (read_spectrum, SPECTRUM_TABLES),
     "filter maps": (read_filter_map, FILTER_MAPS),

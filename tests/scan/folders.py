@@ -9,7 +9,7 @@ from tomo_polysplat.simulate.folders.scene import MARKER, marked_scan
 from tomo_polysplat.start.fdk import fdk
 from tomo_polysplat.units import cm_per
 
-__all__ = ["marked", "require_the_same_volume", "volume_of"]
+__all__ = ["error_db", "marked", "require_the_same_volume", "volume_of"]
 
 
 @cache

@@ -262,3 +262,20 @@ def test_an_edf_header_of_blanks_takes_no_time(tmp_path):
     frames = EdfFrames([tmp_path / "a.edf"])
     assert time.process_time() - begun < 1.0  # by a pattern with blanks in two places it was 20
     np.testing.assert_array_equal(frames.read(0, slice(0, 5), slice(0, 7)), picture)
+
+
+@pytest.mark.parametrize("kind", ["uint8", "uint16", "int32", "uint32", "float32", "float64"])
+def test_edf_as_fabio_writes_it(kind, tmp_path):
+    """The library of the ESRF's, one picture in a file and several."""
+    edfimage = pytest.importorskip("fabio.edfimage", reason="python -m pip install fabio")
+    pictures = np.random.default_rng(1).integers(0, 200, (3, 5, 7)).astype(kind)
+    image = edfimage.EdfImage(data=pictures[0], header={"motor_pos": "1 2"})
+    image.write(str(tmp_path / "one.edf"))
+    for more in pictures[1:]:
+        image.append_frame(data=more)
+    image.write(str(tmp_path / "several.edf"))
+    for name, expected in (("one", pictures[:1]), ("several", pictures)):
+        frames = EdfFrames([tmp_path / f"{name}.edf"])
+        found = [frames.read(k, slice(None), slice(None)) for k in range(frames.shape[0])]
+        np.testing.assert_array_equal(found, expected)
+        assert frames.dtype == pictures.dtype

@@ -3,10 +3,13 @@
 import subprocess
 import sys
 
+import numpy as np
 import pytest
-from folders import marked, require_the_same_volume
+import SimpleITK
+from folders import error_db, marked, require_the_same_volume
 
 import tomo_polysplat as tps
+from tomo_polysplat.simulate.folders.scene import MARKER
 from tomo_polysplat.simulate.folders.write import KINDS, write_folder
 
 
@@ -20,6 +23,24 @@ def test_a_folder_gives_the_volume_of_our_own_file(kind, tmp_path):
         # What the folder tells of the tube makes the spectrum that the scan was made with.
         assert scan.spectrum.effective_energy == pytest.approx(own.spectrum.effective_energy)
         assert any("flat panel" in guess for guess in scan.notes["scanner"]["guessed"])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_another_library_opens_the_volume_of_a_folder(kind, tmp_path):
+    """Voxel size, unit and orientation: the marker lies off every axis, where the simulated one does."""
+    own = write_folder(kind, tmp_path / "folder")
+    tps.baselines.fdk(tps.load_scan(tmp_path / "folder")).save(tmp_path / "volume.mha")
+    image = SimpleITK.ReadImage(str(tmp_path / "volume.mha"))
+    side = 1.6 * 100 / 250  # of a pixel, brought down to the axis, in mm
+    np.testing.assert_allclose(image.GetSpacing(), [side] * 3, rtol=1e-6)
+    values = SimpleITK.GetArrayFromImage(image)
+    found = np.unravel_index(np.argmax(values), values.shape)[::-1]
+    place = image.TransformIndexToPhysicalPoint([int(index) for index in found])
+    np.testing.assert_allclose(place, 10 * np.array(MARKER), atol=1.6)  # its radius
+    # In 1/mm: like that of the own file, which is in 1/cm.
+    expected = tps.baselines.fdk(own)
+    assert own.unit == "cm" and expected.unit == "cm"
+    assert abs(error_db(10 * values, own.truth) - error_db(expected.volume, own.truth)) < 0.3
 
 
 def test_a_folder_is_not_written_over(tmp_path):

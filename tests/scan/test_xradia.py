@@ -10,7 +10,7 @@ from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.scan.readers.compound import CompoundFile
 from tomo_polysplat.simulate.folders.compound_file import compound_file
 from tomo_polysplat.simulate.folders.scene import pictures_of
-from tomo_polysplat.simulate.folders.xradia import streams_of
+from tomo_polysplat.simulate.folders.xradia import single_views, streams_of
 
 
 @pytest.fixture(scope="module")
@@ -157,6 +157,68 @@ def test_only_what_is_wanted_is_read(write, monkeypatch):
 def test_what_is_wrong_is_named(write, changes, message):
     with pytest.raises(ValueError, match=message):
         tps.load_scan(write(changes))
+
+
+@pytest.fixture
+def write_views(tmp_path):
+    """Write one file a view; the changes of a file replace or (None) remove its streams, None removes the file."""
+
+    def written(changes=None):
+        for name, streams in single_views(pictures_of(marked())).items():
+            own = (changes or {}).get(name, {})
+            if own is not None:
+                kept = {key: value for key, value in (streams | own).items() if value is not None}
+                (tmp_path / name).write_bytes(compound_file(kept))
+        return tmp_path
+
+    return written
+
+
+def test_one_file_a_view_is_what_one_file_of_all_is(write, write_views, monkeypatch):
+    whole = tps.load_scan(write())
+    (path := write_views()).joinpath("marker.txrm").unlink()
+    closed, close = [], CompoundFile.__del__
+    monkeypatch.setattr(CompoundFile, "__del__", lambda self: (close(self), closed.append(self.path)))
+    scan = tps.load_scan(path)
+    np.testing.assert_array_equal(scan.projections, whole.projections)
+    np.testing.assert_array_equal(scan.proj_geom["Vectors"], whole.proj_geom["Vectors"])
+    assert scan.name == path.name and len(closed) > 48, "files of views do not stay open"
+
+
+def test_views_of_an_exposure_of_their_own(write_views):
+    exact = tps.load_scan(path := write_views())
+    scan = tps.load_scan(write_views({"marker_0007.xrm": {"ImageInfo/ExpTimes": floats(1.0)}}))
+    longer = exact.projections + np.log(2) * (np.arange(48) == 6)[:, None]
+    np.testing.assert_allclose(scan.projections, longer, atol=1e-5)
+    assert "pictures of 0.5 to 1 s are compared with an open beam of 0.5 s" in guesses(scan)
+    path.joinpath("marker_ref.xrm").unlink()
+    np.testing.assert_array_equal(tps.load_scan(path, views=(0, 6)).views, 6)
+    assert "no flat field" in guesses(tps.load_scan(path))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"ImageInfo/Angles": None}, "ImageInfo/Angles: expected .* of 48 pictures, got 47"),
+        ({"ImageInfo/NoOfImages": np.array(2, "<i4").tobytes()}, None),
+        (
+            {"ImageData1/Image1": None},
+            "one picture in each of several .xrm files, got 0 in .*marker_0002.xrm",
+        ),
+        (
+            {"ImageInfo/ImageWidth": np.array(30, "<i4").tobytes()},
+            r"uint16 of \(33, 37\) as in marker_0001.xrm, got uint16 of \(33, 30\)",
+        ),
+        ({"Alignment/X-Shifts": floats(np.inf)}, "X-Shifts, Y-Shifts: expected finite numbers"),
+    ],
+)
+def test_a_view_that_is_wrong_is_named(write_views, changes, message):
+    path = write_views({"marker_0002.xrm": changes})
+    if message is None:
+        assert tps.load_scan(path).views == 48
+        return
+    with pytest.raises(ValueError, match=message):
+        tps.load_scan(path)
 
 
 def test_a_reconstruction_and_two_scans_are_refused(write):

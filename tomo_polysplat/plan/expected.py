@@ -18,8 +18,8 @@ logger = logging.getLogger(__name__)
 _LONGER = 1.05
 # A growing cloud has its last number of Gaussians for about this share of the run.
 _GROWN = 0.7
-# Less is not worth a line of the log.
-_WORTH_TELLING = 10.0
+# Less is not worth a line of the log, nor some words on compiling.
+_WORTH_TELLING, _COMPILED = 10.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,8 @@ class Expected:
         Seconds of one, as timed.
     memory : str
         What the steps take on the device, and of how much.
+    compiled : float
+        Seconds that compiling took until it was told. They are no part of the others.
     """
 
     seconds: float
@@ -44,12 +46,16 @@ class Expected:
     steps: int
     a_step: float
     memory: str
+    compiled: float = 0.0
 
     def describe(self) -> str:
         """A line."""
         fitted = f"{self.steps} steps of {1e3 * self.a_step:.3g} ms"
         start = f"{_duration(self.so_far)} of it until the first steps"
-        return f"about {_duration(self.seconds)} in all, {start}; {fitted}; {self.memory}"
+        line = f"about {_duration(self.seconds)} in all, {start}; {fitted}; {self.memory}"
+        if self.compiled > _COMPILED:
+            line += f"; compiling took {_duration(self.compiled)} besides, which comes once a machine"
+        return line
 
 
 class Told(Exception):  # noqa: N818  # no error: a run that was to tell this only has told it
@@ -76,7 +82,17 @@ def only_told() -> Iterator[list[Expected]]:
         _ASKED.reset(before)
 
 
-def expected(steps: int, done: int, a_step: float, so_far: float, growth: float, memory: str) -> Expected:
+# Plain numbers of a run, by their names.
+def expected(
+    steps: int,
+    done: int,
+    a_step: float,
+    so_far: float,
+    growth: float,
+    memory: str,
+    *,
+    compiled: float = 0.0,
+) -> Expected:
     """From the seconds of a step as timed.
 
     Parameters
@@ -88,10 +104,12 @@ def expected(steps: int, done: int, a_step: float, so_far: float, growth: float,
     growth : float
         Times as many Gaussians as now at the end.
     memory : str
+    compiled : float
+        Seconds of compiling, of which `so_far` has none.
     """
     longer = _LONGER * (1 + _GROWN * (max(growth, 1.0) - 1))
     seconds = so_far + longer * (steps - done) * a_step
-    return Expected(seconds, so_far, steps, a_step, memory)
+    return Expected(seconds, so_far, steps, a_step, memory, compiled)
 
 
 def tell(found: Expected, budget: float | None) -> None:

@@ -52,7 +52,7 @@ class RunOptions(Means):
         chosen = make_settings(quality, settings)
         if time_budget is not None:
             time_budget = require_number("time_budget", time_budget, above=0)
-            track_compiling()
+        track_compiling()
         return cls(chosen, time_budget, _whole(seed), pick_fast_device(device), _functions(callbacks))
 
     def to_dict(self) -> dict[str, Any]:

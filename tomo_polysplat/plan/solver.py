@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.stopping import Clock, FitState, Stop, StopReason
 from tomo_polysplat.fit.surroundings import cut_out
-from tomo_polysplat.kernels.compile_time import working_time
+from tomo_polysplat.kernels.compile_time import compiled_seconds, working_time
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.plan.alignment import align, aligned
 from tomo_polysplat.plan.answer import Answer, Status
@@ -57,6 +57,8 @@ class Solver:
         Which moves of the scanner the rays are asked about (`plan.alignment`).
     report : callable
         Gets the share done, and words.
+    compiled : float
+        Seconds that this process had compiled for before.
     """
 
     run_options: RunOptions
@@ -65,6 +67,7 @@ class Solver:
     flipped: bool
     report: Callable[[float, str], Any]
     moved: str | Sequence[str] | None = None
+    compiled: float = field(default_factory=compiled_seconds)
 
     def solve(
         self, problem: Problem, wanted: Calibration | None, *, ask_scatter: bool
@@ -177,7 +180,8 @@ class Solver:
         growth = plan.answers["growth"].value if "growth" in plan.answers else 1.0
         memory = plan.facts["memory"].why if "memory" in plan.facts else ""
         parts = clock.steps, clock.done, a_step, so_far, float(growth), f"memory {memory}"
-        tell(expected(*parts), self.run_options.time_budget)
+        found = expected(*parts, compiled=compiled_seconds() - self.compiled)
+        tell(found, self.run_options.time_budget)
 
     def _tell_pace(self, plan: Plan, room: float, lacking: float) -> None:
         """Say for how much of the run the time budget has room, at its beginning."""

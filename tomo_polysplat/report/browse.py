@@ -39,7 +39,7 @@ def browser(
     volumes: Sequence[tuple[str, np.ndarray]],
     window: tuple[float, float],
     first: int,
-    height: float,
+    heights: np.ndarray,
     unit: str,
 ) -> str:
     """Axial slices of volumes side by side.
@@ -52,15 +52,17 @@ def browser(
         Attenuation that is black, and white.
     first : int
         The slice that is shown first.
-    height : float
-        From slice to slice, in `unit`.
+    heights : array, shape (nz,)
+        Where the slices are along z, in `unit`.
     unit : str
         Of length.
     """
     count = volumes[0][1].shape[0]
     chosen = np.unique(np.append(np.linspace(0, count - 1, min(count, _SLICES)).round().astype(int), first))
     pictures = [[_picture(volume[k], window) for k in chosen] for _, volume in volumes]
-    names = [f"slice {k} of {count}, {(k - first) * height:+.3g} {unit}" for k in chosen]
+    # The middle may be at 1e-17.
+    places = np.where(np.abs(heights) < 1e-6 * np.ptp(heights), 0.0, heights)
+    names = [f"slice {k} of {count}, z = {places[k]:.3g} {unit}" for k in chosen]
     start = int(np.flatnonzero(chosen == first)[0])
     parts = [
         f'<figure><figcaption>{text(name)}</figcaption><img alt="axial slice of {text(name)}" '

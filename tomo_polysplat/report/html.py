@@ -142,7 +142,7 @@ def _slices(result: Result, shown: Volumes, truth: np.ndarray | None, metal: np.
     ours = dict(shown)[full_name(OURS)]
     window = display_window(ours if truth is None else truth, metal)
     axial, *others = planes_through(ours if metal is None else metal)
-    parts = [browser(shown, window, axial.index, float(result.grid.voxel_size[2]), result.unit)]
+    parts = [browser(shown, window, axial.index, result.grid.axes()[2], result.unit)]
     return parts + (_other_planes(result, shown, window, others) if others else [])
 
 

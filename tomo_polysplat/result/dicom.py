@@ -34,7 +34,7 @@ _HEADER = 4096
 _UNKNOWN = (
     *("PatientName", "PatientID", "PatientBirthDate", "PatientSex", "StudyDate", "StudyTime", "StudyID"),
     *("AccessionNumber", "ReferringPhysicianName", "SeriesNumber", "PatientPosition", "Manufacturer"),
-    *("PositionReferenceIndicator", "AcquisitionNumber", "KVP"),
+    *("PositionReferenceIndicator", "AcquisitionNumber", "KVP", "Laterality"),
 )
 
 

@@ -23,9 +23,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tomo_polysplat.checks import fail, require_array, require_choice, require_number, require_shape
-from tomo_polysplat.scan.centre import estimate_centre
-from tomo_polysplat.scan.circular import parallel_geometry
+from tomo_polysplat.checks import fail, require_choice
+from tomo_polysplat.scan.data_exchange_parallel import parallel_told
 from tomo_polysplat.scan.defects import flat_and_dark
 from tomo_polysplat.scan.dxchange_host import read_block
 from tomo_polysplat.scan.filter_map_file import read_filter_map
@@ -46,8 +45,11 @@ from tomo_polysplat.scan.layout import (
     vector_geometry,
     volume_geometry,
 )
+from tomo_polysplat.scan.readers.part import Part
+from tomo_polysplat.scan.readers.scan_part import scan_part
 from tomo_polysplat.scan.reading import INPUT_KINDS, ReadOptions
 from tomo_polysplat.scan.scan import Scan
+from tomo_polysplat.scan.stored_part import StoredPart
 
 if TYPE_CHECKING:
     import h5py
@@ -62,15 +64,11 @@ logger = logging.getLogger(__name__)
 _PER_VECTOR, _MOST_COEFFICIENTS = 13, 100
 # Open-beam or dark images beside fewer views than that.
 _MOST_FRAMES = 1000
-# Where APS tomography files keep the size of a pixel in the plane of the object. The size of a camera's own
-# pixel is not used: without the magnification it is off by the objective's factor.
-PIXEL_SIZE_PATHS = ("measurement/instrument/detection_system/objective/resolution",)
-LENGTH_NAMES = {name: name for name in ("um", "mm", "cm", "m")}
-LENGTH_NAMES |= dict.fromkeys(("micron", "microns", "micrometers"), "um")
+_ALL = Part()
 
 
-def scan_from_hdf5(path: Path, options: ReadOptions) -> Scan:
-    """Read a scan; see :func:`tomo_polysplat.load_scan`."""
+def scan_from_hdf5(path: Path, options: ReadOptions, part: Part = _ALL) -> Scan:
+    """Read a scan; see :func:`tomo_polysplat.load_scan`. What a `part` leaves out is not read, as far as that goes."""
     with opened(path) as file:
         if find_array(file, "polysplat/basis") is not None:
             raise fail("path", "a scan", f"the result of a reconstruction in {path}", "Result.load reads it")
@@ -79,27 +77,45 @@ def scan_from_hdf5(path: Path, options: ReadOptions) -> Scan:
         if exchange is None or data is None or data.ndim != 3 or 0 in data.shape:
             got = "no such dataset" if data is None else f"shape {data.shape}"
             raise fail("path", "a dataset /exchange/data of shape (views, rows, columns)", f"{got} in {path}")
-        projections, valid, notes = _line_integrals(exchange, data, options)
+        now, later = _in_two(part, file, options)
+        wanted = StoredPart(data, now)
+        projections, valid, notes = _line_integrals(exchange, data, wanted, options)
         if find_array(file, "polysplat/valid") is not None:
-            stored = read_numbers(file, "polysplat/valid", data.shape).astype(bool)
-            valid &= stored.transpose(1, 0, 2)
+            stored = wanted.of_views(read_numbers(file, "polysplat/valid", data.shape).astype(bool))
+            valid &= wanted.of_pixels(stored).transpose(1, 0, 2)
         _report_defects(notes["rays"], valid)
-        geometry = _geometry(file, projections, valid, options, notes)
+        views, rows, columns = data.shape
+        whole = _geometry(file, (rows, views, columns), (projections, valid, wanted), options, notes)
+        geometry, same = wanted.geometries(whole)
+        known = _knowledge(file, whole["vol_geom"], options)
+        if not same:
+            known |= {"truth": None, "metal_mask": None}
         if (scanner := read_json(file, "polysplat/scanner", None)) is not None:
             notes["scanner"] = scanner
-        return Scan(
+        scan = Scan(
             projections=projections,
             valid=None if valid.all() else valid,
             name=read_text(file, "measurement/sample/name") or path.stem,
             notes=notes,
             **geometry,
-            **_knowledge(file, geometry["vol_geom"], options),
-            filter_map=read_filter_map(file, projections.shape),
+            **known,
+            filter_map=wanted.filters(read_filter_map(file, (rows, views, columns))),
         )
+    return scan if later.whole else scan_part(scan, later)
+
+
+def _in_two(part: Part, file: h5py.File, options: ReadOptions) -> tuple[Part, Part]:
+    """What to leave out while reading, and afterwards: an axis is looked for in whole rows, light is averaged last."""
+    group = find_group(file, "polysplat/geometry")
+    if options.proj_geom is None and group is not None and _attribute(group, "astra_type") == "cyl_cone_vec":
+        return _ALL, part
+    known = options.proj_geom is not None or group is not None or options.centre is not None
+    now = Part(part.rows, part.columns if known else None, part.views)
+    return now, Part(columns=None if known else part.columns, binning=part.binning)
 
 
 def _line_integrals(
-    exchange: h5py.Group, data: StoredArray, options: ReadOptions
+    exchange: h5py.Group, data: StoredArray, wanted: StoredPart, options: ReadOptions
 ) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
     """Projections and validity in the order (rows, views, columns), read a block of views at a time."""
     rows, columns = data.shape[1:]
@@ -119,12 +135,18 @@ def _line_integrals(
         for frames in (one for one in (white, dark) if one is not None):
             _require_few(frames, data)
         no_light, open_beam = None if dark is None else read_block(dark), read_block(white)
-        flat, background = flat_and_dark(open_beam, no_light, (rows, columns))
+        flat, background = map(wanted.of_pixels, flat_and_dark(open_beam, no_light, (rows, columns)))
         means = {"white_frames": _frame_means(open_beam), "dark_frames": _frame_means(no_light)}
     else:
         means = {}
     projections, valid, rays = line_integrals(
-        lambda part: read_block(data, part), data.shape, kind, flat, background, options.saturation
+        wanted.block,
+        wanted.shape,
+        kind,
+        flat,
+        background,
+        options.saturation,
+        options.progress,
     )
     return projections, valid, {"input": kind, "rays": rays} | means
 
@@ -178,9 +200,16 @@ def _report_defects(rays: dict[str, int], valid: np.ndarray) -> None:
 
 
 def _geometry(
-    file: h5py.File, projections: np.ndarray, valid: np.ndarray, options: ReadOptions, notes: dict[str, Any]
+    file: h5py.File,
+    shape: tuple[int, int, int],
+    seen: tuple[np.ndarray, np.ndarray, StoredPart],
+    options: ReadOptions,
+    notes: dict[str, Any],
 ) -> dict[str, Any]:
-    """``proj_geom``, ``vol_geom`` and ``unit``: the caller's, the file's, or a parallel beam."""
+    """``proj_geom``, ``vol_geom`` and ``unit`` of all: the caller's, the file's, or a parallel beam.
+
+    `seen` are projections with their validity, in which the axis is looked for, and what part of all they are.
+    """
     group = find_group(file, "polysplat/geometry")
     if options.proj_geom is not None or group is not None:
         options.refuse_parallel_only()
@@ -195,31 +224,15 @@ def _geometry(
     if group is not None:
         proj_geom = vector_geometry(
             _attribute(group, "astra_type"),
-            read_numbers(group, "vectors", most=_PER_VECTOR * projections.shape[1]),
-            projections.shape,
+            read_numbers(group, "vectors", most=_PER_VECTOR * shape[1]),
+            shape,
         )
         vol_geom = volume_geometry(
             read_numbers(group, "volume_shape", (3,)), read_numbers(group, "volume_window", (6,))
         )
         unit = options.settled_unit(_attribute(group, "unit"), "cm")
         return {"proj_geom": proj_geom, "vol_geom": dict(options.vol_geom or vol_geom), "unit": unit}
-    rows, views, columns = projections.shape
-    centre = options.centre
-    theta = _angles(file, views, options.theta, centre)
-    if centre is None:
-        centre = estimate_centre(projections, theta, valid)
-    notes |= {"centre": float(centre), "centre_estimated": options.centre is None}
-    pixel_size, unit = _pixel_size(file, options)
-    remedy = "in columns from the edge"
-    centre = require_number("centre", centre, above=0, at_most=columns, remedy=remedy)
-    # In degrees: those may be of many turns, where radians are looked at with suspicion.
-    proj_geom, vol_geom = parallel_geometry(
-        pixel=require_number("pixel_size", pixel_size, above=0),
-        degrees=np.rad2deg(theta),
-        detector=(rows, columns),
-        offset=((columns / 2 - centre) * pixel_size, 0.0),
-    )
-    return {"proj_geom": proj_geom, "vol_geom": dict(options.vol_geom or vol_geom), "unit": unit}
+    return parallel_told(file, shape, seen, options, notes)
 
 
 def _attribute(group: h5py.Group, name: str) -> str:
@@ -227,59 +240,6 @@ def _attribute(group: h5py.Group, name: str) -> str:
     if value is None:
         raise fail("path", f"a text as attribute '{name}' of {group.name}", "none")
     return value
-
-
-def _angles(file: h5py.File, views: int, given: Any, centre: float | None) -> np.ndarray:
-    """View angles in radians."""
-    in_radians = False
-    if given is None:
-        dataset = find_array(file, "exchange/theta")
-        if dataset is None:
-            raise _missing_theta(views)
-        in_radians = (text_attribute(dataset, "units") or "").lower().startswith("rad")
-        if dataset.shape != (views,):
-            raise fail("theta", f"shape {(views,)} (views,)", f"{dataset.shape}")
-        given = read_block(dataset)
-    theta = require_array("theta", given, 1).astype(np.float64)
-    require_shape("theta", theta, (views,), "(views,)")
-    if not np.isfinite(theta).all():
-        raise fail("theta", "finite angles", "NaN or infinity")
-    if not in_radians and views > 2 and np.ptp(theta) < 2 * np.pi + 0.1:
-        logger.warning("theta spans %.3g degrees only: are these radians?", np.ptp(theta))
-        # Without half a turn the axis cannot be found either, and to give it would hide what is wrong.
-        if centre is None:
-            got = f"{np.ptp(theta):.3g} degrees from the first to the last, which look like radians"
-            remedy = (
-                "set the attribute units = 'rad' of /exchange/theta, or pass theta= in degrees; else centre="
-            )
-            raise fail("theta", "at least half a turn", got, remedy)
-    return theta if in_radians else np.deg2rad(theta)
-
-
-def _missing_theta(views: int) -> Exception:
-    return fail(
-        "theta",
-        "the angle of every view",
-        "no /exchange/theta in the file",
-        f"pass theta= in degrees, such as numpy.linspace(0, 180, {views}, endpoint=False)",
-    )
-
-
-def _pixel_size(file: h5py.File, options: ReadOptions) -> tuple[float, str]:
-    """Size of a pixel in the plane of the object, and its unit; ``(1, "pixel")`` when unknown."""
-    if options.pixel_size is not None:
-        return options.pixel_size, options.settled_unit(None, "cm")
-    for path in PIXEL_SIZE_PATHS:
-        dataset = find_array(file, path)
-        if dataset is not None and dataset.size == 1:
-            unit = LENGTH_NAMES.get((text_attribute(dataset, "units") or "").lower())
-            if unit is not None:
-                return float(np.asarray(dataset[()]).reshape(())), options.settled_unit(unit, unit)
-    if options.unit not in (None, "pixel"):
-        raise fail(
-            "unit", "'pixel', as the file states no pixel size", repr(options.unit), "pass pixel_size= too"
-        )
-    return 1.0, "pixel"
 
 
 def _knowledge(file: h5py.File, vol_geom: dict[str, Any], options: ReadOptions) -> dict[str, Any]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from tomo_polysplat.checks import fail
 from tomo_polysplat.free_memory import available_memory
+from tomo_polysplat.progress import progress_reports
 from tomo_polysplat.scan.defects import attenuation
 
 __all__ = ["line_integrals"]
@@ -18,6 +20,7 @@ _BLOCK_BYTES = 2**27
 _RAY_BYTES = 10
 
 
+# What the data are, a word each, and who wants to be told how far it is.
 def line_integrals(
     read: Callable[[slice], np.ndarray],
     shape: tuple[int, int, int],
@@ -25,6 +28,7 @@ def line_integrals(
     flat: np.ndarray | None = None,
     dark: np.ndarray | None = None,
     saturation: float | None = None,
+    progress: bool | Callable[[float, str], Any] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, dict[str, int]]:
     """What `tomo_polysplat.scan.defects.attenuation` makes of all views.
 
@@ -35,6 +39,8 @@ def line_integrals(
     shape : (views, rows, columns)
     kind, flat, dark, saturation
         See `attenuation`.
+    progress : bool, callable or None
+        See `progress_reports`; None says nothing of what is read in a moment.
 
     Returns
     -------
@@ -58,9 +64,12 @@ def line_integrals(
     valid = np.empty((rows, views, columns), bool)
     rays: dict[str, int] = {}
     block = max(1, _BLOCK_BYTES // (rows * columns * 8))
-    for first in range(0, views, block):
-        part = slice(first, min(first + block, views))
-        values, usable, counts = attenuation(read(part), kind, flat, dark, saturation)
-        projections[:, part], valid[:, part] = values.transpose(1, 0, 2), usable.transpose(1, 0, 2)
-        rays = {name: rays.get(name, 0) + count for name, count in counts.items()}
+    at_once = progress is None and views <= block
+    with progress_reports(False if at_once else progress) as report:
+        for first in range(0, views, block):
+            part = slice(first, min(first + block, views))
+            values, usable, counts = attenuation(read(part), kind, flat, dark, saturation)
+            projections[:, part], valid[:, part] = values.transpose(1, 0, 2), usable.transpose(1, 0, 2)
+            rays = {name: rays.get(name, 0) + count for name, count in counts.items()}
+            report(part.stop / views, "reading")
     return projections, valid, rays

@@ -49,6 +49,7 @@ def load_scan(
     columns: tuple[int, int] | None = None,
     views: Any = None,
     binning: int = 1,
+    progress: bool | Callable[[float, str], Any] | None = None,
 ) -> Scan:
     """Read a scan: a Data Exchange HDF5 file, an ``.npz`` scan, or what a scanner leaves in a folder.
 
@@ -96,6 +97,9 @@ def load_scan(
         Views to read; a number alone is the step.
     binning : int
         Rows and columns whose light is averaged to one.
+    progress : bool, callable or None
+        Whether to draw a bar, as in `tomo_polysplat.reconstruct`; or a function of (share done, words). None draws it
+        in a notebook and on a terminal, for what takes more than a moment. Not for ``.npz`` scans.
 
     Returns
     -------
@@ -112,7 +116,7 @@ def load_scan(
         If an array is larger than the free memory.
     """
     stated = (spectrum, unit, centre, pixel_size, theta, input, saturation, proj_geom, vol_geom)
-    options = ReadOptions(*stated, water_correction)
+    options = ReadOptions(*stated, water_correction, progress)
     part = Part(rows, columns, views, binning)
     reader = _reader_of_scans(Path(path))
     if reader is None:
@@ -121,6 +125,8 @@ def load_scan(
     if scanner:
         got = ", ".join(map(str, scanner))
         raise fail("scanner", "nothing for a scan that has its own geometry", got, "leave it out")
+    if reader is scan_from_hdf5:
+        return scan_from_hdf5(existing_file(path), options, part)
     scan = reader(existing_file(path), options)
     return scan if part.whole else scan_part(scan, part)
 

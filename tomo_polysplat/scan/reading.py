@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +31,7 @@ class ReadOptions:
     proj_geom: Mapping[str, Any] | None = None
     vol_geom: Mapping[str, Any] | None = None
     water_correction: Sequence[float] | None = None
+    progress: bool | Callable[[float, str], Any] | None = None
 
     def __post_init__(self) -> None:
         if self.unit is not None:

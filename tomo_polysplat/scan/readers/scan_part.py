@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from tomo_polysplat.scan.circular import volume_seen
-from tomo_polysplat.scan.geometry import VolumeGrid, geometry_from_astra, to_astra
 from tomo_polysplat.scan.readers.part import Part
 from tomo_polysplat.scan.scan import Scan
+from tomo_polysplat.scan.stored_part import part_of_geometry
 
 __all__ = ["scan_part"]
 
@@ -37,10 +36,10 @@ def scan_part(scan: Scan, part: Part) -> Scan:
         of_pixels = np.broadcast_to(filters[1], (scan.rows, scan.columns))[slice(*rows), slice(*columns)]
         whole = part.averaged(of_pixels[None])[0] if part.binning > 1 else of_pixels
         filters = (filters[0], np.array(whole), *filters[2:])
-    seen = part.of(geometry_from_astra(scan.proj_geom), (rows, columns))
-    proj_geom, _ = to_astra(seen, VolumeGrid((1, 1, 1), np.zeros(3), np.ones(3)))
-    same = (part.rows, part.columns, part.binning) == (None, None, 1)
-    kept: dict[str, Any] = {} if same else {"vol_geom": volume_seen(seen), "truth": None, "metal_mask": None}
+    proj_geom, vol_geom = part_of_geometry(part, scan.proj_geom, (rows, columns))
+    kept: dict[str, Any] = {}
+    if vol_geom is not None:
+        kept = {"vol_geom": vol_geom, "truth": None, "metal_mask": None}
     return replace(
         scan,
         projections=projections.transpose(1, 0, 2),

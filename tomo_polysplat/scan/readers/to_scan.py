@@ -54,7 +54,9 @@ def scan_from_acquisition(told: Acquisition, options: ReadOptions, part: Part) -
     pictures = Upright(told, part, limit)
     geometry = _geometry(told)
     told, flat, dark = _open_beam(told, kind, pictures)
-    projections, valid, rays = line_integrals(pictures.views, pictures.shape, kind, flat, dark, limit)
+    projections, valid, rays = line_integrals(
+        pictures.views, pictures.shape, kind, flat, dark, limit, options.progress
+    )
     told, spectrum = _spectrum(told, options)
     seen = part.of(geometry, (pictures.rows, pictures.columns))
     _tell(told, rays, valid)
@@ -123,8 +125,16 @@ def _geometries(seen: Geometry, told: Acquisition, options: ReadOptions) -> dict
 def _spectrum(told: Acquisition, options: ReadOptions) -> tuple[Acquisition, Spectrum | None]:
     """The caller's spectrum, else that of the tube and its filters behind a usual detector."""
     tube = told.tube
-    if options.spectrum is not None or tube.kvp is None or told.unit == "pixel":
+    if options.spectrum is not None or told.unit == "pixel":
         return told, options.spectrum
+    if tube.kvp is None:
+        # A parallel beam is mostly a synchrotron's, of one energy.
+        if _geometry(told).beam == "cone":
+            told = told.saying(
+                "the voltage of the tube is not known: there is no spectrum, and one energy is taken, which does not "
+                "mend what metal does; give kvp=, filter= and detector= (--kvp, --filter, --detector)"
+            )
+        return told, None
     if tube.filters is None:
         return told.saying(
             f"the tube was at {tube.kvp:g} kV, its filter is not known: there is no spectrum; give filter="

@@ -1,4 +1,4 @@
-"""Zeiss Xradia: a .txrm file with the pictures, their open beam, angles and distances.
+"""Zeiss Xradia: a .txrm file with the pictures, their open beam, angles and distances, or one .xrm file a view.
 
 Rows are taken to begin at the bottom, pictures to be as seen from the source, and the object to turn counterclockwise
 with the angles, as the reader of the Core Imaging Library takes them. By how much a picture is moved by the drift of
@@ -7,10 +7,10 @@ the sample or on purpose (``Alignment/X-Shifts``) is undone in the geometry, wit
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,10 +21,14 @@ from tomo_polysplat.scan.readers.compound import CompoundFile, is_compound
 from tomo_polysplat.scan.readers.files_of_scans import the_one
 from tomo_polysplat.scan.readers.stated import require_known, stated_over
 from tomo_polysplat.scan.readers.xradia_frames import XrmFrames, picture_names, reference_names
+from tomo_polysplat.scan.readers.xradia_series import SeriesFrames, XrmSeries, sorted_out
+
+if TYPE_CHECKING:
+    from tomo_polysplat.scan.readers.frames import Frames
 
 __all__ = ["KIND", "read", "recognises"]
 
-KIND = "Zeiss Xradia (.txrm)"
+KIND = "Zeiss Xradia (.txrm, .xrm)"
 # The first kind that is there is the scan; the others beside it are single pictures and reconstructions.
 _SUFFIXES = (".txrm", ".xrm", ".txm")
 # Relative changes of exposure or distance that count.
@@ -53,34 +57,49 @@ def recognises(path: Path) -> bool:
 
 def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     """See `tomo_polysplat.load_scan`; `stated` has its ``scanner``."""
-    chosen = the_one(_files(path))
+    known, files = require_known(stated, "scanner"), _files(path)
+    if len(files) > 1 and files[0].suffix.lower() == ".xrm":
+        return _of_single_views(files, known)
+    chosen = the_one(files)
     if chosen.suffix.lower() == ".txm":
         raise fail("path", "a scan", f"{chosen}, a reconstruction", "name the .txrm file of the projections")
     file = CompoundFile(chosen)
     names = picture_names(file)
-    light, exposure, said = _exposures(file, len(names))
+    light, exposure, said = _exposures(file, len(names), file.number("ReferenceData/ExpTime"))
     frames = XrmFrames(file, names, "ImageInfo/DataType", light)
     planned = int(file.number("ImageInfo/NoOfImages", "<u4") or 0)
     if len(names) < planned:
         said.append(f"{len(names)} pictures are there, the file tells of {planned}")
-    setup, shifts, more = _setup(file, len(names))
     open_beam, kind = reference_names(file)
-    if open_beam:
-        more.append("no dark pictures: without light a pixel is taken to count 0; give darks= if it does not")
-    told = Acquisition(
-        KIND,
-        frames,
-        setup,
-        name=chosen.stem,
-        flats=XrmFrames(file, open_beam, kind) if open_beam else None,
-        saturates=light is None,
-        top_first=False,
-        tube=_tube(file),
-        exposure=exposure,
-        shifts=shifts,
-        other=_others(file),
-    ).saying(*said, *more)
-    return stated_over(told, require_known(stated, "scanner"), chosen.parent)
+    flats = XrmFrames(file, open_beam, kind) if open_beam else None
+    told = _told(file, frames, flats, name=chosen.stem, exposure=exposure, saturates=light is None)
+    return stated_over(told.saying(*said), known, chosen.parent)
+
+
+def _of_single_views(files: Sequence[Path], known: Mapping[str, Any]) -> Acquisition:
+    """One file a view, those of the open beam among them by their names."""
+    views, open_beam = sorted_out(files)
+    if not views:
+        got = f"pictures of the open beam alone in {files[0].parent}"
+        raise fail("path", "pictures of an object", got, "name the one that is the scan")
+    series = XrmSeries(views)
+    beside = XrmSeries(open_beam).number("ImageInfo/ExpTimes") if open_beam else None
+    light, exposure, said = _exposures(series, len(views), beside)
+    flats: Frames | None = SeriesFrames(open_beam) if open_beam else None
+    if flats is None and (inside := reference_names(first := CompoundFile(views[0])))[0]:
+        flats = XrmFrames(first, *inside)
+    frames, folder = SeriesFrames(views, light), files[0].parent
+    told = _told(series, frames, flats, name=folder.name, exposure=exposure, saturates=light is None)
+    return stated_over(told.saying(*said), known, folder)
+
+
+def _told(file: CompoundFile | XrmSeries, frames: Frames, flats: Frames | None, **known: Any) -> Acquisition:
+    """All that the file, or the files of single views, tell."""
+    setup, shifts, said = _setup(file, frames.shape[0])
+    if flats is not None:
+        said.append("no dark pictures: without light a pixel is taken to count 0; give darks= if it does not")
+    parts: dict[str, Any] = {"flats": flats, "tube": _tube(file), "shifts": shifts, "other": _others(file)}
+    return Acquisition(KIND, frames, setup, top_first=False, **parts, **known).saying(*said)
 
 
 def _files(path: Path) -> list[Path]:
@@ -91,13 +110,15 @@ def _files(path: Path) -> list[Path]:
     return next((files for some in kinds if (files := [file for file in some if is_compound(file)])), [])
 
 
-def _exposures(file: CompoundFile, views: int) -> tuple[np.ndarray | None, float | None, list[str]]:
+def _exposures(
+    file: CompoundFile | XrmSeries, views: int, open_beam: float | None
+) -> tuple[np.ndarray | None, float | None, list[str]]:
     """What makes each picture's light that of the open beam, None where it is; seconds a picture; what to say."""
     seconds = file.numbers("ImageInfo/ExpTimes")[:views].astype(np.float64)
     if not 0 < views <= len(seconds) or not (np.isfinite(seconds).all() and (seconds > 0).all()):
         return None, None, []
     usual = float(np.median(seconds))
-    beside = file.number("ReferenceData/ExpTime") or usual
+    beside = open_beam or usual
     light = beside / seconds
     if np.abs(light - 1).max() < _SAME:
         return None, usual, []
@@ -105,7 +126,7 @@ def _exposures(file: CompoundFile, views: int) -> tuple[np.ndarray | None, float
     return light, usual, [words]
 
 
-def _setup(file: CompoundFile, views: int) -> tuple[Setup, np.ndarray | None, list[str]]:
+def _setup(file: CompoundFile | XrmSeries, views: int) -> tuple[Setup, np.ndarray | None, list[str]]:
     degrees, said = _per_view(file, "ImageInfo/Angles", views), []
     pixel = 1e-3 * (file.number("ImageInfo/PixelSize") or 0.0)
     if not pixel > 0:
@@ -130,7 +151,7 @@ def _setup(file: CompoundFile, views: int) -> tuple[Setup, np.ndarray | None, li
     return setup, _shifts(file, views), said
 
 
-def _shifts(file: CompoundFile, views: int) -> np.ndarray | None:
+def _shifts(file: CompoundFile | XrmSeries, views: int) -> np.ndarray | None:
     """Columns and rows by which pictures are to be moved, (views, 2); None where they are not."""
     sides = [file.numbers(f"Alignment/{axis}-Shifts")[:views] for axis in "XY"]
     moved = [side if len(side) == views else np.zeros(views) for side in sides]
@@ -140,25 +161,26 @@ def _shifts(file: CompoundFile, views: int) -> np.ndarray | None:
     return shifts if shifts.any() else None
 
 
-def _per_view(file: CompoundFile, name: str, views: int) -> np.ndarray:
+def _per_view(file: CompoundFile | XrmSeries, name: str, views: int) -> np.ndarray:
     found = file.numbers(name)[:views].astype(np.float64)
     if len(found) < views or not np.isfinite(found).all():
-        raise fail(name, f"one finite number for each of {views} pictures", f"{len(found)} in {file.path}")
+        got = f"{np.isfinite(found).sum()} in {file.path}"
+        raise fail(name, f"one finite number for each of {views} pictures", got)
     return found
 
 
-def _tube(file: CompoundFile) -> Tube:
+def _tube(file: CompoundFile | XrmSeries) -> Tube:
     kvp = file.number("ImageInfo/Voltage") or file.number("ImageInfo/XrayVoltage")
     name = _filter(file)
     # The makes of Zeiss' own filters (LE1 to HE18) are not published.
     return Tube(kvp if kvp and kvp > 0 else None, filters_of(name) if name else None)
 
 
-def _filter(file: CompoundFile) -> str:
+def _filter(file: CompoundFile | XrmSeries) -> str:
     return file.text("AcquisitionSettings/SourceFilterName") or file.text("ImageInfo/SourceFilterName")
 
 
-def _others(file: CompoundFile) -> dict[str, str]:
+def _others(file: CompoundFile | XrmSeries) -> dict[str, str]:
     """What somebody may want to see again."""
     texts = {name: file.text(name) for name in _TEXTS}
     texts["SourceFilterName"] = _filter(file)

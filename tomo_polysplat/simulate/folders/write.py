@@ -23,6 +23,7 @@ KINDS = {
     "rtk": rtk.write,
     "cil": cil.write,
     "xradia": xradia.write,
+    "xrm": xradia.write_single_views,
 }
 # Scans of a geometry that a kind has of its own.
 _SCANS = {"nikon": nikon.make}

@@ -1,4 +1,4 @@
-"""A folder with a .txrm file as an Xradia of Zeiss' writes it: pictures that drift, and one of the open beam."""
+"""Folders as an Xradia of Zeiss' writes them: pictures that drift, and one of the open beam; in one file or many."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
+from tomo_polysplat.scan.readers.xradia_series import PER_PICTURE
 from tomo_polysplat.simulate.folders.compound_file import compound_file
 from tomo_polysplat.simulate.folders.scene import SETTINGS, Pictures
 
-__all__ = ["streams_of", "write"]
+__all__ = ["single_views", "streams_of", "write", "write_single_views"]
 
 _UNSIGNED_SHORT, _FLOAT = 5, 10
+_ONE = np.array(1, "<i4").tobytes()
 # Columns and rows by which every third picture is displaced.
 _MOVED = (2, -1)
 
@@ -19,6 +21,27 @@ _MOVED = (2, -1)
 def write(folder: Path, pictures: Pictures) -> None:
     """Fill an empty folder; the first row is the lowest, and dark counts are taken out already."""
     (folder / "marker.txrm").write_bytes(compound_file(streams_of(pictures)))
+
+
+def write_single_views(folder: Path, pictures: Pictures) -> None:
+    """Fill an empty folder with one .xrm file a view, and one of the open beam."""
+    for name, streams in single_views(pictures).items():
+        (folder / name).write_bytes(compound_file(streams))
+
+
+def single_views(pictures: Pictures) -> dict[str, dict[str, bytes]]:
+    """What each of such files says, by its name."""
+    whole, files = streams_of(pictures), {}
+    shared = {name: content for name, content in whole.items() if not name.startswith(("ImageData", "Ref"))}
+    shared |= {f"ImageInfo/{name}": _ONE for name in ("NoOfImages", "ImagesTaken")}
+    for k in range(len(pictures.degrees)):
+        own = {name: whole[name][4 * k : 4 * k + 4] for name in PER_PICTURE}
+        picture = {"ImageData1/Image1": whole[f"ImageData{k // 100 + 1}/Image{k + 1}"]}
+        files[f"marker_{k + 1:04d}.xrm"] = shared | own | picture
+    open_beam = {"ImageData1/Image1": whole["ReferenceData/Image"]}
+    open_beam |= {"ImageInfo/DataType": whole["ReferenceData/DataType"]}
+    files["marker_ref.xrm"] = files["marker_0001.xrm"] | open_beam
+    return files
 
 
 def streams_of(pictures: Pictures) -> dict[str, bytes]:

@@ -1,0 +1,88 @@
+"""Part of the projections of an HDF5 file: what is not wanted is not read."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tomo_polysplat.checks import fail
+from tomo_polysplat.scan.circular import volume_seen
+from tomo_polysplat.scan.dxchange_host import read_block
+from tomo_polysplat.scan.geometry import VolumeGrid, geometry_from_astra, to_astra
+from tomo_polysplat.scan.readers.part import Part
+
+if TYPE_CHECKING:
+    from tomo_polysplat.scan.hdf5_array import StoredArray
+
+__all__ = ["StoredPart", "part_of_geometry"]
+
+
+class StoredPart:
+    """Chosen views, rows and columns of a dataset (views, rows, columns).
+
+    Parameters
+    ----------
+    data : StoredArray
+    part : Part
+        Without binning.
+
+    Attributes
+    ----------
+    shape : (views, rows, columns)
+        Of what is read.
+    """
+
+    def __init__(self, data: StoredArray, part: Part) -> None:
+        self._data, self.part = data, part
+        self._views = part.chosen_views(data.shape[0])
+        self._spans = part.row_span(data.shape[1]), part.column_span(data.shape[2])
+        high, wide = (end - first for first, end in self._spans)
+        self.shape = (len(self._views), high, wide)
+
+    def block(self, chosen: slice) -> np.ndarray:
+        """Some of the views that are wanted."""
+        if self.part.whole:
+            return read_block(self._data, chosen)
+        views = self._views[chosen]
+        step = int(views[1] - views[0]) if len(views) > 1 else 1
+        rows, columns = (slice(*span) for span in self._spans)
+        return self._data[int(views[0]) : int(views[-1]) + 1 : step, rows, columns]
+
+    def of_views(self, values: np.ndarray) -> np.ndarray:
+        """Of one value for each view of the dataset, those of the wanted ones."""
+        return values[self._views]
+
+    def of_pixels(self, values: np.ndarray) -> np.ndarray:
+        """The same of pixels, (..., rows, columns)."""
+        rows, columns = (slice(*span) for span in self._spans)
+        return values[..., rows, columns]
+
+    def filters(self, known: tuple[Any, ...] | None) -> tuple[Any, ...] | None:
+        """`Scan.filter_map` of the part, of that of the whole."""
+        if known is None or self.part.whole:
+            return known
+        material, thickness, *density = known
+        whole = self._data.shape[1:]
+        if np.shape(thickness) not in (whole, whole[1:], (1, whole[1])):
+            raise fail("filter_thickness", f"shape {whole}, (rows, columns)", f"{np.shape(thickness)}")
+        return material, np.array(self.of_pixels(np.broadcast_to(thickness, whole))), *density
+
+    def geometries(self, known: dict[str, Any]) -> tuple[dict[str, Any], bool]:
+        """Those of the part, of ``proj_geom`` and ``vol_geom`` of the whole; whether the volume is still the same."""
+        if self.part.whole:
+            return known, True
+        proj_geom, vol_geom = part_of_geometry(self.part, known["proj_geom"], self._spans)
+        same = vol_geom is None
+        return known | {"proj_geom": proj_geom} | ({} if same else {"vol_geom": vol_geom}), same
+
+
+def part_of_geometry(
+    part: Part, proj_geom: dict[str, Any], spans: tuple[tuple[int, int], tuple[int, int]]
+) -> tuple[dict[str, Any], dict[str, Any] | None]:
+    """ASTRA's geometries of a part; None for that of the volume where views are all that is left out."""
+    seen = part.of(geometry_from_astra(proj_geom), spans)
+    # The window stands for any: only the other half of the answer is used.
+    chosen, _ = to_astra(seen, VolumeGrid((1, 1, 1), np.zeros(3), np.ones(3)))
+    same = (part.rows, part.columns, part.binning) == (None, None, 1)
+    return chosen, None if same else volume_seen(seen)
