@@ -10,7 +10,7 @@ from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 
-__all__ = ["misfit", "roughness", "total_variation", "weighted_huber", "weighted_l1"]
+__all__ = ["misfit", "part_of_variation", "roughness", "total_variation", "weighted_huber", "weighted_l1"]
 
 
 def misfit(
@@ -40,10 +40,20 @@ def weighted_huber(
     return value.sum() / weight.sum().clamp(min=1e-12)
 
 
-def roughness(gaussians: Gaussians, scene: FitScene, settings: Settings) -> torch.Tensor:
-    """Total variation of the volume."""
-    volume = scene.attenuation(gaussians, scene.box)
-    return total_variation(volume, settings.tv_clip, scene.tv_corners, settings.bone_level)
+def roughness(
+    gaussians: Gaussians, scene: FitScene, settings: Settings, planes: slice | None = None
+) -> torch.Tensor:
+    """Total variation of the volume, or the part of it that some planes of z hold: all parts add up to it."""
+    shape, first, after = scene.box.shape, 0, scene.box.shape[0]
+    if planes is not None:
+        # The plane behind them, for the differences from the last of them.
+        first, after = planes.start, min(planes.stop + 1, after)
+    box = scene.box if planes is None else scene.box.part((first, 0, 0), (after - first, *shape[1:]))
+    chosen = settings.tv_clip, scene.tv_corners, settings.bone_level
+    volume = scene.attenuation(gaussians, box)
+    if planes is None:
+        return total_variation(volume, *chosen)
+    return part_of_variation(volume, planes.stop - first, shape, *chosen)
 
 
 def total_variation(
@@ -73,13 +83,37 @@ def total_variation(
     total = volume.new_zeros(())
     for axis in range(volume.ndim):
         if volume.shape[axis] > 1:
-            height = clipped.diff(dim=axis).abs()
-            if any(corners):
-                length = volume.shape[axis] - 1
-                either = (
-                    torch.maximum(clipped.narrow(axis, 0, length), clipped.narrow(axis, 1, length)) > dense
-                )
-                corner = torch.where(either, volume.new_tensor(corners[1]), volume.new_tensor(corners[0]))
-                height = corner * torch.log1p(height / corner)
-            total = total + height.mean()
+            total = total + _heights(clipped, axis, corners, dense).mean()
     return total
+
+
+def part_of_variation(
+    volume: torch.Tensor,
+    planes: int,
+    shape: tuple[int, int, int],
+    ceiling: float,
+    corners: tuple[float, float] = (0.0, 0.0),
+    dense: float = math.inf,
+) -> torch.Tensor:
+    """What the first ``planes`` of a slab add to the `total_variation` of a volume of this shape.
+
+    The slab (some, ny, nx) has the plane behind them as well, unless the volume ends there.
+    """
+    clipped = volume.clamp(max=ceiling)
+    total = volume.new_zeros(())
+    for axis in range(volume.ndim):
+        if shape[axis] > 1:
+            heights = _heights(clipped, axis, corners, dense)[:planes]
+            total = total + heights.sum() / (math.prod(shape) // shape[axis] * (shape[axis] - 1))
+    return total
+
+
+def _heights(clipped: torch.Tensor, axis: int, corners: tuple[float, float], dense: float) -> torch.Tensor:
+    """What each difference of neighbours along an axis counts."""
+    height = clipped.diff(dim=axis).abs()
+    if not any(corners):
+        return height
+    length = clipped.shape[axis] - 1
+    either = torch.maximum(clipped.narrow(axis, 0, length), clipped.narrow(axis, 1, length)) > dense
+    corner = torch.where(either, clipped.new_tensor(corners[1]), clipped.new_tensor(corners[0]))
+    return corner * torch.log1p(height / corner)
