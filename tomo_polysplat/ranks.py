@@ -217,6 +217,7 @@ def led_by(ranks: Ranks) -> Iterator[None]:
 def join(ranks: Ranks) -> None:
     """Connect with all others, which do the same."""
     on_gpu = ranks.device.type == "cuda"
+    ranks.store.set_timeout(_PATIENCE)
     dist.init_process_group(
         "cpu:gloo,cuda:nccl" if on_gpu else "gloo",
         store=dist.PrefixStore("tomo_polysplat/group", ranks.store),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import os
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -130,6 +131,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_solver_options(group)
     group.add_argument(
+        "--devices",
+        metavar="GPUS",
+        help="share the fit out over these, such as 0,1, or all (torchrun: over its processes)",
+    )
+    group.add_argument(
         "--memory",
         metavar="SIZE",
         help='what the run may hold on the device, such as "12 GB" (default: all that is free)',
@@ -145,7 +151,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Reconstruct, and write what was asked for."""
+    """Reconstruct, and write what was asked for; of torchrun's processes the first one does, and the others help."""
+    from tomo_polysplat.rank_processes import TORCHRUN, started_by_torchrun
+
+    if started_by_torchrun():
+        if arguments.devices is not None:
+            raise fail("--devices", "none with torchrun, whose processes have a GPU each", arguments.devices)
+        arguments.devices = TORCHRUN
+        if os.environ["RANK"] != "0":
+            return _follow(arguments.device)
     require_outputs(arguments)
     scan = scan_from(arguments, spectrum_from(arguments))
     spectrum = _spectrum_of(scan, arguments)
@@ -163,6 +177,7 @@ def run(arguments: argparse.Namespace) -> int:
             time_budget=arguments.time_budget,
             seed=arguments.seed,
             device=arguments.device,
+            devices=arguments.devices,
             calibrate=_calibrated(arguments),
             align=None if arguments.align is None else arguments.align or True,
             soft_density=arguments.soft_density,
@@ -181,6 +196,14 @@ def run(arguments: argparse.Namespace) -> int:
     stop = result.plan.get("stop")
     interrupted = stop is not None and stop.value == StopReason.INTERRUPTED
     return INTERRUPTED if interruption.asked or interrupted else 0
+
+
+def _follow(device: str) -> int:
+    """Make the steps that the first process tells this one to make."""
+    from tomo_polysplat.fit.follow import follow_torchrun
+
+    follow_torchrun(device)
+    return 0
 
 
 def _calibrated(arguments: argparse.Namespace) -> bool | list[str] | None:

@@ -19,9 +19,10 @@ from tomo_polysplat.kernels.device import one_torch_thread, pick_device, usual_m
 from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.parallel import kept_threads
+from tomo_polysplat.rank_processes import rank_of_torchrun
 from tomo_polysplat.ranks import Ranks, join, leave
 
-__all__ = ["follow"]
+__all__ = ["follow", "follow_torchrun"]
 
 
 class _Followed:
@@ -98,6 +99,19 @@ def _take(number: int, told: torch.Tensor, lent: dict[int, torch.Tensor], steps:
     for followed in steps.values():
         if followed.number_of_rays == number:
             followed.rays.weigh_anew()
+
+
+def follow_torchrun(device: str) -> None:
+    """Follow the first of torchrun's processes, as another one of them."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    ranks = rank_of_torchrun(device)
+    if ranks.device.type == "cuda":
+        torch.cuda.set_device(ranks.device)
+    try:
+        join(ranks)
+        follow(ranks)
+    finally:
+        leave()
 
 
 def main(folder: str, rank: str, count: str, device: str) -> int:
