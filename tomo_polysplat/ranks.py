@@ -121,7 +121,7 @@ class Ranks:
         dist.broadcast(first, 0)
         if len(whole) > _MESSAGE:
             dist.broadcast(whole[_MESSAGE:].clone(), 0)
-        for tensor in tensors:
+        for tensor in filter(torch.Tensor.numel, tensors):
             dist.broadcast(tensor, 0)
 
     def hear(self) -> tuple[list[int], tuple[Any, ...]]:
@@ -138,7 +138,8 @@ class Ranks:
         tensors = []
         for shape, kind, on_device in kinds:
             tensors.append(torch.empty(shape, dtype=kind, device=self.device if on_device else "cpu"))
-            dist.broadcast(tensors[-1], 0)
+            if tensors[-1].numel():
+                dist.broadcast(tensors[-1], 0)
         return _Unpickler(io.BytesIO(body), tensors).load()
 
     @contextmanager

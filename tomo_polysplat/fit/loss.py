@@ -44,16 +44,11 @@ def roughness(
     gaussians: Gaussians, scene: FitScene, settings: Settings, planes: slice | None = None
 ) -> torch.Tensor:
     """Total variation of the volume, or the part of it that some planes of z hold: all parts add up to it."""
-    shape, first, after = scene.box.shape, 0, scene.box.shape[0]
-    if planes is not None:
-        # The plane behind them, for the differences from the last of them.
-        first, after = planes.start, min(planes.stop + 1, after)
-    box = scene.box if planes is None else scene.box.part((first, 0, 0), (after - first, *shape[1:]))
+    # All of it in any case: in a box of these planes voxels come out with other roundings, and where neighbours are as
+    # good as equal these tell the sign of the slope.
+    volume = scene.attenuation(gaussians, scene.box)
     chosen = settings.tv_clip, scene.tv_corners, settings.bone_level
-    volume = scene.attenuation(gaussians, box)
-    if planes is None:
-        return total_variation(volume, *chosen)
-    return part_of_variation(volume, planes.stop - first, shape, *chosen)
+    return total_variation(volume, *chosen) if planes is None else part_of_variation(volume, planes, *chosen)
 
 
 def total_variation(
@@ -89,22 +84,19 @@ def total_variation(
 
 def part_of_variation(
     volume: torch.Tensor,
-    planes: int,
-    shape: tuple[int, int, int],
+    planes: slice,
     ceiling: float,
     corners: tuple[float, float] = (0.0, 0.0),
     dense: float = math.inf,
 ) -> torch.Tensor:
-    """What the first ``planes`` of a slab add to the `total_variation` of a volume of this shape.
-
-    The slab (some, ny, nx) has the plane behind them as well, unless the volume ends there.
-    """
-    clipped = volume.clamp(max=ceiling)
+    """What some planes (nz) add to the `total_variation` of a volume, with the step to the plane behind them."""
+    clipped = volume.clamp(max=ceiling)[planes.start : planes.stop + 1]
+    depth = planes.stop - planes.start
     total = volume.new_zeros(())
-    for axis in range(volume.ndim):
-        if shape[axis] > 1:
-            heights = _heights(clipped, axis, corners, dense)[:planes]
-            total = total + heights.sum() / (math.prod(shape) // shape[axis] * (shape[axis] - 1))
+    for axis, length in enumerate(volume.shape):
+        if length > 1 and depth:
+            heights = _heights(clipped, axis, corners, dense)[:depth]
+            total = total + heights.sum() / (volume.numel() // length * (length - 1))
     return total
 
 
