@@ -28,6 +28,8 @@ BASICS = (
     "progress",
     "interrupts",
     "transfer",
+    "ranks",
+    "rank_processes",
 )
 LAYERS = (
     BASICS,

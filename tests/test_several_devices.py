@@ -58,13 +58,15 @@ def relative(volume, reference):
     return float(np.linalg.norm(volume - reference) / np.linalg.norm(reference))
 
 
-class TestThreeProcesses:
-    """They are started once."""
+@pytest.fixture(scope="class")
+def three():
+    """Three processes that share out what is fitted while they live; they are started once."""
+    with sharing([CPU] * 3):
+        yield current_ranks()
 
-    @pytest.fixture(scope="class")
-    def three(self):
-        with sharing([CPU] * 3):
-            yield current_ranks()
+
+class TestThreeProcesses:
+    """What they make is what one makes."""
 
     @pytest.mark.parametrize("scan", [cone, tilted, parallel, fan])
     def test_make_the_volume_of_one(self, scan, three):
@@ -98,15 +100,7 @@ class TestThreeProcesses:
         assert relative(shared.volume, one.volume) < SAME < relative(shared.volume, before.volume)
 
 
-def test_a_checkpoint_of_two_processes_goes_on_in_one(tmp_path):
-    path = tmp_path / "fit.npz"
-    stopped = reconstruct(cone(), devices=TWO, callbacks=[lambda state: True], checkpoint=path)
-    assert len(stopped.history) == 1 and not children()
-    resumed, whole = reconstruct(cone(), resume=True, checkpoint=path), reconstruct(cone())
-    assert len(resumed.history) == len(whole.history) and relative(resumed.volume, whole.volume) < SAME
-
-
-def test_a_process_that_dies_ends_the_run_and_leaves_the_checkpoint(tmp_path):
+def test_a_process_that_dies_ends_the_run_and_its_checkpoint_goes_on_in_one(tmp_path):
     path, killed = tmp_path / "fit.npz", []
 
     def kill(state):
@@ -116,7 +110,9 @@ def test_a_process_that_dies_ends_the_run_and_leaves_the_checkpoint(tmp_path):
     with pytest.raises(RankFailed, match=r"rank 1 of 2 \(cpu\) was ended by signal 9"):
         reconstruct(cone(), devices=TWO, callbacks=[kill], checkpoint=path)
     assert len(killed) == 1 and time.monotonic() - killed[0] < 30 and not children()
-    assert len(reconstruct(cone(), checkpoint=path, resume=True).history) == 2
+    resumed, whole = reconstruct(cone(), resume=True, checkpoint=path), reconstruct(cone())
+    assert len(resumed.history) == len(whole.history) == 2
+    assert relative(resumed.volume, whole.volume) < SAME
 
 
 def test_what_a_process_fails_of_is_told():
@@ -148,7 +144,15 @@ def test_ctrl_c_within_a_step_returns_the_best_state(monkeypatch):
 def test_torchrun_reconstructs_by_the_command_line(tmp_path):
     save_scan(fan(metal=False), tmp_path / "scan.npz")
     about = [arg for name, value in QUICK.items() for arg in ("--set", f"{name}={value}")]
-    command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node=2", "-m", "tomo_polysplat", "recon"]
+    command = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--nproc-per-node=2",
+        "-m",
+        "tomo_polysplat",
+        "recon",
+    ]
     command += ["scan.npz", "-o", "volume.npy", "--json", "about.json", *about, "--device", "cpu"]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=120)
     assert done.returncode == 0, done.stderr
@@ -170,6 +174,12 @@ def test_devices_by_name(monkeypatch):
     assert devices_of("all", "auto") == ["cuda:0", "cuda:1", "cuda:2"]
     assert devices_of("0,2", "auto") == devices_of([0, 2], "auto") == devices_of(["cuda:0", "cuda:2"], "auto")
     assert devices_of(TWO, "auto") == TWO
-    for wrong, device in (([0, 0], "auto"), (["cpu", 0], "auto"), ([], "auto"), (2, "auto"), ([0, 1], "cuda:0")):
+    for wrong, device in (
+        ([0, 0], "auto"),
+        (["cpu", 0], "auto"),
+        ([], "auto"),
+        (2, "auto"),
+        ([0, 1], "cuda:0"),
+    ):
         with pytest.raises(ValueError, match="device"):
             devices_of(wrong, device)

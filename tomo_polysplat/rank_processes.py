@@ -48,7 +48,9 @@ def devices_of(devices: Any, device: str) -> list[str] | None:
     if devices is None or devices == TORCHRUN:
         return None
     if device != "auto":
-        raise fail("device", "'auto' beside devices", repr(device), "the first of devices is the first one used")
+        raise fail(
+            "device", "'auto' beside devices", repr(device), "the first of devices is the first one used"
+        )
     if isinstance(devices, str) and devices == "all":
         return [f"cuda:{k}" for k in range(torch.cuda.device_count())] or None
     if isinstance(devices, str):
@@ -74,7 +76,9 @@ def rank_of_torchrun(device: str = "auto") -> Ranks:
     local = int(os.environ.get("LOCAL_RANK", rank))
     gpus = torch.cuda.device_count() if device != "cpu" else 0
     if gpus and local >= gpus:
-        raise fail("--nproc-per-node", f"at most {gpus} processes, a GPU each", f"rank {rank} is the {local + 1}th")
+        raise fail(
+            "--nproc-per-node", f"at most {gpus} processes, a GPU each", f"rank {rank} is the {local + 1}th"
+        )
     here = torch.device("cuda", local) if gpus else torch.device("cpu")
     store, _, _ = next(dist.rendezvous("env://"))
     return Ranks(rank, count, here, store)
@@ -101,15 +105,24 @@ def sharing(devices: Sequence[torch.device] | Ranks | None) -> Iterator[None]:
         raise fail(
             "devices", "a process without a torch.distributed group", "one that has one", "start it without"
         )
-    started = None if isinstance(devices, Ranks) else _Started(devices)
-    ranks = devices if isinstance(devices, Ranks) else started.ranks()
+    started: _Started | None = None
+    if isinstance(devices, Ranks):
+        ranks = devices
+    else:
+        started = _Started(devices)
+        ranks = started.ranks()
     done = threading.Event()
-    try:
+
+    def connect() -> None:
         if started is not None:
             started.wait_for_all(ranks)
         join(ranks)
         if ranks.device.type == "cuda":
             threading.Thread(target=_look_after, args=(ranks, done), daemon=True).start()
+
+    # As late as can be: the others start meanwhile.
+    ranks.connect = connect
+    try:
         with led_by(ranks):
             yield
         if ranks.usable:
@@ -167,7 +180,11 @@ class _Started:
         """Words on the first process that has failed; none while all run or have ended well."""
         for rank, process in enumerate(self._processes, 1):
             if process.poll():
-                how = f"signal {-process.returncode}" if process.returncode < 0 else f"status {process.returncode}"
+                how = (
+                    f"signal {-process.returncode}"
+                    if process.returncode < 0
+                    else f"status {process.returncode}"
+                )
                 return f"rank {rank} of {len(self._devices)} ({self._devices[rank]}) was ended by {how}"
         return ""
 

@@ -54,6 +54,8 @@ class Ranks:
         Which large tensors the others hold, for whom that concerns.
     failed : RankFailed or None
         What another rank has failed of, once that is known.
+    connect : callable or None
+        Called before the first thing is made together.
     """
 
     rank: int = 0
@@ -63,6 +65,7 @@ class Ranks:
     watch: Any = None
     lent: dict[int, Any] = field(default_factory=dict)
     failed: RankFailed | None = None
+    connect: Any = None
     _made: int = 0
     _gone: list[int] = field(default_factory=list)
     _broken: bool = False
@@ -156,6 +159,9 @@ class Ranks:
             raise self.failed or RankFailed("the other ranks were left in the middle of a step")
         self._broken = True
         try:
+            connect, self.connect = self.connect, None
+            if connect is not None:
+                connect()
             yield
         except Exception as error:
             self.failed = self.failed or self.failure(_LAST_WORDS)

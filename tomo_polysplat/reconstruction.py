@@ -265,7 +265,11 @@ def _note_ranks(plan: Plan) -> None:
     """Say over how many processes the steps were shared out."""
     ranks = current_ranks()
     if ranks.count > 1:
-        plan.note("ranks", ranks.count, f"each makes its part of the views of a step, on {ranks.device.type} devices")
+        plan.note(
+            "ranks",
+            ranks.count,
+            f"each makes its part of the views of a step, on {ranks.device.type} devices",
+        )
 
 
 def _problem(

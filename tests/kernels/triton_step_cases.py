@@ -132,7 +132,9 @@ def the_parts_of_ranks_add_up_to_the_step(device):
         parts = [_parts(_made(kind, device, Ranks(rank, count), changes)) for rank in range(count)]
         for name, values in whole.items():
             total = sum(part[name] for part in parts)
-            np.testing.assert_allclose(total, values, rtol=1e-4, atol=2e-5 * np.abs(values).max(), err_msg=name)
+            np.testing.assert_allclose(
+                total, values, rtol=1e-4, atol=2e-5 * np.abs(values).max(), err_msg=name
+            )
             assert np.abs(values).max() > 0, name
 
 

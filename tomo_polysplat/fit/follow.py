@@ -28,7 +28,9 @@ __all__ = ["follow", "follow_torchrun"]
 class _Followed:
     """A step as this rank makes it."""
 
-    def __init__(self, number_of_rays: int, projections: torch.Tensor, parts: dict[str, Any], ranks: Ranks) -> None:
+    def __init__(
+        self, number_of_rays: int, projections: torch.Tensor, parts: dict[str, Any], ranks: Ranks
+    ) -> None:
         self.number_of_rays = number_of_rays
         self.gaussians: Gaussians = parts["gaussians"]
         streamed = ranks.device if projections.device.type != ranks.device.type else None
@@ -90,7 +92,9 @@ def _follow(ranks: Ranks) -> None:
             steps[number].step.read()
 
 
-def _take(number: int, told: torch.Tensor, lent: dict[int, torch.Tensor], steps: dict[int, _Followed]) -> None:
+def _take(
+    number: int, told: torch.Tensor, lent: dict[int, torch.Tensor], steps: dict[int, _Followed]
+) -> None:
     """Measured rays, new ones or what has become of those that are here."""
     if number not in lent:
         lent[number] = told

@@ -230,7 +230,9 @@ class FusedStep:
         of_volume = self._volume_gradients(*drawn, output, smooth) if smoothed else self._not_smoothed
         if smooth and not smoothed:  # to which the other ranks' are added
             of_volume = tuple(tensor.clone() for tensor in of_volume)
-        of_rays = self._of_rays((*drawn, weight), table.view(self._batch, _VIEW), chosen.view(_CHOSEN, self._batch))
+        of_rays = self._of_rays(
+            (*drawn, weight), table.view(self._batch, _VIEW), chosen.view(_CHOSEN, self._batch)
+        )
         if smoothed:
             self._join()
         return Gradients(scale, of_rays, of_volume)

@@ -67,17 +67,9 @@ class LedStep:
             }
             ranks.tell("make", self._number, _lent(self._projections, ranks), parts)
             self._own = make(gaussians, spacing, rays, scene, settings, batch, ranks)
-        self._changed, self._rates = True, None
-
-    @property
-    def pull(self) -> torch.Tensor:
-        """See `Step`."""
-        return self._own.pull
-
-    @property
-    def moments(self) -> Moments:
-        """See `Step`."""
-        return self._own.moments
+        self.pull, self.moments = self._own.pull, self._own.moments
+        self._changed = True
+        self._rates: dict[str, float] | None = None
 
     @property
     def done(self) -> int:
@@ -107,14 +99,16 @@ class LedStep:
         with self._ranks.together():
             if changed := self._changed:
                 _lent(self._projections, self._ranks)
-                state = state_of(self._gaussians, self._own.moments)
+                state = state_of(self._gaussians, self.moments)
                 self._ranks.tell("state", self._number, state, self.done, self.largest, self._rates)
                 self._changed = False
             self._ranks.tell("step", self._number, views, share, changed)
             self._own(views, share)
             # Once a pass: a GPU is waited for.
             if changed and not self._ranks.same(fingerprint(self._gaussians)):
-                raise RuntimeError("the ranks' Gaussians differ after the same step: devices of several kinds?")
+                raise RuntimeError(
+                    "the ranks' Gaussians differ after the same step: devices of several kinds?"
+                )
 
     def read(self) -> tuple[float, float, int]:
         """Means since the last call; see `Step`."""

@@ -205,9 +205,12 @@ class EagerStep:
         """Make the gradients those of all ranks."""
         if self.ranks.count == 1:
             return
+        gradients = []
         for tensor in self.gaussians.parameters().values():
+            # Without views of its own a rank has none, to which those of others are added.
             tensor.grad = torch.zeros_like(tensor) if tensor.grad is None else tensor.grad
-        self.ranks.sum_(*(tensor.grad for tensor in self.gaussians.parameters().values()))
+            gradients.append(tensor.grad)
+        self.ranks.sum_(*gradients)
 
     def _predict(self, views: np.ndarray, chosen: DetectorViews) -> tuple[torch.Tensor, int]:
         """What the ``views`` of these numbers, which are ``chosen``, would measure, and the pairs skipped."""
