@@ -154,12 +154,15 @@ def run(arguments: argparse.Namespace) -> int:
     """Reconstruct, and write what was asked for; of torchrun's processes the first one does, and the others help."""
     from tomo_polysplat.rank_processes import TORCHRUN, started_by_torchrun
 
-    if started_by_torchrun():
-        if arguments.devices is not None:
-            raise fail("--devices", "none with torchrun, whose processes have a GPU each", arguments.devices)
-        arguments.devices = TORCHRUN
-        if os.environ["RANK"] != "0":
-            return _follow(arguments.device)
+    if not started_by_torchrun():
+        return _reconstruct(arguments)
+    if arguments.devices is not None:
+        raise fail("--devices", "none with torchrun, whose processes have a GPU each", arguments.devices)
+    arguments.devices = TORCHRUN
+    return _reconstruct(arguments) if os.environ["RANK"] == "0" else _follow(arguments.device)
+
+
+def _reconstruct(arguments: argparse.Namespace) -> int:
     require_outputs(arguments)
     scan = scan_from(arguments, spectrum_from(arguments))
     spectrum = _spectrum_of(scan, arguments)

@@ -50,6 +50,7 @@ def make_step(
     return LedStep(own_step, gaussians, spacing, rays, scene, settings, batch, ranks)
 
 
+# What a step needs, and whom it shares it with.
 def own_step(
     gaussians: Gaussians,
     spacing: float,

@@ -51,6 +51,7 @@ class GraphStep(FusedStep):
     Where it cannot be recorded the error leaves the Gaussians as they were.
     """
 
+    # The parameters of `FusedStep`.
     def __init__(
         self,
         gaussians: Gaussians,
