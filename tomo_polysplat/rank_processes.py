@@ -21,7 +21,7 @@ from tomo_polysplat.checks import fail
 from tomo_polysplat.parallel import cpu_threads
 from tomo_polysplat.ranks import RankFailed, Ranks, join, leave, led_by
 
-__all__ = ["TORCHRUN", "devices_of", "rank_of_torchrun", "sharing", "started_by_torchrun"]
+__all__ = ["TORCHRUN", "devices_of", "here", "rank_of_torchrun", "sharing", "started_by_torchrun"]
 
 # In place of devices: those of the processes that torchrun has started.
 TORCHRUN = "torchrun"
@@ -102,9 +102,8 @@ def sharing(devices: Sequence[torch.device] | Ranks | None) -> Iterator[None]:
         yield
         return
     if dist.is_initialized():
-        raise fail(
-            "devices", "a process without a torch.distributed group", "one that has one", "start it without"
-        )
+        remedy = "one run over several devices at a time, in a process that has no group of its own"
+        raise fail("devices", "no torch.distributed group yet", "one", remedy)
     started: _Started | None = None
     if isinstance(devices, Ranks):
         ranks = devices
@@ -114,9 +113,10 @@ def sharing(devices: Sequence[torch.device] | Ranks | None) -> Iterator[None]:
     done = threading.Event()
 
     def connect() -> None:
-        if started is not None:
-            started.wait_for_all(ranks)
-        join(ranks)
+        if started is None:
+            join(ranks)
+        else:
+            started.join_all(ranks)
         if ranks.device.type == "cuda":
             threading.Thread(target=_look_after, args=(ranks, done), daemon=True).start()
 
@@ -146,6 +146,17 @@ def _look_after(ranks: Ranks, done: threading.Event) -> None:
             return
 
 
+def here(rank: int) -> str:
+    """The key that a process sets once it has started."""
+    return f"tomo_polysplat/here/{rank}"
+
+
+def _within_this_host() -> dict[str, str]:
+    """Variables for gloo: no other host has to reach the processes, nor has this one's name to be known."""
+    usual = sys.platform == "linux" and "GLOO_SOCKET_IFNAME" not in os.environ
+    return {"GLOO_SOCKET_IFNAME": "lo"} if usual else {}
+
+
 class _Started:
     """Processes that follow this one."""
 
@@ -155,10 +166,7 @@ class _Started:
         paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
         threads = str(max(1, cpu_threads() // len(devices)))
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": threads}
-        # All on this host: no other has to reach them, nor has its name to be known.
-        if sys.platform == "linux":
-            environment.setdefault("GLOO_SOCKET_IFNAME", "lo")
-            os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")
+        environment.update(_within_this_host())
         self._processes = [
             subprocess.Popen(
                 [sys.executable, "-m", "tomo_polysplat.fit.follow", self._folder]
@@ -188,10 +196,21 @@ class _Started:
                 return f"rank {rank} of {len(self._devices)} ({self._devices[rank]}) was ended by {how}"
         return ""
 
-    def wait_for_all(self, ranks: Ranks) -> None:
-        """Return when all have started."""
+    def join_all(self, ranks: Ranks) -> None:
+        """Connect with all of them."""
+        self._wait_for_all(ranks)
+        # Only while gloo looks at them: they are the caller's.
+        own = _within_this_host()
+        os.environ.update(own)
+        try:
+            join(ranks)
+        finally:
+            for name in own:
+                del os.environ[name]
+
+    def _wait_for_all(self, ranks: Ranks) -> None:
         end = time.monotonic() + _START
-        keys = [f"tomo_polysplat/here/{rank}" for rank in range(1, ranks.count)]
+        keys = [here(rank) for rank in range(1, ranks.count)]
         while not ranks.store.check(keys):
             if (failed := ranks.failure()) is not None:
                 raise failed

@@ -19,7 +19,7 @@ from tomo_polysplat.kernels.device import one_torch_thread, pick_device, usual_m
 from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.parallel import kept_threads
-from tomo_polysplat.rank_processes import rank_of_torchrun
+from tomo_polysplat.rank_processes import here, rank_of_torchrun
 from tomo_polysplat.ranks import Ranks, join, leave
 
 __all__ = ["follow", "follow_torchrun"]
@@ -51,19 +51,9 @@ class _Followed:
 
 
 def follow(ranks: Ranks) -> None:
-    """Do what rank 0 tells, until it says that all is done.
-
-    Raises
-    ------
-    Exception
-        Whatever a step raises here, after rank 0 was told of it.
-    """
-    try:
-        with usual_modes(), one_torch_thread(ranks.device), kept_threads():
-            _follow(ranks)
-    except BaseException as error:
-        ranks.fail(error)
-        raise
+    """Do what rank 0 tells, until it says that all is done."""
+    with usual_modes(), one_torch_thread(ranks.device), kept_threads():
+        _follow(ranks)
 
 
 def _follow(ranks: Ranks) -> None:
@@ -109,11 +99,13 @@ def follow_torchrun(device: str) -> None:
     """Follow the first of torchrun's processes, as another one of them."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     ranks = rank_of_torchrun(device)
-    if ranks.device.type == "cuda":
-        torch.cuda.set_device(ranks.device)
     try:
+        _begin(ranks)
         join(ranks)
         follow(ranks)
+    except BaseException as error:
+        ranks.fail(error)
+        raise
     finally:
         leave()
 
@@ -122,20 +114,25 @@ def main(folder: str, rank: str, count: str, device: str) -> int:
     """A process that rank 0 has started, which it does not outlive."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    here = pick_device(device)
-    if here.type == "cuda":
-        torch.cuda.set_device(here)
-    ranks = Ranks(int(rank), int(count), here, dist.FileStore(os.path.join(folder, "store"), int(count)))
-    ranks.store.set(f"tomo_polysplat/here/{rank}", b"1")
+    store = dist.FileStore(os.path.join(folder, "store"), int(count))
+    ranks = Ranks(int(rank), int(count), torch.device(device), store)
     try:
+        _begin(ranks)
+        store.set(here(ranks.rank), "1")
         join(ranks)
         follow(ranks)
-    except Exception:
+    except BaseException as error:
         # Rank 0 tells it; this process has nobody to tell.
+        ranks.fail(error)
         os._exit(1)
     finally:
         leave()
     return 0
+
+
+def _begin(ranks: Ranks) -> None:
+    if pick_device(ranks.device).type == "cuda":
+        torch.cuda.set_device(ranks.device)
 
 
 def _end_with_parent() -> None:

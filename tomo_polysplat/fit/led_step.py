@@ -56,7 +56,7 @@ class LedStep:
         with ranks.together():
             views = rays.views
             parts = {
-                "gaussians": gaussians.copy(),
+                "gaussians": gaussians,
                 "spacing": spacing,
                 "rays": (rays.photons, rays.model_error, rays.held_out, rays.dimmed),
                 "views": (views.cone, views.origin, views.matrix, views.rows, views.columns, views.planar),
