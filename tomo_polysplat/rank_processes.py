@@ -132,6 +132,7 @@ def sharing(devices: Sequence[torch.device] | Ranks | None) -> Iterator[None]:
                 started.wait()
     finally:
         done.set()
+        ranks.leave()
         if started is not None:
             started.end()
         leave()

@@ -28,8 +28,8 @@ _MESSAGE = 4096
 _PATIENCE = timedelta(days=30)
 # Seconds in which a rank that has failed says why.
 _LAST_WORDS = 5.0
-# Under which a rank that fails leaves its words.
-_FAILED = "tomo_polysplat/failed"
+# Under which a rank that fails leaves its words, and rank 0 that it waits for nobody any more.
+_FAILED, _LEFT = "tomo_polysplat/failed", "tomo_polysplat/left"
 
 
 class RankFailed(RuntimeError):
@@ -195,11 +195,24 @@ class Ranks:
                 return self.store.get(_FAILED).decode()
         return ""
 
-    def fail(self, error: BaseException) -> None:
+    def fail(self, error: BaseException) -> RankFailed:
         """Say, for rank 0 to repeat, what this one has failed of."""
         reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        words = f"rank {self.rank} of {self.count} ({self.device}) failed: {reason}"
         with suppress(RuntimeError):
-            self.store.set(_FAILED, f"rank {self.rank} of {self.count} ({self.device}) failed: {reason}")
+            self.store.set(_FAILED, words)
+        return RankFailed(words)
+
+    def leave(self) -> None:
+        """From rank 0, that it goes, so that the others need not complain of it."""
+        with suppress(RuntimeError):
+            self.store.set(_LEFT, "1")
+
+    def left_alone(self) -> bool:
+        """Whether rank 0 has gone."""
+        with suppress(RuntimeError):
+            return self.store.check([_LEFT])
+        return False
 
 
 ALONE = Ranks()

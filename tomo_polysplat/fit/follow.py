@@ -96,16 +96,22 @@ def _take(
 
 
 def follow_torchrun(device: str) -> None:
-    """Follow the first of torchrun's processes, as another one of them."""
+    """Follow the first of torchrun's processes, as another one of them.
+
+    Raises
+    ------
+    RankFailed
+        Whatever this one fails of; that rank 0 has gone is no failure.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     ranks = rank_of_torchrun(device)
     try:
         _begin(ranks)
         join(ranks)
         follow(ranks)
-    except BaseException as error:
-        ranks.fail(error)
-        raise
+    except Exception as error:
+        if not ranks.left_alone():
+            raise ranks.fail(error) from error
     finally:
         leave()
 
