@@ -10,7 +10,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +19,14 @@ import torch.distributed as dist
 
 from tomo_polysplat.checks import fail
 from tomo_polysplat.parallel import cpu_threads
-from tomo_polysplat.ranks import RankFailed, Ranks, join, leave, led_by
+from tomo_polysplat.ranks import RankFailed, Ranks, join, join_here, leave, led_by
 
 __all__ = ["TORCHRUN", "devices_of", "here", "rank_of_torchrun", "sharing", "started_by_torchrun"]
 
 # In place of devices: those of the processes that torchrun has started.
 TORCHRUN = "torchrun"
-# Seconds that a process may take to start, and to end when it is told so.
-_START, _END = 120.0, 10.0
+# Seconds that a process may take to start.
+_START = 120.0
 # Between two looks at whether all processes still run.
 _LOOK = 0.5
 
@@ -125,17 +125,15 @@ def sharing(devices: Sequence[torch.device] | Ranks | None) -> Iterator[None]:
     try:
         with led_by(ranks):
             yield
-        if ranks.usable:
+        if started is None and ranks.usable:
             with ranks.together():
                 ranks.tell("end")
-            if started is not None:
-                started.wait()
     finally:
         done.set()
         ranks.leave()
+        leave()
         if started is not None:
             started.end()
-        leave()
 
 
 def _look_after(ranks: Ranks, done: threading.Event) -> None:
@@ -152,12 +150,6 @@ def here(rank: int) -> str:
     return f"tomo_polysplat/here/{rank}"
 
 
-def _within_this_host() -> dict[str, str]:
-    """Variables for gloo: no other host has to reach the processes, nor has this one's name to be known."""
-    usual = sys.platform == "linux" and "GLOO_SOCKET_IFNAME" not in os.environ
-    return {"GLOO_SOCKET_IFNAME": "lo"} if usual else {}
-
-
 class _Started:
     """Processes that follow this one."""
 
@@ -167,7 +159,6 @@ class _Started:
         paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
         threads = str(max(1, cpu_threads() // len(devices)))
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": threads}
-        environment.update(_within_this_host())
         self._processes = [
             subprocess.Popen(
                 [sys.executable, "-m", "tomo_polysplat.fit.follow", self._folder]
@@ -189,25 +180,15 @@ class _Started:
         """Words on the first process that has failed; none while all run or have ended well."""
         for rank, process in enumerate(self._processes, 1):
             if process.poll():
-                how = (
-                    f"signal {-process.returncode}"
-                    if process.returncode < 0
-                    else f"status {process.returncode}"
-                )
-                return f"rank {rank} of {len(self._devices)} ({self._devices[rank]}) was ended by {how}"
+                code = process.returncode
+                how = f"was ended by signal {-code}" if code < 0 else f"ended with status {code}"
+                return f"rank {rank} of {len(self._devices)} ({self._devices[rank]}) {how}"
         return ""
 
     def join_all(self, ranks: Ranks) -> None:
         """Connect with all of them."""
         self._wait_for_all(ranks)
-        # Only while gloo looks at them: they are the caller's.
-        own = _within_this_host()
-        os.environ.update(own)
-        try:
-            join(ranks)
-        finally:
-            for name in own:
-                del os.environ[name]
+        join_here(ranks)
 
     def _wait_for_all(self, ranks: Ranks) -> None:
         end = time.monotonic() + _START
@@ -219,15 +200,8 @@ class _Started:
                 raise RankFailed(f"not all of {ranks.count} processes had started after {_START:g} s")
             time.sleep(0.02)
 
-    def wait(self) -> None:
-        """Return when all have ended, or had the time to."""
-        end = time.monotonic() + _END
-        for process in self._processes:
-            with suppress(subprocess.TimeoutExpired):
-                process.wait(max(end - time.monotonic(), 0.0))
-
     def end(self) -> None:
-        """Leave none behind."""
+        """Leave none behind; they have nothing to lose."""
         for process in self._processes:
             process.kill()
         for process in self._processes:

@@ -8,7 +8,9 @@ anything is made together it tells them what (`Ranks.tell`, `Ranks.hear`), and w
 from __future__ import annotations
 
 import io
+import os
 import pickle
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -20,7 +22,7 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
-__all__ = ["ALONE", "RankFailed", "Ranks", "current_ranks", "join", "leave", "led_by"]
+__all__ = ["ALONE", "RankFailed", "Ranks", "current_ranks", "join", "join_here", "leave", "led_by"]
 
 # Bytes of a message that travels at once; of a longer one the rest follows.
 _MESSAGE = 4096
@@ -238,25 +240,44 @@ def join(ranks: Ranks) -> None:
     """Connect with all others, which do the same."""
     on_gpu = ranks.device.type == "cuda"
     ranks.store.set_timeout(_PATIENCE)
-    dist.init_process_group(
-        "cpu:gloo,cuda:nccl" if on_gpu else "gloo",
-        store=dist.PrefixStore("tomo_polysplat/group", ranks.store),
-        rank=ranks.rank,
-        world_size=ranks.count,
-        timeout=_PATIENCE,
-    )
-    # NCCL connects when it is first used, which would otherwise be beside a graph that is recorded.
-    dist.all_reduce(torch.zeros(1, device=ranks.device))
+    # Whether another rank has died is found out here; NCCL's own watch would end this process.
+    with _variables({"TORCH_NCCL_ASYNC_ERROR_HANDLING": "0"}):
+        dist.init_process_group(
+            "cpu:gloo,cuda:nccl" if on_gpu else "gloo",
+            store=dist.PrefixStore("tomo_polysplat/group", ranks.store),
+            rank=ranks.rank,
+            world_size=ranks.count,
+            timeout=_PATIENCE,
+        )
+        # NCCL connects when it is first used, which would otherwise be beside a graph that is recorded.
+        dist.all_reduce(torch.zeros(1, device=ranks.device))
+
+
+def join_here(ranks: Ranks) -> None:
+    """Connect with others of this host: no other has to reach them, nor has this one's name to be known."""
+    with _variables({"GLOO_SOCKET_IFNAME": "lo"} if sys.platform == "linux" else {}):
+        join(ranks)
+
+
+@contextmanager
+def _variables(values: dict[str, str]) -> Iterator[None]:
+    """Variables of the environment, while libraries look at them; what the caller has set stands."""
+    own = {name: value for name, value in values.items() if name not in os.environ}
+    os.environ.update(own)
+    try:
+        yield
+    finally:
+        for name in own:
+            os.environ.pop(name, None)
 
 
 def leave() -> None:
     """Let go of the connections without waiting for anybody."""
-    if not dist.is_initialized():
-        return
-    # Destroying waits for what was begun with processes that may be no more.
+    # To destroy a group waits for what was begun with processes that may be no more. Of two threads one is too late.
     abort = getattr(dist.distributed_c10d, "_abort_process_group", dist.destroy_process_group)
-    with suppress(RuntimeError):
-        abort()
+    with suppress(Exception):
+        if dist.is_initialized():
+            abort()
 
 
 class _Pickler(pickle.Pickler):

@@ -20,7 +20,7 @@ from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.parallel import kept_threads
 from tomo_polysplat.rank_processes import here, rank_of_torchrun
-from tomo_polysplat.ranks import Ranks, join, leave
+from tomo_polysplat.ranks import Ranks, join, join_here, leave
 
 __all__ = ["follow", "follow_torchrun"]
 
@@ -125,7 +125,7 @@ def main(folder: str, rank: str, count: str, device: str) -> int:
     try:
         _begin(ranks)
         store.set(here(ranks.rank), "1")
-        join(ranks)
+        join_here(ranks)
         follow(ranks)
     except BaseException as error:
         # Rank 0 tells it; this process has nobody to tell.
