@@ -99,6 +99,24 @@ class TestThreeProcesses:
         shared, one = reconstruct(cone(), settings=settings), alone(cone(), settings=settings)
         assert relative(shared.volume, one.volume) < SAME < relative(shared.volume, before.volume)
 
+    def test_stand_still_after_ctrl_c_within_a_step(self, three, monkeypatch):
+        """The last thing that they do: the best state is returned, and nothing more is asked of them."""
+        step, made = EagerStep.__call__, []
+
+        def interrupted(self, *parts):
+            made.append(1)
+            if len(made) == 7:
+                raise KeyboardInterrupt
+            step(self, *parts)
+
+        monkeypatch.setattr(EagerStep, "__call__", interrupted)
+        result = reconstruct(cone())
+        assert result.plan["stop"].value == "interrupted" and len(result.history) == 1
+        assert np.isfinite(result.volume).all() and result.volume.any()
+        assert not three.usable
+        with pytest.raises(RankFailed, match="left in the middle of a step"):
+            reconstruct(cone())
+
 
 def test_a_process_that_dies_ends_the_run_and_its_checkpoint_goes_on_in_one(tmp_path):
     path, killed = tmp_path / "fit.npz", []
@@ -124,21 +142,6 @@ def test_what_a_process_fails_of_is_told():
         with pytest.raises(RankFailed, match="KeyError: 77"), ranks.together():
             pass
     assert not children()
-
-
-def test_ctrl_c_within_a_step_returns_the_best_state(monkeypatch):
-    step, made = EagerStep.__call__, []
-
-    def interrupted(self, *parts):
-        made.append(1)
-        if len(made) == 7:
-            raise KeyboardInterrupt
-        step(self, *parts)
-
-    monkeypatch.setattr(EagerStep, "__call__", interrupted)
-    result = reconstruct(cone(), devices=TWO)
-    assert result.plan["stop"].value == "interrupted" and len(result.history) == 1
-    assert np.isfinite(result.volume).all() and result.volume.any() and not children()
 
 
 def test_torchrun_reconstructs_by_the_command_line(tmp_path):
