@@ -10,7 +10,8 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +22,20 @@ from tomo_polysplat.checks import fail
 from tomo_polysplat.parallel import cpu_threads
 from tomo_polysplat.ranks import RankFailed, Ranks, join, join_here, leave, led_by
 
-__all__ = ["TORCHRUN", "devices_of", "here", "rank_of_torchrun", "sharing", "started_by_torchrun"]
+__all__ = [
+    "TORCHRUN",
+    "devices_of",
+    "here",
+    "rank_of_torchrun",
+    "share_out",
+    "sharing",
+    "sharing_ends",
+    "started_by_torchrun",
+]
 
 # In place of devices: those of the processes that torchrun has started.
 TORCHRUN = "torchrun"
+_ENDS: ContextVar[ExitStack] = ContextVar("_ENDS")
 # Seconds that a process may take to start.
 _START = 120.0
 # Between two looks at whether all processes still run.
@@ -134,6 +145,22 @@ def sharing(devices: Sequence[torch.device] | Ranks | None) -> Iterator[None]:
         leave()
         if started is not None:
             started.end()
+
+
+@contextmanager
+def sharing_ends() -> Iterator[None]:
+    """End with this block what `share_out` begins in it."""
+    with ExitStack() as stack:
+        before = _ENDS.set(stack)
+        try:
+            yield
+        finally:
+            _ENDS.reset(before)
+
+
+def share_out(devices: Sequence[torch.device] | Ranks | None) -> None:
+    """Begin `sharing`, until the end of `sharing_ends`; processes start while this one does other things."""
+    _ENDS.get().enter_context(sharing(devices))
 
 
 def _look_after(ranks: Ranks, done: threading.Event) -> None:

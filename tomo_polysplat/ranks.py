@@ -26,6 +26,8 @@ __all__ = ["ALONE", "RankFailed", "Ranks", "current_ranks", "join", "join_here",
 
 # Bytes of a message that travels at once; of a longer one the rest follows.
 _MESSAGE = 4096
+# More numbers than this are added up where they are: to put them together would take longer than some more calls.
+_LARGE = 1 << 22
 # A rank waits for what the first one reads or decides meanwhile. One that dies is noticed by its connection.
 _PATIENCE = timedelta(days=30)
 # Seconds in which a rank that has failed says why.
@@ -78,8 +80,12 @@ class Ranks:
         return slice(length * rank // self.count, length * (rank + 1) // self.count)
 
     def sum_(self, *tensors: torch.Tensor) -> None:
-        """Add up tensors of one type over all ranks, in place, in one go."""
+        """Add up contiguous tensors of one type over all ranks, in place."""
         if self.count == 1:
+            return
+        if sum(tensor.numel() for tensor in tensors) > _LARGE:
+            for tensor in tensors:
+                dist.all_reduce(tensor)
             return
         flat = torch.cat([tensor.reshape(-1) for tensor in tensors])
         dist.all_reduce(flat)

@@ -40,7 +40,7 @@ from tomo_polysplat.plan.preparation import PreparedFit, RunOptions
 from tomo_polysplat.plan.solver import Solver
 from tomo_polysplat.plan.unit_check import tell_impossible
 from tomo_polysplat.progress import progress_reports
-from tomo_polysplat.rank_processes import TORCHRUN, devices_of, rank_of_torchrun, sharing
+from tomo_polysplat.rank_processes import TORCHRUN, devices_of, rank_of_torchrun, share_out, sharing_ends
 from tomo_polysplat.ranks import Ranks, current_ranks
 from tomo_polysplat.result.provenance import provenance
 from tomo_polysplat.result.result import Result
@@ -65,6 +65,7 @@ _VIEWS_OF_PIXELS = 16
 # One parameter for each option that a caller names.
 @usual_modes()
 @memory_limits()
+@sharing_ends()
 def reconstruct(
     projections: Any,
     proj_geom: Mapping[str, Any] | None = None,
@@ -190,6 +191,7 @@ def reconstruct(
     """
     begun = time.perf_counter()
     device, shared = _devices(devices, device)
+    share_out(shared)
     run_options = RunOptions.of(quality, settings, time_budget, seed, device, callbacks)
     limit_memory(run_options.settings.memory, run_options.device.type)
     started, compiled = working_time(), compiled_seconds()
@@ -215,12 +217,7 @@ def reconstruct(
     saved = _checkpoint(checkpoint, resume, problem, options)
     before = 0.0 if saved is None else saved.seconds
     started, begun = started - before, begun - before
-    with (
-        sharing(shared),
-        one_torch_thread(run_options.device),
-        kept_threads(),
-        progress_reports(progress) as report,
-    ):
+    with one_torch_thread(run_options.device), kept_threads(), progress_reports(progress) as report:
         solver = Solver(run_options, saved, started, flipped, report, moved)
         problem, prepared, outcome = solver.solve(problem, wanted, ask_scatter=calibrate is None)
         _note_ranks(prepared.plan)
