@@ -41,11 +41,11 @@ class _Followed:
         self.step: Step = own_step(self.gaussians, *about, ranks)
 
     @torch.no_grad()
-    def restore(self, state: list[torch.Tensor], done: int, largest: list[float], rates: Any) -> None:
+    def restore(self, state: list[torch.Tensor], done: int, rates: Any) -> None:
         """Go on from where rank 0 is."""
         for own, told in zip(state_of(self.gaussians, self.step.moments), state):
             own.copy_(told)
-        self.step.done, self.step.largest = done, largest
+        self.step.done = done
         if rates is not None:
             self.step.set_rates(rates)
 

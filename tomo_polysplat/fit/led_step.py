@@ -87,7 +87,8 @@ class LedStep:
 
     @largest.setter
     def largest(self, values: list[float]) -> None:
-        self._own.largest, self._changed = values, True
+        # Each rank has its own, of its views and its slab; they change roundings only.
+        self._own.largest = values
 
     def set_rates(self, rates: Mapping[str, float]) -> None:
         """See `Step`."""
@@ -100,7 +101,7 @@ class LedStep:
             if changed := self._changed:
                 _lent(self._projections, self._ranks)
                 state = state_of(self._gaussians, self.moments)
-                self._ranks.tell("state", self._number, state, self.done, self.largest, self._rates)
+                self._ranks.tell("state", self._number, state, self.done, self._rates)
                 self._changed = False
             self._ranks.tell("step", self._number, views, share, changed)
             self._own(views, share)
