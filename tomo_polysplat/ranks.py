@@ -74,10 +74,9 @@ class Ranks:
     _gone: list[int] = field(default_factory=list)
     _broken: bool = False
 
-    def mine(self, length: int, rank: int | None = None) -> slice:
-        """This rank's part of ``range(length)``, or that of another one; empty where there are too few for all."""
-        rank = self.rank if rank is None else rank
-        return slice(length * rank // self.count, length * (rank + 1) // self.count)
+    def mine(self, length: int) -> slice:
+        """This rank's part of ``range(length)``; empty where there are too few for all."""
+        return slice(length * self.rank // self.count, length * (self.rank + 1) // self.count)
 
     def sum_(self, *tensors: torch.Tensor) -> None:
         """Add up contiguous tensors of one type over all ranks, in place."""

@@ -125,7 +125,7 @@ def reconstruct(
     devices : "all", numbers of GPUs such as ``[0, 1]``, or "torchrun", optional
         Share the fit's steps out over these GPUs, in a process each; the first one does everything else. "torchrun":
         over the processes that torchrun has started, of which only the first one may come here; the others call
-        `tomo_polysplat.fit.follow.follow`, as the command line does.
+        `tomo_polysplat.fit.follow.follow_torchrun`, as the command line does.
     valid : bool array, shape of ``projections``, optional
         False for rays that must not be used.
     water_correction : sequence of float, optional
