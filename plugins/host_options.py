@@ -11,7 +11,7 @@ __all__ = ["SOLVER_OPTIONS", "solver_options", "spectrum_of", "split_options"]
 
 TUBE_OPTIONS = ("kvp", "anode", "filters", "detector")
 PASSED_ON = (
-    *("spectrum", "materials", "unit", "quality", "time_budget", "seed", "device"),
+    *("spectrum", "materials", "unit", "quality", "time_budget", "seed", "device", "devices"),
     *("callbacks", "progress", "settings", "water_correction", "checkpoint", "resume"),
     *("calibrate", "soft_density", "align"),
 )

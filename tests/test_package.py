@@ -28,6 +28,8 @@ BASICS = (
     "progress",
     "interrupts",
     "transfer",
+    "ranks",
+    "rank_processes",
 )
 LAYERS = (
     BASICS,
@@ -44,6 +46,7 @@ LAYERS = (
     ("reconstruction", "viewer"),
     ("quality",),
     ("baselines", "bench", "cli", "doctor", "plugins"),
+    ("__main__",),
 )
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 # Loading any of these takes a good part of a second, or starts something.

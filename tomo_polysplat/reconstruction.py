@@ -23,7 +23,7 @@ from tomo_polysplat.fit.surroundings import cut_out
 from tomo_polysplat.free_memory import limit_memory, memory_limits
 from tomo_polysplat.interrupts import postponed_interrupts
 from tomo_polysplat.kernels.compile_time import compiled_seconds, working_time
-from tomo_polysplat.kernels.device import one_torch_thread, usual_modes
+from tomo_polysplat.kernels.device import one_torch_thread, pick_device, usual_modes
 from tomo_polysplat.nuisances.detector_blur import BlurOfDetector
 from tomo_polysplat.parallel import kept_threads
 from tomo_polysplat.physics.base_materials import Materials
@@ -40,6 +40,8 @@ from tomo_polysplat.plan.preparation import PreparedFit, RunOptions
 from tomo_polysplat.plan.solver import Solver
 from tomo_polysplat.plan.unit_check import tell_impossible
 from tomo_polysplat.progress import progress_reports
+from tomo_polysplat.rank_processes import TORCHRUN, devices_of, rank_of_torchrun, share_out, sharing_ends
+from tomo_polysplat.ranks import Ranks, current_ranks
 from tomo_polysplat.result.provenance import provenance
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.coverage import unseen_share
@@ -63,6 +65,7 @@ _VIEWS_OF_PIXELS = 16
 # One parameter for each option that a caller names.
 @usual_modes()
 @memory_limits()
+@sharing_ends()
 def reconstruct(
     projections: Any,
     proj_geom: Mapping[str, Any] | None = None,
@@ -75,6 +78,7 @@ def reconstruct(
     time_budget: float | None = None,
     seed: int = 0,
     device: str = "auto",
+    devices: str | Sequence[int | str] | None = None,
     valid: Any = None,
     water_correction: Sequence[float] | None = None,
     filter_map: Sequence[Any] | None = None,
@@ -118,6 +122,10 @@ def reconstruct(
     seed : int
         Seed of every random choice.
     device : {"auto", "cpu", "cuda", "cuda:N"}
+    devices : "all", numbers of GPUs such as ``[0, 1]``, or "torchrun", optional
+        Share the fit's steps out over these GPUs, in a process each; the first one does everything else. "torchrun":
+        over the processes that torchrun has started, of which only the first one may come here; the others call
+        `tomo_polysplat.fit.follow.follow_torchrun`, as the command line does.
     valid : bool array, shape of ``projections``, optional
         False for rays that must not be used.
     water_correction : sequence of float, optional
@@ -176,10 +184,14 @@ def reconstruct(
         For a checkpoint that exists, without ``resume``.
     OSError
         For a checkpoint that cannot be written.
+    RankFailed
+        If the process of one of several devices dies, or fails; the message names it and tells why.
     KeyboardInterrupt
         After Ctrl-C before the fit has begun, or a second one after it.
     """
     begun = time.perf_counter()
+    device, shared = _devices(devices, device)
+    share_out(shared)
     run_options = RunOptions.of(quality, settings, time_budget, seed, device, callbacks)
     limit_memory(run_options.settings.memory, run_options.device.type)
     started, compiled = working_time(), compiled_seconds()
@@ -208,6 +220,7 @@ def reconstruct(
     with one_torch_thread(run_options.device), kept_threads(), progress_reports(progress) as report:
         solver = Solver(run_options, saved, started, flipped, report, moved)
         problem, prepared, outcome = solver.solve(problem, wanted, ask_scatter=calibrate is None)
+        _note_ranks(prepared.plan)
         _note_scan(prepared.plan, problem, grid, measured.water_correction, mended)
         with postponed_interrupts("the volume") as interruption:
             report(1.0, "volume")
@@ -232,6 +245,28 @@ def reconstruct(
     result.seconds = time.perf_counter() - begun
     logger.info("Reconstructed in %.1f s: %s; %s", result.seconds, result.plan["stop"].why, result.counts)
     return result
+
+
+def _devices(devices: Any, device: str) -> tuple[str, list[torch.device] | Ranks | None]:
+    """The device of this process, and over what the steps are shared out."""
+    if devices == TORCHRUN:
+        ranks = rank_of_torchrun(device)
+        return str(ranks.device), ranks
+    names = devices_of(devices, device)
+    if names is None:
+        return device, None
+    return names[0], [pick_device(name) for name in names]
+
+
+def _note_ranks(plan: Plan) -> None:
+    """Say over how many processes the steps were shared out."""
+    ranks = current_ranks()
+    if ranks.count > 1:
+        plan.note(
+            "ranks",
+            ranks.count,
+            f"each makes its part of the views of a step, on {ranks.device.type} devices",
+        )
 
 
 def _problem(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tomo_polysplat.fit.loss import misfit, total_variation, weighted_huber, weighted_l1
+from tomo_polysplat.fit.loss import misfit, part_of_variation, total_variation, weighted_huber, weighted_l1
 from tomo_polysplat.settings import Settings
 
 
@@ -84,6 +84,20 @@ def test_total_variation_of_a_cube_is_its_surface():
     volume = torch.zeros((9, 9, 9), dtype=torch.float64)
     volume[3:6, 3:6, 3:6] = 0.7
     assert float(total_variation(volume, 10.0)) == pytest.approx(3 * 0.7 * 2 * 9 / (8 * 9 * 9))
+
+
+def test_parts_of_the_total_variation_add_up_to_it():
+    """Of planes shared out in any way, some of them to nobody; also of one slice, and with corners."""
+    generator = torch.Generator().manual_seed(1)
+    for depth, corners in ((7, (0.0, 0.0)), (7, (0.2, 0.05)), (1, (0.0, 0.0))):
+        volume = torch.rand((depth, 4, 5), generator=generator)
+        whole = float(total_variation(volume, 0.9, corners, 0.6))
+        for ends in ((0, depth), (0, 0, depth // 2, depth), (*range(depth + 1), depth)):
+            parts = [
+                float(part_of_variation(volume, slice(a, b), 0.9, corners, 0.6))
+                for a, b in zip(ends, ends[1:])
+            ]
+            assert sum(parts) == pytest.approx(whole, rel=1e-5)
 
 
 def test_total_variation_of_one_slice_leaves_the_missing_axis_out():

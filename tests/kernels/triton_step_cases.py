@@ -4,11 +4,13 @@ import functools
 from unittest import mock
 
 import numpy as np
+import torch
 from step_scenes import BATCH, compare_steps, fit_problem
 from triton_case import case
 
 from tomo_polysplat.fit.step import EagerStep
 from tomo_polysplat.kernels import portions
+from tomo_polysplat.ranks import ALONE, Ranks
 
 
 def _fused(*problem):
@@ -130,3 +132,35 @@ def what_is_not_a_number_shows_in_the_misfit(device):
         problem[0].attenuation[3] = float("nan")
         step(np.array([0, 3]), 0.0)
         assert np.isnan(step.read()[0]), (blurring, rays)
+
+
+@case
+def the_parts_of_ranks_add_up_to_the_step(device):
+    """Of three with two views to share, and of two in a plane, which cannot be cut into slabs."""
+    for kind, count, changes in (("cone", 3, {"pixel_rays": 2}), ("fan", 2, {"blurring": False})):
+        whole = _parts(_made(kind, device, ALONE, changes))
+        parts = [_parts(_made(kind, device, Ranks(rank, count), changes)) for rank in range(count)]
+        for name, values in whole.items():
+            total = sum(part[name] for part in parts)
+            np.testing.assert_allclose(
+                total, values, rtol=1e-4, atol=2e-5 * np.abs(values).max(), err_msg=name
+            )
+            assert np.abs(values).max() > 0, name
+
+
+def _made(kind, device, ranks, changes):
+    from tomo_polysplat.fit.fused_step import FusedStep
+
+    problem = fit_problem(kind, True, device, "triton", count=9, **changes)
+    step = FusedStep(*problem, BATCH, ranks)
+    step._control.copy_(torch.from_numpy(step._next(np.array([3, 1]), 0.0)))
+    return step, step._gradients(0.3)
+
+
+def _parts(made):
+    step, gradients = made
+    names = ("position", "scale", "rotation", "weight")
+    found = {f"{k} of rays": t for k, t in zip(names, gradients.of_rays)}
+    found |= {f"{k} of the volume": t for k, t in zip(names, gradients.of_volume)}
+    found |= {"sums": step._sums} | ({"blur": step._grad_blur} if step.scene.blurring else {})
+    return {name: tensor.double().cpu().numpy() for name, tensor in found.items()}

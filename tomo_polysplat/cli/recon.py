@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import os
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -131,6 +132,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_solver_options(group)
     group.add_argument(
+        "--devices",
+        metavar="GPUS",
+        help="share the fit out over these, such as 0,1, or all (torchrun: over its processes)",
+    )
+    group.add_argument(
         "--memory",
         metavar="SIZE",
         help='what the run may hold on the device, such as "12 GB" (default: all that is free)',
@@ -146,7 +152,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Reconstruct, and write what was asked for."""
+    """Reconstruct, and write what was asked for; of torchrun's processes the first one does, and the others help."""
+    from tomo_polysplat.rank_processes import TORCHRUN, started_by_torchrun
+
+    if not started_by_torchrun():
+        return _reconstruct(arguments)
+    if arguments.devices is not None:
+        raise fail("--devices", "none with torchrun, whose processes have a GPU each", arguments.devices)
+    arguments.devices = TORCHRUN
+    return _reconstruct(arguments) if os.environ["RANK"] == "0" else _follow(arguments.device)
+
+
+def _reconstruct(arguments: argparse.Namespace) -> int:
     require_outputs(arguments)
     settings = _settings(arguments)
     # Refused before the scan is read.
@@ -167,6 +184,7 @@ def run(arguments: argparse.Namespace) -> int:
             time_budget=arguments.time_budget,
             seed=arguments.seed,
             device=arguments.device,
+            devices=arguments.devices,
             calibrate=_calibrated(arguments),
             align=None if arguments.align is None else arguments.align or True,
             soft_density=arguments.soft_density,
@@ -185,6 +203,14 @@ def run(arguments: argparse.Namespace) -> int:
     stop = result.plan.get("stop")
     interrupted = stop is not None and stop.value == StopReason.INTERRUPTED
     return INTERRUPTED if interruption.asked or interrupted else 0
+
+
+def _follow(device: str) -> int:
+    """Make the steps that the first process tells this one to make."""
+    from tomo_polysplat.fit.follow import follow_torchrun
+
+    follow_torchrun(device)
+    return 0
 
 
 def _calibrated(arguments: argparse.Namespace) -> bool | list[str] | None:

@@ -6,13 +6,15 @@ import logging
 
 import torch
 
+from tomo_polysplat.fit.led_step import LedStep
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.step import EagerStep, Step
 from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.ranks import ALONE, Ranks, current_ranks
 from tomo_polysplat.settings import Settings
 
-__all__ = ["make_step", "why_eager"]
+__all__ = ["make_step", "own_step", "why_eager"]
 
 logger = logging.getLogger(__name__)
 
@@ -37,7 +39,7 @@ def make_step(
     batch: int,
     beside: Step | None = None,
 ) -> Step:
-    """A CUDA graph where there can be one, else operation by operation.
+    """A CUDA graph where there can be one, else operation by operation; shared out over ranks, if there are several.
 
     Parameters
     ----------
@@ -51,19 +53,43 @@ def make_step(
     torch.OutOfMemoryError
         Where a GPU has no room for the graph: operation by operation would need more.
     """
+    ranks = current_ranks()
+    if ranks.count == 1 or settings.ssim_weight:
+        if ranks.count > 1:
+            logger.warning("One device makes the steps: structural similarity is of whole steps.")
+        return own_step(gaussians, spacing, rays, scene, settings, batch, beside=beside)
+    return LedStep(own_step, gaussians, spacing, rays, scene, settings, batch, ranks)
+
+
+# What a step needs, and whom it shares it with.
+def own_step(
+    gaussians: Gaussians,
+    spacing: float,
+    rays: Rays,
+    scene: FitScene,
+    settings: Settings,
+    batch: int,
+    ranks: Ranks = ALONE,
+    beside: Step | None = None,
+) -> Step:
+    """This process's step, or its part of that of ``ranks``, which all make theirs; see `make_step`."""
     reason = why_eager(scene, settings)
+    graph: Step | None = None
     if not reason:
         from tomo_polysplat.fit.graph_step import GraphStep
 
         try:
             shared = beside if isinstance(beside, GraphStep) else None
-            return GraphStep(gaussians, spacing, rays, scene, settings, batch, shared)
-        except torch.OutOfMemoryError:
-            raise
+            graph = GraphStep(gaussians, spacing, rays, scene, settings, batch, ranks, shared)
         # Of compiler or driver, of any kind: the slower way gives the same result.
         except Exception as problem:
+            if isinstance(problem, torch.OutOfMemoryError) and ranks.count == 1:
+                raise
             logger.debug("no CUDA graph", exc_info=True)
             logger.warning("Steps one operation at a time: no CUDA graph could be recorded: %s", problem)
     else:
         logger.debug("Steps one operation at a time: %s.", reason)
-    return EagerStep(gaussians, spacing, rays, scene, settings)
+    # What the two forms add up over ranks is not the same.
+    if ranks.same(graph is not None) and graph is not None:
+        return graph
+    return EagerStep(gaussians, spacing, rays, scene, settings, ranks)

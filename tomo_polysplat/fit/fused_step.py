@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -40,10 +41,11 @@ from tomo_polysplat.kernels.voxelise.triton_setup import box_table, ellipsoids
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.detector_blur import LARGEST_BLUR
 from tomo_polysplat.physics.transmission import nodes_on
+from tomo_polysplat.ranks import ALONE, Ranks
 from tomo_polysplat.render.renderer import VOXEL_CUTOFF
 from tomo_polysplat.settings import Settings
 
-__all__ = ["FusedStep"]
+__all__ = ["FusedStep", "Gradients"]
 
 # Numbers of the control tensor, in its order: of the update, and of each view its number and slot, and its geometry.
 # Every part begins at 16 bytes whatever the batch: elsewhere the kernels would be compiled once more.
@@ -51,6 +53,14 @@ _HEAD, _CHOSEN, _VIEW = 4, 2, 21
 
 # Position, deviation, rotation and weights.
 _Drawn = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
+
+
+class Gradients(NamedTuple):
+    """Deviations as they are drawn, and gradients by position, deviation, rotation and weights."""
+
+    scale: torch.Tensor
+    of_rays: tuple[torch.Tensor, ...]
+    of_volume: tuple[torch.Tensor, ...]
 
 
 class FusedStep:
@@ -67,8 +77,11 @@ class FusedStep:
     settings : Settings
     batch : int
         Views of a step.
+    ranks : Ranks
+        Of several each takes its part of the views and of the volume; they add up their gradients.
     """
 
+    # What differs between scenes is set up once, for kernels that are given addresses.
     def __init__(
         self,
         gaussians: Gaussians,
@@ -77,12 +90,15 @@ class FusedStep:
         scene: FitScene,
         settings: Settings,
         batch: int,
+        ranks: Ranks = ALONE,
     ) -> None:
         self.gaussians, self.rays, self.scene, self.settings = gaussians, rays, scene, settings
-        self.done, self._unread = 0, 0
+        self.done, self._unread, self.ranks = 0, 0, ranks
+        self._batch, self._mine = batch, ranks.mine(batch)
+        of_mine = len(range(batch)[self._mine])
         parameters, device = gaussians.parameters(), gaussians.position.device
         self.pull, self.moments = torch.zeros_like(gaussians.attenuation), new_moments(parameters)
-        self.feed = feed(rays.projections, rays.target, batch)
+        self.feed = feed(rays.projections, rays.target, max(of_mine, 1))
         rates = step_rates(settings, spacing)
         self._rates = torch.tensor([rates[k] for k in parameters], dtype=torch.float32, device=device)
         bounds = log_scale_bounds(scene, spacing, gaussians.planar, settings)
@@ -90,7 +106,7 @@ class FusedStep:
         fine = scene.fine(rays.views)
         self._table = fine.host_table()
         # Only the shape of these views counts.
-        self._portions = portions(fine.select(np.arange(batch)), len(gaussians))
+        self._portions = portions(fine.select(np.arange(of_mine)), len(gaussians)) if of_mine else []
         self._parts = (fine.rows // rays.views.rows, fine.columns // rays.views.columns)
         self._sums = torch.zeros(3, dtype=torch.float64, device=device)
         self._skipped = torch.zeros((), dtype=torch.int64, device=device)
@@ -104,7 +120,12 @@ class FusedStep:
         if scene.reference_curve is not None and scene.output_curve is not None:
             self._curves = torch.cat([scene.reference_curve, scene.output_curve])
         self._measurement = self._measure()
-        self._box_table = box_table(scene.box, device)
+        self._planes = ranks.mine(scene.box.shape[0])
+        # With the planes beside them, which their differences need.
+        self._slab = slice(max(self._planes.start - 1, 0), min(self._planes.stop + 1, scene.box.shape[0]))
+        depth = self._slab.stop - self._slab.start
+        self._box = scene.box.part((self._slab.start, 0, 0), (depth, *scene.box.shape[1:]))
+        self._box_table = box_table(self._box, device)
         self._not_smoothed = tuple(
             torch.zeros(shape, device=device) for shape in ((len(gaussians), 3),) * 2 + ((len(gaussians), 4),)
         ) + (torch.zeros((1, len(gaussians)), device=device),)
@@ -162,12 +183,13 @@ class FusedStep:
 
     def read(self) -> tuple[float, float, int]:
         """Means since the last call; see `Step`."""
-        fitted, held_out, weight = self._sums.tolist()
-        skipped, steps = int(self._skipped), self._unread
+        sums = (*self._sums.tolist(), int(self._skipped))
+        fitted, held_out, weight, skipped = self.ranks.total(*sums)
+        steps = self._unread
         self._sums.zero_()
         self._skipped.zero_()
         self._unread = 0
-        return fitted / steps, held_out_mean(held_out, weight, self.rays.typical_weight), skipped
+        return fitted / steps, held_out_mean(held_out, weight, self.rays.typical_weight), round(skipped)
 
     def _next(self, views: np.ndarray, share: float) -> np.ndarray:
         """What the control tensor must hold for the next step."""
@@ -177,13 +199,23 @@ class FusedStep:
         rate = self.settings.final_rate**share / (1 - FIRST_DECAY**self.done)
         root = math.sqrt(1 - SECOND_DECAY**self.done)
         head = [rate, root, float(share >= self.settings.material_from), turns]
-        slots = self.feed.place(views)
+        slots = np.zeros(len(views), int)
+        slots[self._mine] = self.feed.place(views[self._mine])
         return np.concatenate([head, views, slots, self._table[views].ravel()])
 
     def _enqueue(self, smooth: float) -> None:
         """All kernels of a step that smooths with this weight; what else they read of it is in the control tensor."""
-        gaussians, batch = self.gaussians, sum(len(views) for views in self._portions)
-        head, chosen, table = self._control.split([_HEAD, batch * _CHOSEN, batch * _VIEW])
+        made = self._gradients(smooth)
+        self._add_up(made)
+        self._update(made)
+
+    def _parts_of_control(self) -> tuple[torch.Tensor, ...]:
+        return self._control.split([_HEAD, self._batch * _CHOSEN, self._batch * _VIEW])
+
+    def _gradients(self, smooth: float) -> Gradients:
+        """Those of this rank's part."""
+        gaussians = self.gaussians
+        _, chosen, table = self._parts_of_control()
         scale, weight, output = activate(
             gaussians.log_scale,
             gaussians.attenuation,
@@ -193,17 +225,34 @@ class FusedStep:
             self._curves,
         )
         drawn = (gaussians.position, scale, gaussians.rotation)
-        of_volume = self._volume_gradients(*drawn, output, smooth) if smooth else self._not_smoothed
-        of_rays = self._of_rays((*drawn, weight), table.view(batch, _VIEW), chosen.view(_CHOSEN, batch))
-        if smooth:
+        smoothed = smooth and self._planes.start < self._planes.stop
+        of_volume = self._volume_gradients(*drawn, output, smooth) if smoothed else self._not_smoothed
+        if smooth and not smoothed:  # to which the other ranks' are added
+            of_volume = tuple(tensor.clone() for tensor in of_volume)
+        of_rays = self._of_rays(
+            (*drawn, weight), table.view(self._batch, _VIEW), chosen.view(_CHOSEN, self._batch)
+        )
+        if smoothed:
             self._join()
+        return Gradients(scale, of_rays, of_volume)
+
+    def _add_up(self, made: Gradients) -> None:
+        """Make the gradients those of all ranks."""
+        if self.ranks.count > 1:
+            smoothed = made.of_volume is not self._not_smoothed
+            self.ranks.sum_(*made.of_rays, *(made.of_volume if smoothed else ()))
+            if self.scene.blurring:
+                self.ranks.sum_(self._grad_blur)
+
+    def _update(self, made: Gradients) -> None:
+        gaussians, (head, _, _) = self.gaussians, self._parts_of_control()
         update(
             gaussians.parameters(),
             gaussians.group,
             self.moments,
-            (scale, self._curves),
-            of_rays,
-            of_volume,
+            (made.scale, self._curves),
+            made.of_rays,
+            made.of_volume,
             (self._grad_shared, self._grad_blur, self.pull, self._rates, head),
             self._bounds,
             self.scene.blurring,
@@ -211,8 +260,10 @@ class FusedStep:
 
     def _of_rays(self, drawn: _Drawn, table, chosen) -> tuple[torch.Tensor, ...]:
         """Gradients of the misfit by position, deviation, rotation and weights, a portion of the views at a time."""
+        if not self._portions:
+            return tuple(torch.zeros_like(tensor) for tensor in drawn)
         totals: tuple[torch.Tensor, ...] = ()
-        first = 0
+        first = self._mine.start
         for views in self._portions:
             of_portion = self._of_portion(drawn, table, chosen, views, first)
             for total, gradient in zip(totals, of_portion):
@@ -242,7 +293,7 @@ class FusedStep:
 
     def _volume_gradients(self, position, scale, rotation, output, smooth) -> tuple[torch.Tensor, ...]:
         """Gradients of the volume's total variation, likewise, times ``smooth``."""
-        drawn, box, table = (position, scale, rotation, output), self.scene.box, self._box_table
+        drawn, box, table = (position, scale, rotation, output), self._box, self._box_table
         record = ellipsoids(*drawn, table, VOXEL_CUTOFF)
         volume = box_forward.splat(record, 1, box, VOXEL_CUTOFF, self._largest[1])
         chosen = self.settings
@@ -253,6 +304,10 @@ class FusedStep:
             chosen.bone_level,
             smooth,
             self._largest[1],
+            self.scene.box.shape[0],
         )
+        # Each plane's slope is told by the rank that it belongs to.
+        slope[:, : self._planes.start - self._slab.start] = 0.0
+        slope[:, self._planes.stop - self._slab.start :] = 0.0
         moments = box_backward.sum_moments(record, slope, box, VOXEL_CUTOFF)
         return box_backward.pull_back(*drawn, table, moments)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import threading
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.fused_step import FusedStep
+from tomo_polysplat.fit.fused_step import FusedStep, Gradients
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.step import smoothing
 from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.ranks import ALONE, Ranks
 from tomo_polysplat.settings import Settings
 
 __all__ = ["GraphStep"]
@@ -35,6 +37,14 @@ def _give_back(device: torch.device) -> None:
         torch.cuda.empty_cache()
 
 
+class _Recorded(NamedTuple):
+    """A step, or its gradients and, where ranks add them up, the update from them."""
+
+    gradients: torch.cuda.CUDAGraph
+    made: Any = None
+    update: torch.cuda.CUDAGraph | None = None
+
+
 class GraphStep(FusedStep):
     """Replays of a recorded `FusedStep`, of one that smooths and of one that does not; see `fit.step.Step`.
 
@@ -48,7 +58,7 @@ class GraphStep(FusedStep):
         One of the same run, never replayed at the same time: both use the same memory for what a step makes on its way.
     """
 
-    # All that a fit is made of, and the run beside it.
+    # The parameters of `FusedStep`, and the run beside it.
     def __init__(
         self,
         gaussians: Gaussians,
@@ -57,9 +67,11 @@ class GraphStep(FusedStep):
         scene: FitScene,
         settings: Settings,
         batch: int,
+        ranks: Ranks = ALONE,
         beside: GraphStep | None = None,
     ) -> None:
-        super().__init__(gaussians, spacing, rays, scene, settings, batch)
+        super().__init__(gaussians, spacing, rays, scene, settings, batch, ranks)
+        self._recording = True
         self._side, self._forked = torch.cuda.Stream(gaussians.position.device), False
         with torch.cuda.device(gaussians.position.device):
             self._pool: Any = torch.cuda.graph_pool_handle() if beside is None else beside._pool
@@ -68,21 +80,25 @@ class GraphStep(FusedStep):
         ]
         self._passed = [torch.cuda.Event() for _ in range(_AHEAD)]
         self._graphs = self._record(batch)
+        self._recording = False
 
     def __call__(self, views: np.ndarray, share: float) -> None:
         """One step; see `Step`."""
         turn = self.done % _AHEAD
         self._passed[turn].synchronize()
-        graph = self._graphs[smoothing(self.settings, self.scene, self.done)]
+        graphs = self._graphs[smoothing(self.settings, self.scene, self.done)]
         values = self._next(views, share)
         self._waiting[turn].numpy()[:] = values
         self._control.copy_(self._waiting[turn], non_blocking=True)
-        graph.replay()
+        graphs.gradients.replay()
+        if graphs.update is not None:
+            self._add_up(graphs.made)
+            graphs.update.replay()
         # On another GPU than the current one, the usual stream would say nothing about this one's work.
         self._passed[turn].record(torch.cuda.current_stream(self._control.device))
         self.feed.used()
 
-    def _record(self, batch: int) -> dict[float, torch.cuda.CUDAGraph]:
+    def _record(self, batch: int) -> dict[float, _Recorded]:
         """Graphs by the weight they smooth with, after a trial run that compiles the kernels and leaves no trace."""
         before, device = self.gaussians.copy(), self.gaussians.position.device
         weights = {smoothing(self.settings, self.scene, step) for step in range(self.scene.tv_every)}
@@ -99,18 +115,36 @@ class GraphStep(FusedStep):
             stream = torch.cuda.Stream(device)
             return {smooth: self._recorded(smooth, stream) for smooth in weights}
 
-    def _recorded(self, smooth: float, stream: torch.cuda.Stream) -> torch.cuda.CUDAGraph:
-        """A step as a graph. ``torch.cuda.graph`` would give back all memory that is kept for later, and pinned memory
-        takes 20 ms to get again: more than the recording itself."""
+    def _add_up(self, made: Gradients) -> None:
+        # Ranks record at their own pace, and what they add up is no part of a graph.
+        if not self._recording:
+            super()._add_up(made)
+
+    def _recorded(self, smooth: float, stream: torch.cuda.Stream) -> _Recorded:
+        """A step as one graph, or as two between which ranks add up their gradients."""
+        if self.ranks.count == 1:
+            return _Recorded(self._captured(lambda: self._enqueue(smooth), stream)[0])
+        first, made = self._captured(lambda: self._gradients(smooth), stream)
+        second, _ = self._captured(lambda: self._update(made), stream)
+        return _Recorded(first, made, second)
+
+    def _captured(
+        self, make: Callable[[], Any], stream: torch.cuda.Stream
+    ) -> tuple[torch.cuda.CUDAGraph, Any]:
+        """A graph of what ``make`` enqueues, and what that returns.
+
+        ``torch.cuda.graph`` would give back all memory that is kept for later, and pinned memory takes 20 ms to get
+        again: more than the recording itself.
+        """
         graph = torch.cuda.CUDAGraph()
         with _recording, torch.cuda.stream(stream):
             torch.cuda.synchronize()
             graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
             try:
-                self._enqueue(smooth)
+                made = make()
             finally:
                 graph.capture_end()
-        return graph
+        return graph, made
 
     def _forget(self, before: Gaussians) -> None:
         for name, tensor in self.gaussians.parameters().items():
@@ -119,9 +153,9 @@ class GraphStep(FusedStep):
             tensor.zero_()
         self.done = self._unread = 0
 
-    def _enqueue(self, smooth: float) -> None:
+    def _gradients(self, smooth: float) -> Gradients:
         try:
-            super()._enqueue(smooth)
+            return super()._gradients(smooth)
         except BaseException:
             # A recording ends with an error of its own, which would hide this one, where its streams stay apart.
             if self._forked:

@@ -10,7 +10,7 @@ from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 
-__all__ = ["misfit", "roughness", "total_variation", "weighted_huber", "weighted_l1"]
+__all__ = ["misfit", "part_of_variation", "roughness", "total_variation", "weighted_huber", "weighted_l1"]
 
 
 def misfit(
@@ -40,10 +40,15 @@ def weighted_huber(
     return value.sum() / weight.sum().clamp(min=1e-12)
 
 
-def roughness(gaussians: Gaussians, scene: FitScene, settings: Settings) -> torch.Tensor:
-    """Total variation of the volume."""
+def roughness(
+    gaussians: Gaussians, scene: FitScene, settings: Settings, planes: slice | None = None
+) -> torch.Tensor:
+    """Total variation of the volume, or the part of it that some planes of z hold: all parts add up to it."""
+    # All of it in any case: in a box of these planes voxels come out with other roundings, and where neighbours are as
+    # good as equal these tell the sign of the slope.
     volume = scene.attenuation(gaussians, scene.box)
-    return total_variation(volume, settings.tv_clip, scene.tv_corners, settings.bone_level)
+    chosen = settings.tv_clip, scene.tv_corners, settings.bone_level
+    return total_variation(volume, *chosen) if planes is None else part_of_variation(volume, planes, *chosen)
 
 
 def total_variation(
@@ -73,13 +78,34 @@ def total_variation(
     total = volume.new_zeros(())
     for axis in range(volume.ndim):
         if volume.shape[axis] > 1:
-            height = clipped.diff(dim=axis).abs()
-            if any(corners):
-                length = volume.shape[axis] - 1
-                either = (
-                    torch.maximum(clipped.narrow(axis, 0, length), clipped.narrow(axis, 1, length)) > dense
-                )
-                corner = torch.where(either, volume.new_tensor(corners[1]), volume.new_tensor(corners[0]))
-                height = corner * torch.log1p(height / corner)
-            total = total + height.mean()
+            total = total + _heights(clipped, axis, corners, dense).mean()
     return total
+
+
+def part_of_variation(
+    volume: torch.Tensor,
+    planes: slice,
+    ceiling: float,
+    corners: tuple[float, float] = (0.0, 0.0),
+    dense: float = math.inf,
+) -> torch.Tensor:
+    """What some planes (nz) add to the `total_variation` of a volume, with the step to the plane behind them."""
+    clipped = volume.clamp(max=ceiling)[planes.start : planes.stop + 1]
+    depth = planes.stop - planes.start
+    total = volume.new_zeros(())
+    for axis, length in enumerate(volume.shape):
+        if length > 1 and depth:
+            heights = _heights(clipped, axis, corners, dense)[:depth]
+            total = total + heights.sum() / (volume.numel() // length * (length - 1))
+    return total
+
+
+def _heights(clipped: torch.Tensor, axis: int, corners: tuple[float, float], dense: float) -> torch.Tensor:
+    """What each difference of neighbours along an axis counts."""
+    height = clipped.diff(dim=axis).abs()
+    if not any(corners):
+        return height
+    length = clipped.shape[axis] - 1
+    either = torch.maximum(clipped.narrow(axis, 0, length), clipped.narrow(axis, 1, length)) > dense
+    corner = torch.where(either, clipped.new_tensor(corners[1]), clipped.new_tensor(corners[0]))
+    return corner * torch.log1p(height / corner)

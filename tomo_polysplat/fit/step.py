@@ -17,6 +17,7 @@ from tomo_polysplat.fit.similarity import dissimilarity
 from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.detector_blur import LARGEST_BLUR
+from tomo_polysplat.ranks import ALONE, Ranks
 from tomo_polysplat.settings import Settings
 
 __all__ = [
@@ -107,12 +108,22 @@ def held_out_mean(total: float, weight: float, typical: float) -> float:
 
 
 class EagerStep:
-    """The step as torch runs it, operation by operation; see `Step`."""
+    """The step as torch runs it, operation by operation; see `Step`.
+
+    Of several ``ranks`` each takes its part of the views and of the volume; they add up their gradients.
+    """
 
     def __init__(
-        self, gaussians: Gaussians, spacing: float, rays: Rays, scene: FitScene, settings: Settings
+        self,
+        gaussians: Gaussians,
+        spacing: float,
+        rays: Rays,
+        scene: FitScene,
+        settings: Settings,
+        ranks: Ranks = ALONE,
     ) -> None:
         self.gaussians, self.rays, self.scene, self.settings = gaussians, rays, scene, settings
+        self.ranks = ranks
         self.bounds = log_scale_bounds(scene, spacing, gaussians.planar, settings)
         self.pull = torch.zeros_like(gaussians.attenuation)
         self.rates = step_rates(settings, spacing)
@@ -136,14 +147,23 @@ class EagerStep:
         """One step; see `Step`."""
         rates = {name: rate * self.settings.final_rate**share for name, rate in self.rates.items()}
         rates["rotation"] *= turning(self._done)
-        chosen, measured, weight, aside = self.rays.batch(views)
-        predicted, skipped = self._predict(views, chosen)
+        # One of more ranks than views looks at a view that does not count.
+        mine = views[self.ranks.mine(len(views))]
+        some = mine if len(mine) else views[:1]
+        chosen, measured, weight, aside = self.rays.batch(some)
+        predicted, skipped = self._predict(some, chosen)
+        if not len(mine):
+            weight, aside, skipped = 0 * weight, 0 * aside, 0 * skipped
         fitted = misfit(predicted, measured, weight, self.settings)
+        if self.ranks.count > 1:
+            # A mean over the rays of all ranks.
+            fitted = fitted * weight.sum() / self.rays.totals[views].sum().clamp(min=1e-12)
         loss = fitted + self._regularisation(predicted, measured, weight)
         self.adam.forget_gradients()
         # On this thread: autograd's own would be woken and waited for at every step.
         with torch.autograd.set_multithreading_enabled(False):
             loss.backward()
+        self._add_up()
         self._hold_materials(share)
         if (moved := self.gaussians.position.grad) is not None:
             self.pull += moved.norm(dim=1)
@@ -154,6 +174,17 @@ class EagerStep:
             weight = aside.sum()
             held_out = misfit(predicted, measured, aside, self.settings) * weight
             self._sums.append((fitted.detach(), held_out, weight, skipped))
+
+    def _add_up(self) -> None:
+        """Make the gradients those of all ranks."""
+        if self.ranks.count == 1:
+            return
+        gradients = []
+        for tensor in self.gaussians.parameters().values():
+            # Without views of its own a rank has none, to which those of others are added.
+            tensor.grad = torch.zeros_like(tensor) if tensor.grad is None else tensor.grad
+            gradients.append(tensor.grad)
+        self.ranks.sum_(*gradients)
 
     def _predict(self, views: np.ndarray, chosen: DetectorViews) -> tuple[torch.Tensor, int]:
         """What the ``views`` of these numbers, which are ``chosen``, would measure, and the pairs skipped."""
@@ -173,7 +204,8 @@ class EagerStep:
 
     def read(self) -> tuple[float, float, int]:
         """Means since the last call; see `Step`."""
-        fitted, held_out, weight, skipped = (float(sum(values)) for values in zip(*self._sums))
+        sums = (float(sum(values)) for values in zip(*self._sums))
+        fitted, held_out, weight, skipped = self.ranks.total(*sums)
         steps, self._sums = len(self._sums), []
         return fitted / steps, held_out_mean(held_out, weight, self.rays.typical_weight), round(skipped)
 
@@ -184,7 +216,9 @@ class EagerStep:
         settings = self.settings
         total: torch.Tensor | float = 0.0
         if weight_now := smoothing(settings, self.scene, self._done):
-            total = total + weight_now * roughness(self.gaussians, self.scene, settings)
+            planes = self.ranks.mine(self.scene.box.shape[0]) if self.ranks.count > 1 else None
+            if planes is None or planes.start < planes.stop:
+                total = total + weight_now * roughness(self.gaussians, self.scene, settings, planes)
         if settings.ssim_weight:
             total = total + settings.ssim_weight * dissimilarity(predicted, measured, weight)
         return total

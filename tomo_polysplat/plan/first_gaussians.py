@@ -15,6 +15,7 @@ from tomo_polysplat.model.seed import Spacing, seed_gaussians
 from tomo_polysplat.plan.costs import work
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.resolution import finest_spacing, most_seeds
+from tomo_polysplat.ranks import current_ranks
 from tomo_polysplat.settings import Settings
 
 __all__ = ["AVERAGED_RAYS", "first_gaussians", "room_to_grow"]
@@ -69,9 +70,11 @@ def first_gaussians(
     memory = require_room(
         device,
         gaussians=math.ceil(_runs(plan) * max(settings.growth or 1.0, 1.0) * len(gaussians)),
-        **_all_else(plan, problem),
+        **_all_else(plan, problem, device),
         projections=values.nbytes if values.device.type == device.type else 0,
     )
+    if (ranks := current_ranks().count) > 1:
+        memory = f"on each of {ranks} devices {memory}"
     return gaussians, {
         "gaussians": (len(gaussians), kinds),
         "work": ("", work(plan, problem, settings, len(gaussians))),
@@ -89,7 +92,7 @@ def room_to_grow(gaussians: int, plan: Plan, problem: Problem, device: torch.dev
     problem : Problem
     device : torch.device
     """
-    room = room_for_gaussians(device, **_all_else(plan, problem)) / _runs(plan)
+    room = room_for_gaussians(device, **_all_else(plan, problem, device)) / _runs(plan)
     if device.type != "cpu":
         room = min(room, most_gaussians(device), _OF_SEEDS * most_seeds(problem))
     return room / max(gaussians, 1)
@@ -104,11 +107,15 @@ def _runs(plan: Plan) -> int:
     return 1 if plan.pixel_rays and plan.fat is not None else 2
 
 
-def _all_else(plan: Plan, problem: Problem) -> dict[str, int]:
-    """What memory is needed for besides Gaussians, as `fit.memory` asks."""
+def _all_else(plan: Plan, problem: Problem, device: torch.device) -> dict[str, int]:
+    """What memory is needed for besides Gaussians, as `fit.memory` asks, on each of the ranks that share the steps."""
+    ranks, (planes, *slice_shape) = current_ranks().count, problem.grid.shape
+    if ranks > 1 and device.type == "cuda":
+        # A slab each, with the planes beside it.
+        planes = min(-(-planes // ranks) + 2, planes)
     rays = _runs(plan) * plan.pixel_rays**2 if plan.pixel_rays else 1 + AVERAGED_RAYS**2
     return {
-        "views": plan.views_per_step,
+        "views": -(-plan.views_per_step // ranks),
         "pixels": rays * problem.geometry.rows * problem.geometry.columns,
-        "voxels": math.prod(problem.grid.shape),
+        "voxels": planes * math.prod(slice_shape),
     }

@@ -33,7 +33,8 @@ def _along(volume, at, value, index, length, stride, live, ceiling, dense, by_co
 
 @triton.jit(do_not_specialize=SIZES)
 def _variation_kernel(
-    volume, grad, largest, nz, ny, nx, ceiling, dense, by_corner, by_dense_corner, factor, BLOCK: tl.constexpr
+    volume, grad, largest, nz, ny, nx, count, ceiling, dense, by_corner, by_dense_corner, factor,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
     at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     size = tl.cast(nz, tl.int64) * ny * nx
@@ -43,13 +44,14 @@ def _variation_kernel(
     raw = tl.load(volume + at, mask=live, other=0.0)
     value = tl.minimum(raw, ceiling)
     tl.atomic_max(largest, tl.max(raw, 0), sem="relaxed")
-    # The mean over an axis has a term less a line than the volume has voxels.
+    # The mean over an axis has a term less a line than the volume has voxels; of a slab, the whole volume.
     along_x = _along(volume, at, value, x, nx, 1, live, ceiling, dense, by_corner, by_dense_corner)
     along_y = _along(volume, at, value, y, ny, nx, live, ceiling, dense, by_corner, by_dense_corner)
     along_z = _along(volume, at, value, z, nz, nx * ny, live, ceiling, dense, by_corner, by_dense_corner)
-    slope = along_x / tl.maximum(size - ny * nz, 1)
-    slope += along_y / tl.maximum(size - nx * nz, 1)
-    slope += along_z / tl.maximum(size - nx * ny, 1)
+    whole = tl.cast(count, tl.int64) * ny * nx
+    slope = along_x / tl.maximum(whole - ny * count, 1)
+    slope += along_y / tl.maximum(whole - nx * count, 1)
+    slope += along_z / tl.maximum(whole - nx * ny, 1)
     tl.store(grad + at, tl.where(raw <= ceiling, slope * factor, 0.0), mask=live)
 
 
@@ -60,16 +62,18 @@ def variation_gradient(
     dense: float,
     factor: float,
     largest: torch.Tensor,
+    planes: int,
 ) -> torch.Tensor:
     """``factor`` times the gradient of ``fit.loss.total_variation`` of a volume (1, nz, ny, nx), so shaped.
 
+    Of a slab it is that of the whole volume, of so many ``planes``, except in planes beside which the slab ends.
     ``largest``, a float32 tensor of one number, is raised to the largest value of the volume.
     """
     grad = torch.empty_like(volume)
     by_corners = [1 / corner if corner else 0.0 for corner in corners]
     with on_device(volume):
         _variation_kernel[(triton.cdiv(volume.numel(), _BLOCK),)](
-            volume, grad, largest, *volume.shape[1:], ceiling, dense, *by_corners, factor,
+            volume, grad, largest, *volume.shape[1:], planes, ceiling, dense, *by_corners, factor,
             BLOCK=_BLOCK, num_warps=4,
         )  # fmt: skip
     return grad

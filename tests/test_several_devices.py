@@ -1,0 +1,188 @@
+"""Fits shared out over processes: the same volume, also after one of them has died."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import astra
+import numpy as np
+import pytest
+import torch
+from small_scans import QUICK, cone, fan, reconstruct
+
+import tomo_polysplat as tps
+from tomo_polysplat.fit.fitter import Fitter
+from tomo_polysplat.fit.step import EagerStep
+from tomo_polysplat.rank_processes import devices_of, sharing
+from tomo_polysplat.ranks import ALONE, RankFailed, Ranks, current_ranks, led_by
+from tomo_polysplat.scan.io import save_scan
+
+CPU = torch.device("cpu")
+TWO = ["cpu", "cpu"]
+# Of the norm of a volume. What is added up in another order differs by rounding, which grows with every step.
+SAME = 1e-4
+
+
+def children():
+    """Processes that this one has started and that still run."""
+    named = f"/proc/{os.getpid()}/task/{os.getpid()}/children"
+    with open(named) as file:
+        return [int(pid) for pid in file.read().split()]
+
+
+def alone(*args, **options):
+    """A fit without the other processes, while they live."""
+    with led_by(ALONE):
+        return reconstruct(*args, **options)
+
+
+def parallel():
+    return tps.simulate_scan("pins", size=24, views=30, geometry="parallel", metal=False)
+
+
+def tilted():
+    """A cone whose detector is turned in its plane and leans out of it."""
+    scan = cone()
+    proj_geom = astra.geom_2vec(scan.proj_geom)
+    source, _, u, v = np.split(proj_geom["Vectors"].copy(), 4, axis=1)
+    lean = 0.1 * np.linalg.norm(v) / np.linalg.norm(source) * source
+    proj_geom["Vectors"][:, 6:] = np.concatenate([u + 0.05 * v, v - 0.05 * u + lean], axis=1)
+    return replace(scan, proj_geom=proj_geom)
+
+
+def relative(volume, reference):
+    """Difference over the reference, in L2."""
+    return float(np.linalg.norm(volume - reference) / np.linalg.norm(reference))
+
+
+@pytest.fixture(scope="class")
+def three():
+    """Three processes that share out what is fitted while they live; they are started once."""
+    with sharing([CPU] * 3):
+        yield current_ranks()
+
+
+class TestThreeProcesses:
+    """What they make is what one makes."""
+
+    @pytest.mark.parametrize("scan", [cone, tilted, parallel, fan])
+    def test_make_the_volume_of_one(self, scan, three):
+        shared, one = reconstruct(scan()), alone(scan())
+        assert three.count == 3 and shared.plan["ranks"].value == 3 and "ranks" not in one.plan
+        assert "returned" not in one.plan, "the start was better, so that nothing is compared"
+        assert relative(shared.volume, one.volume) < SAME
+        for entry, other in zip(shared.history, one.history, strict=True):
+            assert entry["loss"] == pytest.approx(other["loss"], rel=1e-4)
+            assert entry["held_out"] == pytest.approx(other["held_out"], rel=1e-4)
+
+    def test_may_be_more_than_the_views_of_a_step(self, three):
+        settings = QUICK | {"views_per_step": 2, "passes": 0.5}
+        shared, one = reconstruct(cone(), settings=settings), alone(cone(), settings=settings)
+        assert "returned" not in one.plan and relative(shared.volume, one.volume) < SAME
+
+    def test_all_see_rays_that_change_during_a_run(self, three, monkeypatch):
+        """As those of which gains or drift are taken out between two passes."""
+        end = Fitter._end_pass
+
+        def less(self, share):
+            told = end(self, share)
+            self.rays.projections.sub_(0.02)
+            self.rays.weigh_anew()
+            return told
+
+        settings = QUICK | {"passes": 1.4}
+        before = alone(cone(), settings=settings)
+        monkeypatch.setattr(Fitter, "_end_pass", less)
+        shared, one = reconstruct(cone(), settings=settings), alone(cone(), settings=settings)
+        assert relative(shared.volume, one.volume) < SAME < relative(shared.volume, before.volume)
+
+    def test_stand_still_after_ctrl_c_within_a_step(self, three, monkeypatch):
+        """The last thing that they do: the best state is returned, and nothing more is asked of them."""
+        step, made = EagerStep.__call__, []
+
+        def interrupted(self, *parts):
+            made.append(1)
+            if len(made) == 7:
+                raise KeyboardInterrupt
+            step(self, *parts)
+
+        monkeypatch.setattr(EagerStep, "__call__", interrupted)
+        result = reconstruct(cone())
+        assert result.plan["stop"].value == "interrupted" and len(result.history) == 1
+        assert np.isfinite(result.volume).all() and result.volume.any()
+        assert not three.usable
+        with pytest.raises(RankFailed, match="left in the middle of a step"):
+            reconstruct(cone())
+
+
+def test_a_process_that_dies_ends_the_run_and_its_checkpoint_goes_on_in_one(tmp_path):
+    path, killed = tmp_path / "fit.npz", []
+
+    def kill(state):
+        killed.append(time.monotonic())
+        os.kill(children()[0], signal.SIGKILL)
+
+    with pytest.raises(RankFailed, match=r"rank 1 of 2 \(cpu\) was ended by signal 9"):
+        reconstruct(cone(), devices=TWO, callbacks=[kill], checkpoint=path)
+    assert len(killed) == 1 and time.monotonic() - killed[0] < 30 and not children()
+    resumed, whole = reconstruct(cone(), resume=True, checkpoint=path), reconstruct(cone())
+    assert len(resumed.history) == len(whole.history) == 2
+    assert relative(resumed.volume, whole.volume) < SAME
+
+
+def test_what_a_process_fails_of_is_told():
+    with sharing([CPU] * 2):
+        ranks = current_ranks()
+        with pytest.raises(RankFailed, match=r"rank 1 of 2 \(cpu\) failed: KeyError: 77"), ranks.together():
+            ranks.tell("read", 77)
+            ranks.total(0.0)
+        with pytest.raises(RankFailed, match="KeyError: 77"), ranks.together():
+            pass
+    assert not children()
+
+
+def test_torchrun_reconstructs_by_the_command_line(tmp_path):
+    save_scan(fan(metal=False), tmp_path / "scan.npz")
+    about = [arg for name, value in QUICK.items() for arg in ("--set", f"{name}={value}")]
+    command = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--nproc-per-node=2",
+        "-m",
+        "tomo_polysplat",
+        "recon",
+    ]
+    command += ["scan.npz", "-o", "volume.npy", "--json", "about.json", *about, "--device", "cpu"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("wrote volume.npy") == 1 and '"ranks"' in (tmp_path / "about.json").read_text()
+    assert relative(np.load(tmp_path / "volume.npy"), reconstruct(fan(metal=False)).volume) < SAME
+
+
+@pytest.mark.parametrize("length", [0, 1, 2, 7, 12])
+def test_parts_of_ranks_are_all_and_differ_by_one_at_most(length):
+    for count in (1, 2, 3, 5):
+        parts = [list(range(length))[Ranks(rank, count).mine(length)] for rank in range(count)]
+        assert sum(parts, []) == list(range(length))
+        assert max(map(len, parts)) - min(map(len, parts)) <= 1
+
+
+def test_devices_by_name(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 3)
+    assert devices_of(None, "cpu") is None
+    assert devices_of("all", "auto") == ["cuda:0", "cuda:1", "cuda:2"]
+    assert devices_of("0,2", "auto") == devices_of([0, 2], "auto") == devices_of(["cuda:0", "cuda:2"], "auto")
+    assert devices_of(TWO, "auto") == TWO
+    for wrong, device in (
+        ([0, 0], "auto"),
+        (["cpu", 0], "auto"),
+        ([], "auto"),
+        (2, "auto"),
+        ([0, 1], "cuda:0"),
+    ):
+        with pytest.raises(ValueError, match="device"):
+            devices_of(wrong, device)

@@ -1,0 +1,152 @@
+"""A rank that follows: it makes its part of the steps that rank 0 tells it to make."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from typing import Any
+
+import torch
+import torch.distributed as dist
+
+from tomo_polysplat.fit.choose_step import own_step
+from tomo_polysplat.fit.led_step import fingerprint, state_of
+from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.step import Step
+from tomo_polysplat.kernels.device import one_torch_thread, pick_device, usual_modes
+from tomo_polysplat.kernels.views import DetectorViews
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.parallel import kept_threads
+from tomo_polysplat.rank_processes import here, rank_of_torchrun
+from tomo_polysplat.ranks import Ranks, join, join_here, leave
+
+__all__ = ["follow", "follow_torchrun"]
+
+
+class _Followed:
+    """A step as this rank makes it."""
+
+    def __init__(
+        self, number_of_rays: int, projections: torch.Tensor, parts: dict[str, Any], ranks: Ranks
+    ) -> None:
+        self.number_of_rays = number_of_rays
+        self.gaussians: Gaussians = parts["gaussians"]
+        streamed = ranks.device if projections.device.type != ranks.device.type else None
+        photons, model_error, held_out, dimmed = parts["rays"]
+        views = DetectorViews(*parts["views"])
+        self.rays = Rays(projections, views, photons, model_error, held_out, streamed, dimmed)
+        about = (parts["spacing"], self.rays, parts["scene"], parts["settings"], parts["batch"])
+        self.step: Step = own_step(self.gaussians, *about, ranks)
+
+    @torch.no_grad()
+    def restore(self, state: list[torch.Tensor], done: int, rates: Any) -> None:
+        """Go on from where rank 0 is."""
+        for own, told in zip(state_of(self.gaussians, self.step.moments), state):
+            own.copy_(told)
+        self.step.done = done
+        if rates is not None:
+            self.step.set_rates(rates)
+
+
+def follow(ranks: Ranks) -> None:
+    """Do what rank 0 tells, until it says that all is done."""
+    with usual_modes(), one_torch_thread(ranks.device), kept_threads():
+        _follow(ranks)
+
+
+def _follow(ranks: Ranks) -> None:
+    steps: dict[int, _Followed] = {}
+    lent: dict[int, torch.Tensor] = {}
+    while True:
+        gone, (what, *told) = ranks.hear()
+        for number in gone:
+            steps.pop(number, None)
+            lent.pop(number, None)
+        if what == "end":
+            return
+        number, *parts = told
+        if what == "rays":
+            _take(number, parts[0], lent, steps)
+        elif what == "make":
+            steps[number] = _Followed(parts[0], lent[parts[0]], parts[1], ranks)
+        elif what == "state":
+            steps[number].restore(*parts)
+        elif what == "step":
+            views, share, compared = parts
+            steps[number].step(views, share)
+            if compared:
+                ranks.same(fingerprint(steps[number].gaussians))
+        elif what == "read":
+            steps[number].step.read()
+
+
+def _take(
+    number: int, told: torch.Tensor, lent: dict[int, torch.Tensor], steps: dict[int, _Followed]
+) -> None:
+    """Measured rays, new ones or what has become of those that are here."""
+    if number not in lent:
+        lent[number] = told
+        return
+    lent[number].copy_(told)
+    for followed in steps.values():
+        if followed.number_of_rays == number:
+            followed.rays.weigh_anew()
+
+
+def follow_torchrun(device: str) -> None:
+    """Follow the first of torchrun's processes, as another one of them.
+
+    Raises
+    ------
+    RankFailed
+        Whatever this one fails of; that rank 0 has gone is no failure.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    ranks = rank_of_torchrun(device)
+    try:
+        _begin(ranks)
+        join(ranks)
+        follow(ranks)
+    except Exception as error:
+        if not ranks.left_alone():
+            raise ranks.fail(error) from error
+    finally:
+        leave()
+
+
+def main(folder: str, rank: str, count: str, device: str) -> int:
+    """A process that rank 0 has started, which it does not outlive."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    store = dist.FileStore(os.path.join(folder, "store"), int(count))
+    ranks = Ranks(int(rank), int(count), torch.device(device), store)
+    try:
+        _begin(ranks)
+        store.set(here(ranks.rank), "1")
+        join_here(ranks)
+        follow(ranks)
+    except BaseException as error:
+        # Rank 0 tells it; this process has nobody to tell.
+        ranks.fail(error)
+        os._exit(1)
+    finally:
+        leave()
+    return 0
+
+
+def _begin(ranks: Ranks) -> None:
+    if pick_device(ranks.device).type == "cuda":
+        torch.cuda.set_device(ranks.device)
+
+
+def _end_with_parent() -> None:
+    # The other end of this pipe closes when rank 0 is no more, however it ended.
+    while os.read(0, 1):
+        pass
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))
