@@ -8,7 +8,8 @@ import pytest
 import torch
 
 import tomo_polysplat as tps
-from tomo_polysplat.plan.alignment import _joined, moves_of
+from tomo_polysplat.plan.alignment import moves_of
+from tomo_polysplat.plan.coarse import joined_pixels
 from tomo_polysplat.scan.layout import vector_form
 
 QUICK = {"passes": 5.0, "pixel_rays": 1}
@@ -97,7 +98,7 @@ def test_an_interrupted_run_goes_on_by_the_scanner_that_was_found(tmp_path):
 @pytest.mark.parametrize(
     "wanted, budget, word",
     [
-        ("auto", 3.0, "time_budget"),
+        (True, 3.0, "time_budget"),
         ("sideways", None, "one of"),
         (3, None, "names"),
         (["u", "w"], None, "one of"),
@@ -111,7 +112,7 @@ def test_what_makes_no_sense_is_refused(wanted, budget, word):
 def test_joined_pixels_are_means_of_those_that_count():
     values = np.arange(2 * 3 * 5, dtype=np.float32).reshape(2, 3, 5)
     values[0, 0, 0] = np.nan
-    found = torch.from_numpy(_joined(values, 1, 2))
+    found = torch.from_numpy(joined_pixels(values, 1, 2))
     assert found.shape == (2, 3, 2) and found[0, 0, 0] == 1.0
     torch.testing.assert_close(found[1], torch.tensor([[15.5, 17.5], [20.5, 22.5], [25.5, 27.5]]))
-    assert _joined(values, 1, 1) is values
+    assert joined_pixels(values, 1, 1) is values

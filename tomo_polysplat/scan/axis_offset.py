@@ -24,6 +24,10 @@ _ELSEWHERE, _CLEARLY = 2.0, 2.0
 _LARGEST_MISMATCH = 0.25
 # Steps of Newton's method, in columns at most, and how small the last must be.
 _STEPS, _LONGEST, _SETTLED = 12, 0.5, 1e-3
+# What varies with the views is enough where it tells the place with this standard error.
+_WELL = 0.05
+# The slope is taken between places so far on either side, in columns.
+_APART = 0.25
 # Groups of lines and of columns, each left out once; fewer lines than these are cut by rows instead.
 _LINE_GROUPS, _COLUMN_GROUPS, _FEWEST_LINES, _FEWEST_GROUPS = 16, 12, 8, 4
 _FEWEST_VIEWS, _FEWEST_COLUMNS = 12, 12
@@ -83,10 +87,15 @@ def axis_offset(projections: np.ndarray, geometry: Geometry) -> AxisOffset:
             found, error = _refined(rays.joined(step), found / step, limit / step)
             found *= step
             if step == 1:
-                return AxisOffset(-found, error)
+                break
             step = (step + 1) // 2
     except ValueError as why:
         return AxisOffset(0.0, np.inf, str(why))
+    try:
+        varying, its_error = (np.inf, np.inf) if rays.seam else _refined(rays, found, limit, varying=True)
+    except ValueError:
+        its_error = np.inf
+    return AxisOffset(-varying, its_error) if its_error < _WELL else AxisOffset(-found, error)
 
 
 def _rays(projections: np.ndarray, geometry: Geometry) -> OppositeRays:
@@ -196,13 +205,19 @@ def _spread(rays: OppositeRays, most: int) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def _refined(rays: OppositeRays, place: float, limit: float) -> tuple[float, float]:
-    """The place near this one at which opposite rays agree best, and its standard error, in columns of the rays."""
+def _refined(rays: OppositeRays, place: float, limit: float, varying: bool = False) -> tuple[float, float]:
+    """The place near this one at which opposite rays agree best, and its standard error, in columns of the rays.
+
+    Only what is ``varying`` with the views may be compared, in which gains of pixels have no part.
+    """
     lines, columns = _spread(rays, _VIEWS)
     for _ in range(_STEPS):
         pairs, slope = rays.pairs(place, lines, columns), _slope(rays, place, lines, columns)
-        above = pairs.weight * slope * (pairs.opposite - pairs.own)
-        below = pairs.weight * slope**2
+        change = pairs.opposite - pairs.own
+        like = pairs.slope
+        if varying:
+            slope, change, like = (_varying(part, pairs.weight) for part in (slope, change, like))
+        above, below = pairs.weight * like * change, pairs.weight * like * slope
         if not below.sum() > 0:
             raise ValueError("opposite rays show no detail")
         step = -float(above.sum() / below.sum())
@@ -213,41 +228,45 @@ def _refined(rays: OppositeRays, place: float, limit: float) -> tuple[float, flo
         raise ValueError("no single place of the axis was found")
     if pairs.mismatch > _LARGEST_MISMATCH:
         raise ValueError("rays that should agree do not, wherever the axis is")
-    return place, _jackknife(above, below)
+    distance = np.abs(columns - rays.axis - place)
+    return place, _jackknife(above, below, distance, 1.0 if rays.seam else 2.0)
 
 
 def _slope(rays: OppositeRays, place: float, lines: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Change of what opposite rays differ by with the place of the axis, (lines, columns, rows)."""
-    own = columns[columns >= rays.axis + place]
-    # The same rays for both, whichever side of the axis a column next to it then is on.
-    ahead, behind = (rays.pairs(place + step, lines, own) for step in (0.25, -0.25))
-    shape = (ahead.own.shape[0], len(own), ahead.own.shape[2])
-    change = np.zeros(shape)
-    many = ahead.own.shape[1]
-    both = (ahead.weight > 0) & (behind.weight[:, len(own) - many :] > 0)
-    behind_own, behind_opposite = (part[:, -many:] for part in (behind.own, behind.opposite))
-    moved = (ahead.opposite - ahead.own) - (behind_opposite - behind_own)
-    change[:, len(own) - many :] = np.where(both, moved / 0.5, 0)
-    return change
+    ahead, behind = (rays.pairs(place + step, lines, columns) for step in (_APART, -_APART))
+    moved = (ahead.opposite - ahead.own) - (behind.opposite - behind.own)
+    return np.where((ahead.weight > 0) & (behind.weight > 0), moved / (2 * _APART), 0)
 
 
-def _jackknife(above: np.ndarray, below: np.ndarray) -> float:
-    """Standard error of the quotient of the sums of (lines, columns, rows)."""
+def _varying(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Values (lines, columns, rows) without their mean over lines, in which gains of pixels are."""
+    return values - (weight * values).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300)
+
+
+def _jackknife(above: np.ndarray, below: np.ndarray, distance: np.ndarray, times: float) -> float:
+    """Standard error of the quotient of the sums of (lines, columns, rows).
+
+    Each pair is there ``times`` times: in lines far apart, but in columns of the same ``distance`` from the axis.
+    """
     errors = []
-    some = np.flatnonzero(below.any(axis=(1, 2)))
-    axis, some = (0, some) if len(some) >= _FEWEST_LINES else (2, np.flatnonzero(below.any(axis=(0, 1))))
-    for along, used, most in (
-        (axis, some, _LINE_GROUPS),
-        (1, np.flatnonzero(below.any(axis=(0, 2))), _COLUMN_GROUPS),
+    lines, rows = (np.flatnonzero(below.any(axis=axes)) for axes in ((1, 2), (0, 1)))
+    columns = np.argsort(distance, kind="stable")
+    columns = columns[below.any(axis=(0, 2))[columns]]
+    many = len(lines) >= _FEWEST_LINES
+    for along, used, most, count in (
+        (0 if many else 2, lines if many else rows, _LINE_GROUPS, times if many else 1.0),
+        (1, columns, _COLUMN_GROUPS, 1.0),
     ):
         groups = np.array_split(used, min(most, len(used)))
         if len(groups) < _FEWEST_GROUPS:
             continue
-        parts = [[values.take(group, along).sum() for group in groups] for values in (above, below)]
-        one, two = (np.asarray(part) for part in parts)
+        one, two = (
+            np.array([values.take(group, along).sum() for group in groups]) for values in (above, below)
+        )
         rest = two.sum() - two
         if not (rest > 0).all():
             return np.inf
         without = (one.sum() - one) / rest
-        errors.append(float(np.sqrt((len(groups) - 1) * without.var())))
+        errors.append(float(np.sqrt(count * (len(groups) - 1) * without.var())))
     return max(errors, default=np.inf)

@@ -20,6 +20,8 @@ _GAP = 2.5
 _EVEN = 0.05
 # Columns that the values are smoothed over, so that what lies between columns is as sharp as they are.
 _SMOOTH = 1.0
+# A ray counts where this share of those that it is smoothed with was measured.
+_WHOLE = 0.98
 # The 99th percentile of the values that tell how much light a ray has; of larger ones the unit is not known.
 _DARK = 6.0
 
@@ -32,12 +34,15 @@ class RaysAndOpposites:
     ----------
     own, opposite : (lines, columns, rows)
         0 where there is no pair.
+    slope : (lines, columns, rows)
+        Change of ``opposite - own`` with the place of the axis, told by the own rays alone.
     weight : (lines, columns, rows)
         Inverse of the noise's variance, up to a factor; 0 where there is no pair.
     """
 
     own: np.ndarray
     opposite: np.ndarray
+    slope: np.ndarray
     weight: np.ndarray
 
     @property
@@ -88,7 +93,7 @@ class OppositeRays:
         return OppositeRays(np.where(count, mean, np.nan), self.azimuth, axis, self.slope * factor)
 
     def pairs(self, offset: float, lines: np.ndarray, columns: np.ndarray) -> RaysAndOpposites:
-        """Rays and their opposites if the axis is so many columns above the told one; each pair once.
+        """Rays and their opposites if the axis is so many columns above the told one.
 
         Parameters
         ----------
@@ -97,18 +102,18 @@ class OppositeRays:
             Views, or, at the seam of half a turn, all that there are.
         columns : (m,) int
         """
-        columns = columns[columns >= self.axis + offset]
-        own, opposite, use = (
+        own, slope, opposite, use = (
             self._at_seam(offset, columns) if self.seam else self._around(offset, lines, columns)
         )
         light = [np.exp(self._dark * np.clip(side, 0, _DARK / self._dark)) for side in (own, opposite)]
         weight = np.where(use, 2 / (light[0] + light[1]), 0)
-        return RaysAndOpposites(np.where(use, own, 0), np.where(use, opposite, 0), weight)
+        kept = (np.where(use, part, 0) for part in (own, opposite, slope))
+        return RaysAndOpposites(*kept, weight)
 
     def _around(
         self, offset: float, lines: np.ndarray, columns: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rays of these views, their opposites between two views, and whether there are both."""
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Rays of these views, slopes, their opposites between two views, and whether there are both."""
         many = len(self.azimuth)
         fan = np.arctan(self.slope * (columns - self.axis - offset))
         begin = self.azimuth[0]
@@ -120,10 +125,12 @@ class OppositeRays:
         usable = (gap > 0) & (gap <= _GAP * self._step)
         (a, use_a), (b, use_b) = (self._mirrored(offset, view, columns) for view in (first, second))
         opposite = (1 - share[..., None]) * a + share[..., None] * b
-        own = self._smooth[lines][:, columns]
-        return own, opposite, use_a & use_b & usable[..., None] & self._good[lines][:, columns]
+        own, steep = (part[lines][:, columns] for part in (self._smooth, self._steep))
+        return own, -2 * steep, opposite, use_a & use_b & usable[..., None] & self._good[lines][:, columns]
 
-    def _at_seam(self, offset: float, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _at_seam(
+        self, offset: float, columns: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Of half a turn: the first and the last view, and what neighbours on both sides of the seam make of them.
 
         Beyond the seam lie the mirrored views of the other end. The views are taken for a cubic in the angle.
@@ -141,7 +148,9 @@ class OppositeRays:
             own.append(place[k][0])
             opposite.append(sum(w * part for w, (part, _) in zip((-1 / 6, 4 / 6, 4 / 6, -1 / 6), around)))
             use.append(np.logical_and.reduce([place[k][1], *(good for _, good in around)]))
-        return np.stack(own), np.stack(opposite), np.stack(use)
+        # Of the four neighbours half lie beyond the seam, or all but half, and with them the view itself.
+        slopes = [-np.gradient(own[0], columns, axis=0), np.gradient(own[1], columns, axis=0)]
+        return np.stack(own), np.stack(slopes), np.stack(opposite), np.stack(use)
 
     def _mirrored(
         self, offset: float, views: np.ndarray, columns: np.ndarray
@@ -163,19 +172,27 @@ class OppositeRays:
         return values, self._good[views, near] & inside[:, None]
 
     @cached_property
+    def _share(self) -> np.ndarray:
+        """How much of what is smoothed together was measured."""
+        from scipy.ndimage import gaussian_filter1d
+
+        return gaussian_filter1d(np.isfinite(self.values).astype(np.float64), _SMOOTH, axis=1, mode="constant")
+
+    @cached_property
     def _good(self) -> np.ndarray:
-        return np.isfinite(self.values)
+        return self._share > _WHOLE
 
     @cached_property
     def _smooth(self) -> np.ndarray:
-        """The values a little smoothed along columns; bad rays are as the mean of the good ones around them."""
+        """The values a little smoothed along columns, where they were measured."""
         from scipy.ndimage import gaussian_filter1d
 
-        kept = gaussian_filter1d(np.where(self._good, self.values, 0), _SMOOTH, axis=1)
-        if self._good.all():
-            return kept
-        share = gaussian_filter1d(self._good.astype(np.float64), _SMOOTH, axis=1)
-        return np.where(share > 1e-3, kept / np.maximum(share, 1e-3), 0)
+        known = np.where(np.isfinite(self.values), self.values, 0)
+        return gaussian_filter1d(known, _SMOOTH, axis=1, mode="constant") / np.maximum(self._share, 1e-3)
+
+    @cached_property
+    def _steep(self) -> np.ndarray:
+        return np.gradient(self._smooth, axis=1)
 
     @cached_property
     def _spline(self) -> np.ndarray:
