@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -27,7 +27,7 @@ from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.nuisances.alignment import Alignment
 from tomo_polysplat.nuisances.alignment_search import levels, schedule, search
 from tomo_polysplat.plan.answer import Answer, Status
-from tomo_polysplat.plan.axis import axis_of
+from tomo_polysplat.plan.axis import axis_of, is_known
 from tomo_polysplat.plan.coarse import coarse_problem, coarse_settings, joined_pixels
 from tomo_polysplat.plan.first_gaussians import first_gaussians
 from tomo_polysplat.plan.first_volume import first_volume
@@ -67,9 +67,9 @@ def moves_of(wanted: Any, time_budget: float | None) -> str | list[str] | None:
     if not isinstance(names, Sequence):
         raise fail("align", "True, False, 'auto' or names of moves", repr(wanted), error=TypeError)
     for name in names:
-        require_choice("align", name, ("auto", *MOVES))
-    if "auto" in names:
-        raise fail("align", "'auto' alone", repr(wanted), "name the moves that are to be found")
+        if name == "auto":
+            raise fail("align", "'auto' alone", repr(wanted), "name the moves that are to be found")
+        require_choice("align", name, tuple(MOVES))
     return list(names)
 
 
@@ -77,7 +77,7 @@ def align(
     problem: Problem,
     names: str | Sequence[str],
     means: Means,
-    start: Mapping[str, float],
+    axis: Answer | None,
     report: Callable[[float, str], Any],
 ) -> Answer:
     """What of the scanner's geometry has moved, as the rays tell it.
@@ -89,8 +89,8 @@ def align(
     names : "usual" or names of moves
         See `nuisances.alignment.Alignment`.
     means : Means
-    start : mapping of name to number
-        Moves to begin with, which are known to be there.
+    axis : Answer or None
+        Of `find_axis`, where that was asked: a move to begin with.
     report : callable
         Gets the share done, none, and words.
 
@@ -99,17 +99,23 @@ def align(
     Answer
         Its value is a dict of moves by name, empty where none was confirmed, as `aligned` takes it.
     """
+    start = {} if axis is None else axis.value
     alignment = Alignment(problem.geometry, 1.0, names=names, pivot=axis_of(problem), start=start)
     trials = _Levels(problem, alignment, means, report)
     factors = levels(problem.geometry.columns)
-    record = search(alignment, trials.fit, factors)
+    # Where the axis is known, the coarsest detector has nothing to find that the next does not.
+    skipped = int(axis is not None and is_known(axis) and len(factors) > 1)
+    factors = factors[skipped:]
+    record = search(alignment, lambda level, *asked: trials.fit(skipped + level, *asked), factors)
     confirmed = tuple(record["confirmed"])
     if confirmed and factors[-1] > 1:
         alignment.forget()
-        trials.fit(len(factors), 1, confirmed)
+        trials.fit(skipped + len(factors), 1, confirmed)
     moves = {name: value.tolist() for name, value in alignment.values.items() if bool(value.any())}
     last = record["levels"][-1]
     evidence = {name: float(value) for name, value in last.items() if isinstance(value, float)}
+    if axis is not None:
+        evidence |= {name: axis.evidence[name] for name in ("offset", "error") if name in axis.evidence}
     words = alignment.describe() if moves else "the rays confirm no move"
     logger.info("Alignment: %s", words)
     return Answer(moves, words, Status.ASKED, evidence)

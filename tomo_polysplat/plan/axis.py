@@ -17,7 +17,7 @@ from tomo_polysplat.plan.short_fit import short_fit
 from tomo_polysplat.scan.axis_offset import AxisOffset, axis_offset
 from tomo_polysplat.scan.moves import Scanner, moved_geometry
 
-__all__ = ["aligned", "find_axis"]
+__all__ = ["aligned", "axis_of", "find_axis", "is_known"]
 
 logger = logging.getLogger(__name__)
 
@@ -66,6 +66,12 @@ def find_axis(problem: Problem, means: Means, report: Callable[[float, str], Any
     else:
         logger.info("Alignment: %s", words)
     return Answer(moves, words, Status.ASKED, evidence)
+
+
+def is_known(answer: Answer) -> bool:
+    """Whether an answer of `find_axis` says where the axis is, moved or as told."""
+    evidence = answer.evidence
+    return "error" in evidence and evidence["error"] <= _KNOWN and (bool(answer.value) or "moved" not in evidence)
 
 
 def aligned(problem: Problem, moves: dict[str, Any]) -> Problem:

@@ -127,9 +127,8 @@ class Solver:
             found = find_axis(problem, options, self.report)
         else:
             # Names are asked for as they stand: who leaves out "u" does not want the axis moved.
-            usual = self.moved == "usual"
-            start = find_axis(problem, options, self.report).value if usual else {}
-            found = align(problem, self.moved, options, start, self.report)
+            axis = find_axis(problem, options, self.report) if self.moved == "usual" else None
+            found = align(problem, self.moved, options, axis, self.report)
         return aligned(problem, found.value), {"alignment": found}
 
     def _anew(
