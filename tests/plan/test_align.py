@@ -70,7 +70,9 @@ def test_what_no_ray_confirms_is_not_moved(align):
     assert ("no move" if align != "auto" else "where it was told") in asked.plan["alignment"].why
     assert np.array_equal(asked.volume, plain.volume)
     np.testing.assert_array_equal(asked.geometry["Vectors"], plain.geometry["Vectors"])
-    others = [{k: v for k, v in r.plan.items() if k not in ("alignment", "compiling")} for r in (asked, plain)]
+    others = [
+        {k: v for k, v in r.plan.items() if k not in ("alignment", "compiling")} for r in (asked, plain)
+    ]
     assert others[0] == others[1]
 
 

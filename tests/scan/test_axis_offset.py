@@ -25,7 +25,9 @@ KINDS = [
 @cache
 def measured(beam, arc, views, scene="teeth", photons=1e5):
     scan = tps.simulate_scan(scene, 28, views, geometry=beam, arc_degrees=arc, photons=photons)
-    return projections_from_astra(scan.projections, scan.proj_geom), from_astra(scan.proj_geom, scan.vol_geom)[0]
+    return projections_from_astra(scan.projections, scan.proj_geom), from_astra(
+        scan.proj_geom, scan.vol_geom
+    )[0]
 
 
 def beside(geometry, columns):
@@ -64,7 +66,9 @@ def test_an_axis_of_a_parallel_beam_need_not_run_through_the_origin():
 def test_gains_of_pixels_dead_rays_and_a_gap_are_no_shift():
     values, geometry = measured("fan", 360.0, 60)
     rng = np.random.default_rng(3)
-    gained = values + rng.normal(0, 0.03, (1, *values.shape[1:])) + 0.05 * np.linspace(-1, 1, geometry.columns)
+    gained = (
+        values + rng.normal(0, 0.03, (1, *values.shape[1:])) + 0.05 * np.linspace(-1, 1, geometry.columns)
+    )
     holes = np.where(rng.random(values.shape) < 0.01, np.nan, values)
     holes[..., 13:15] = np.nan
     for spoilt in (gained, holes):
@@ -89,7 +93,10 @@ def test_noise_makes_the_error_larger_and_no_shift():
         (lambda p, g: (np.zeros_like(p), g), "do not"),
         (lambda p, g: (np.random.default_rng(0).normal(size=p.shape), g), "do not"),
         (lambda p, g: (p[:8], g.select(slice(8))), "fewer than"),
-        (lambda p, g: (p, replace(g, origin=g.origin + np.linspace(0, 1, 60)[:, None] * [0, 0, 9])), "circle"),
+        (
+            lambda p, g: (p, replace(g, origin=g.origin + np.linspace(0, 1, 60)[:, None] * [0, 0, 9])),
+            "circle",
+        ),
     ],
 )
 def test_what_rays_do_not_tell_is_said(change, why):

@@ -61,7 +61,9 @@ def moves_of(wanted: Any, time_budget: float | None) -> str | list[str] | None:
     if isinstance(names, Sequence) and list(names) == ["auto"]:
         return "auto"
     if time_budget is not None:
-        raise fail("align", "'auto' or none beside a time_budget, which its fits would not keep", repr(wanted))
+        raise fail(
+            "align", "'auto' or none beside a time_budget, which its fits would not keep", repr(wanted)
+        )
     if wanted is True:
         return "usual"
     if not isinstance(names, Sequence):

@@ -1,4 +1,4 @@
-"""Where the axis of rotation was, asked by default: of opposite rays, and of two short fits where those say it is off."""
+"""Where the axis of rotation was, asked by default: of opposite rays, and of two short fits where they say it is off."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = ["aligned", "axis_of", "find_axis", "is_known"]
 logger = logging.getLogger(__name__)
 
 # An axis is moved that is off by more than this, in columns, beyond so many standard errors; by so many where a time
-# budget leaves no room for fits. 101 perfect scans of 13 kinds came to 3.3 at most (docs/alignment.md).
+# budget leaves no room for fits. 161 perfect scans of 10 kinds came to 3.3 at most (docs/alignment.md).
 _TOLERATED, _SURE, _SURE_ALONE = 0.03, 4.0, 8.0
 # An error below this is as good as none: it costs less than a tenth of a decibel.
 _KNOWN = 0.05
@@ -71,7 +71,11 @@ def find_axis(problem: Problem, means: Means, report: Callable[[float, str], Any
 def is_known(answer: Answer) -> bool:
     """Whether an answer of `find_axis` says where the axis is, moved or as told."""
     evidence = answer.evidence
-    return "error" in evidence and evidence["error"] <= _KNOWN and (bool(answer.value) or "moved" not in evidence)
+    return (
+        "error" in evidence
+        and evidence["error"] <= _KNOWN
+        and (bool(answer.value) or "moved" not in evidence)
+    )
 
 
 def aligned(problem: Problem, moves: dict[str, Any]) -> Problem:

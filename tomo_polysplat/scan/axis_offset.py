@@ -114,9 +114,7 @@ def _rays(projections: np.ndarray, geometry: Geometry) -> OppositeRays:
     last = int(np.argmax(np.diff(azimuth, append=azimuth[0] + 2 * np.pi)))
     order, azimuth = np.roll(order, -last - 1), np.roll(azimuth, -last - 1)
     azimuth = np.where(azimuth < azimuth[0], azimuth + 2 * np.pi, azimuth)
-    values = sum(
-        share * np.asarray(projections[:, some], np.float64).swapaxes(1, 2) for share, some in rows
-    )
+    values = sum(share * np.asarray(projections[:, some], np.float64).swapaxes(1, 2) for share, some in rows)
     return OppositeRays(np.where(np.isfinite(values), values, np.nan)[order], azimuth, axis, slope)
 
 
@@ -252,7 +250,7 @@ def _jackknife(above: np.ndarray, below: np.ndarray, distance: np.ndarray, times
     errors = []
     lines, rows = (np.flatnonzero(below.any(axis=axes)) for axes in ((1, 2), (0, 1)))
     columns = np.argsort(distance, kind="stable")
-    columns = columns[below.any(axis=(0, 2))[columns]]
+    columns = columns[np.asarray(below.any(axis=(0, 2)))[columns]]
     many = len(lines) >= _FEWEST_LINES
     for along, used, most, count in (
         (0 if many else 2, lines if many else rows, _LINE_GROUPS, times if many else 1.0),

@@ -107,8 +107,8 @@ class OppositeRays:
         )
         light = [np.exp(self._dark * np.clip(side, 0, _DARK / self._dark)) for side in (own, opposite)]
         weight = np.where(use, 2 / (light[0] + light[1]), 0)
-        kept = (np.where(use, part, 0) for part in (own, opposite, slope))
-        return RaysAndOpposites(*kept, weight)
+        own, opposite, slope = (np.where(use, part, 0) for part in (own, opposite, slope))
+        return RaysAndOpposites(own, opposite, slope, weight)
 
     def _around(
         self, offset: float, lines: np.ndarray, columns: np.ndarray
@@ -155,14 +155,19 @@ class OppositeRays:
     def _mirrored(
         self, offset: float, views: np.ndarray, columns: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Values (lines, columns, rows) of views (lines, columns) at the mirrored columns, and whether they are good."""
+        """Values (lines, columns, rows) of views (lines, columns) at mirrored columns, and whether they are good."""
         most = self.values.shape[1] - 1
         where = 2 * (self.axis + offset) - columns
         left = np.floor(where).astype(int)
         f = where - left
         inside = (where >= 0) & (where <= most)
         # The cubic B-spline of samples that are mirrored at the ends.
-        weights = (1 - f) ** 3 / 6, (4 - 6 * f**2 + 3 * f**3) / 6, (1 + 3 * f + 3 * f**2 - 3 * f**3) / 6, f**3 / 6
+        weights = (
+            (1 - f) ** 3 / 6,
+            (4 - 6 * f**2 + 3 * f**3) / 6,
+            (1 + 3 * f + 3 * f**2 - 3 * f**3) / 6,
+            f**3 / 6,
+        )
         values = np.zeros((*views.shape, self.values.shape[2]))
         for step, weight in zip((-1, 0, 1, 2), weights):
             column = np.abs(left + step)
@@ -176,7 +181,9 @@ class OppositeRays:
         """How much of what is smoothed together was measured."""
         from scipy.ndimage import gaussian_filter1d
 
-        return gaussian_filter1d(np.isfinite(self.values).astype(np.float64), _SMOOTH, axis=1, mode="constant")
+        return gaussian_filter1d(
+            np.isfinite(self.values).astype(np.float64), _SMOOTH, axis=1, mode="constant"
+        )
 
     @cached_property
     def _good(self) -> np.ndarray:
