@@ -28,7 +28,7 @@ def fitter_of(steps):
 
 
 def rates(fitter):
-    return {group["name"]: group["rate"] for group in fitter.step.optimiser.param_groups}
+    return fitter.step.rates
 
 
 def after_a_pass(steps, clock):

@@ -4,6 +4,8 @@ The kernels themselves are compared with autograd in tests/kernels, in Triton's 
 """
 
 import logging
+import os
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -177,3 +179,16 @@ def test_a_graph_that_cannot_be_recorded_is_said_and_replaced(monkeypatch, caplo
         assert torch.equal(tensor, before.parameters()[name]), name
     step(np.array([0, 1]), 0.0)
     assert np.isfinite(step.read()[0])
+
+
+def test_a_step_does_not_load_the_compiler_of_torch():
+    """It takes more than a second, in every process that fits."""
+    made = "from step_scenes import fit_problem; from tomo_polysplat.fit.step import EagerStep; import sys, numpy"
+    stepped = "EagerStep(*fit_problem('cone', True, 'cpu', 'numba'))(numpy.array([0]), 0.0)"
+    code = f"{made}; {stepped}; print('torch._dynamo' in sys.modules)"
+    folder = Path(__file__).parent.parent / "kernels"
+    paths = os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": paths}, capture_output=True, text=True
+    )
+    assert done.stdout.strip() == "False", done.stderr

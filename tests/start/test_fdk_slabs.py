@@ -84,6 +84,10 @@ def test_a_gpu_that_has_no_room_gets_smaller_slabs(monkeypatch):
     assert made[0] == 21 and max(made[1:]) <= 11, "less was tried"
 
 
+# Textures interpolate by weights of 8 bits, which the other coordinates of a slab round another way: 5e-5 on an H200.
+_TEXTURE = 2e-4
+
+
 @pytest.mark.gpu
 def test_astra_by_slabs_is_astra_in_one_piece():
     made = astra.create_proj_geom("cone", 2.2, 1.7, 53, 60, TURN, 200.0, 120.0)
@@ -102,7 +106,7 @@ def test_astra_by_slabs_is_astra_in_one_piece():
             return fdk_cuda_tensor(source[:, rows[0] : rows[1]].cuda(), cropped, slab, orbit, "hann")
 
         fdk_of_slabs(make, geometry, grid, 7, found)
-        assert float((found - whole).abs().max()) < 1e-5 * float(whole.abs().max())
+        assert float((found - whole).abs().max()) < _TEXTURE * float(whole.abs().max())
 
 
 @pytest.mark.gpu
@@ -119,4 +123,4 @@ def test_a_gpu_with_little_room_makes_slabs(monkeypatch):
     for room in (1e6, 3e6):
         monkeypatch.setattr(slabs, "free_bytes", lambda device, room=room: room)
         found = slabs.fdk_on_device(values, geometry, grid, orbit, "hann", cuda)
-        assert float((found.cpu() - whole.cpu()).abs().max()) < 1e-5 * float(whole.abs().max())
+        assert float((found.cpu() - whole.cpu()).abs().max()) < _TEXTURE * float(whole.abs().max())

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 
+import torch
+
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.step import EagerStep, Step
@@ -24,6 +26,7 @@ def why_eager(scene: FitScene, settings: Settings) -> str:
     return ""
 
 
+# All that a fit is made of, and the run beside it.
 def make_step(
     gaussians: Gaussians,
     spacing: float,
@@ -32,6 +35,7 @@ def make_step(
     settings: Settings,
     *,
     batch: int,
+    beside: Step | None = None,
 ) -> Step:
     """A CUDA graph where there can be one, else operation by operation.
 
@@ -39,13 +43,23 @@ def make_step(
     ----------
     batch : int
         Views of a step.
+    beside : Step, optional
+        Another one of the same run, never made at the same time.
+
+    Raises
+    ------
+    torch.OutOfMemoryError
+        Where a GPU has no room for the graph: operation by operation would need more.
     """
     reason = why_eager(scene, settings)
     if not reason:
         from tomo_polysplat.fit.graph_step import GraphStep
 
         try:
-            return GraphStep(gaussians, spacing, rays, scene, settings, batch)
+            shared = beside if isinstance(beside, GraphStep) else None
+            return GraphStep(gaussians, spacing, rays, scene, settings, batch, shared)
+        except torch.OutOfMemoryError:
+            raise
         # Of compiler or driver, of any kind: the slower way gives the same result.
         except Exception as problem:
             logger.debug("no CUDA graph", exc_info=True)

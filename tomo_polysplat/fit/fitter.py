@@ -20,7 +20,7 @@ from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.snapshot import Snapshot
 from tomo_polysplat.fit.soft_matter import flatten
-from tomo_polysplat.fit.step import step_rates
+from tomo_polysplat.fit.step import Step, step_rates
 from tomo_polysplat.fit.stopping import Clock
 from tomo_polysplat.kernels.compile_time import working_time
 from tomo_polysplat.kernels.spatial_order import spatial_order
@@ -59,8 +59,11 @@ class Fitter:
     scene : FitScene
     settings : Settings
     batches : Batches
+    beside : Fitter, optional
+        Another run on the same rays that never steps at the same time: both use the same memory on the way.
     """
 
+    # All that a fit is made of, and the run beside it.
     def __init__(
         self,
         gaussians: Gaussians,
@@ -69,10 +72,12 @@ class Fitter:
         scene: FitScene,
         settings: Settings,
         batches: Batches,
+        beside: Fitter | None = None,
     ) -> None:
         batch, steps, self.rng = batches
         self.gaussians, self.rays, self.scene, self.settings = gaussians, rays, scene, settings
-        self.step = make_step(gaussians, spacing, rays, scene, hurried(settings, steps), batch=batch)
+        hurry, shared = hurried(settings, steps), None if beside is None else beside.step
+        self.step: Step = make_step(gaussians, spacing, rays, scene, hurry, batch=batch, beside=shared)
         self.spacing, self.batch, self.order = spacing, batch, np.empty(0, int)
         self.steps = steps
         self.steps_of_a_pass = max(1, round(views_of_a_pass(rays) / batch))
@@ -123,7 +128,7 @@ class Fitter:
         """The same run from here on, with changes to its scene by name, on Gaussians of its own."""
         scene, rng = replace(self.scene, **changes), copy.deepcopy(self.rng)
         gaussians, batches = self.gaussians.copy(), Batches(self.batch, self.steps, rng)
-        other = Fitter(gaussians, self.spacing, self.rays, scene, self.settings, batches)
+        other = Fitter(gaussians, self.spacing, self.rays, scene, self.settings, batches, beside=self)
         other.restore(self.snapshot(None, {}))
         return other
 

@@ -12,14 +12,13 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 
+from tomo_polysplat.fit.adam import EPSILON, new_moments
 from tomo_polysplat.fit.feed import feed
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.step import (
-    EPSILON,
     held_out_mean,
     log_scale_bounds,
-    new_moments,
     smoothing,
     step_rates,
     turning,

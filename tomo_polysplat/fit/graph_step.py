@@ -39,8 +39,16 @@ class GraphStep(FusedStep):
     """Replays of a recorded `FusedStep`, of one that smooths and of one that does not; see `fit.step.Step`.
 
     Where it cannot be recorded the error leaves the Gaussians as they were.
+
+    Parameters
+    ----------
+    gaussians, spacing, rays, scene, settings, batch
+        As for `FusedStep`.
+    beside : GraphStep, optional
+        One of the same run, never replayed at the same time: both use the same memory for what a step makes on its way.
     """
 
+    # All that a fit is made of, and the run beside it.
     def __init__(
         self,
         gaussians: Gaussians,
@@ -49,9 +57,12 @@ class GraphStep(FusedStep):
         scene: FitScene,
         settings: Settings,
         batch: int,
+        beside: GraphStep | None = None,
     ) -> None:
         super().__init__(gaussians, spacing, rays, scene, settings, batch)
-        self._side = torch.cuda.Stream(gaussians.position.device)
+        self._side, self._forked = torch.cuda.Stream(gaussians.position.device), False
+        with torch.cuda.device(gaussians.position.device):
+            self._pool: Any = torch.cuda.graph_pool_handle() if beside is None else beside._pool
         self._waiting = [
             torch.zeros(len(self._control), dtype=torch.float64).pin_memory() for _ in range(_AHEAD)
         ]
@@ -85,16 +96,16 @@ class GraphStep(FusedStep):
                 self._forget(before)
             _give_back(device)
             # As only one of the graphs runs at a time, they share what memory they need.
-            stream, pool = torch.cuda.Stream(device), torch.cuda.graph_pool_handle()
-            return {smooth: self._recorded(smooth, stream, pool) for smooth in weights}
+            stream = torch.cuda.Stream(device)
+            return {smooth: self._recorded(smooth, stream) for smooth in weights}
 
-    def _recorded(self, smooth: float, stream: torch.cuda.Stream, pool: Any) -> torch.cuda.CUDAGraph:
+    def _recorded(self, smooth: float, stream: torch.cuda.Stream) -> torch.cuda.CUDAGraph:
         """A step as a graph. ``torch.cuda.graph`` would give back all memory that is kept for later, and pinned memory
         takes 20 ms to get again: more than the recording itself."""
         graph = torch.cuda.CUDAGraph()
         with _recording, torch.cuda.stream(stream):
             torch.cuda.synchronize()
-            graph.capture_begin(pool=pool, capture_error_mode="thread_local")
+            graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
             try:
                 self._enqueue(smooth)
             finally:
@@ -108,11 +119,22 @@ class GraphStep(FusedStep):
             tensor.zero_()
         self.done = self._unread = 0
 
+    def _enqueue(self, smooth: float) -> None:
+        try:
+            super()._enqueue(smooth)
+        except BaseException:
+            # A recording ends with an error of its own, which would hide this one, where its streams stay apart.
+            if self._forked:
+                self._join()
+            raise
+
     def _volume_gradients(self, position, scale, rotation, output, smooth) -> tuple[torch.Tensor, ...]:
         """Beside those of the rays: each alone leaves much of a GPU idle."""
         self._side.wait_stream(torch.cuda.current_stream())
+        self._forked = True
         with torch.cuda.stream(self._side):
             return super()._volume_gradients(position, scale, rotation, output, smooth)
 
     def _join(self) -> None:
         torch.cuda.current_stream().wait_stream(self._side)
+        self._forked = False

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 import torch
 
+from tomo_polysplat.fit.adam import Adam, Moments
 from tomo_polysplat.fit.loss import misfit, roughness
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
@@ -16,29 +17,20 @@ from tomo_polysplat.fit.similarity import dissimilarity
 from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.detector_blur import LARGEST_BLUR
-from tomo_polysplat.quiet_imports import leaving_no_trace
 from tomo_polysplat.settings import Settings
 
 __all__ = [
-    "EPSILON",
     "EagerStep",
-    "Moments",
     "Step",
     "held_out_mean",
     "log_scale_bounds",
-    "new_moments",
     "smoothing",
     "step_rates",
     "turning",
 ]
 
-# Of Adam, so small that gradients of any unit give the same steps.
-EPSILON = 1e-15
 # Fewer held-out rays in a pass, those of a typical weight, go up and down by chance.
 _FEWEST_HELD_OUT = 10.0
-
-# Adam's first and second moment of each parameter by name.
-Moments = dict[str, tuple[torch.Tensor, torch.Tensor]]
 
 
 class Step(Protocol):
@@ -109,11 +101,6 @@ def log_scale_bounds(
     return math.log(scene.smallest_scale * min(voxel, spacing)), math.log(settings.largest_scale * spacing)
 
 
-def new_moments(parameters: dict[str, torch.Tensor]) -> Moments:
-    """Adam's memory before its first step."""
-    return {name: (torch.zeros_like(t), torch.zeros_like(t)) for name, t in parameters.items()}
-
-
 def held_out_mean(total: float, weight: float, typical: float) -> float:
     """Mean misfit of the held-out rays from its sum and their weight; NaN where they are few of a typical one."""
     return total / weight if weight and weight >= _FEWEST_HELD_OUT * typical else math.nan
@@ -128,20 +115,9 @@ class EagerStep:
         self.gaussians, self.rays, self.scene, self.settings = gaussians, rays, scene, settings
         self.bounds = log_scale_bounds(scene, spacing, gaussians.planar, settings)
         self.pull = torch.zeros_like(gaussians.attenuation)
-        parameters = gaussians.parameters()
-        rates = step_rates(settings, spacing)
-        groups = [
-            {"name": name, "params": [parameters[name].requires_grad_()], "lr": rate, "rate": rate}
-            for name, rate in rates.items()
-        ]
-        with leaving_no_trace():  # torch loads its compiler
-            self.optimiser = torch.optim.Adam(groups, eps=EPSILON, fused=True)
-        self._turns = self.optimiser.param_groups[list(rates).index("rotation")]
-        self.moments = new_moments(parameters)
-        for name, tensor in parameters.items():
-            first, second = self.moments[name]
-            count = torch.zeros((), dtype=torch.float32, device=tensor.device)
-            self.optimiser.state[tensor] = {"step": count, "exp_avg": first, "exp_avg_sq": second}
+        self.rates = step_rates(settings, spacing)
+        self.adam = Adam(gaussians.parameters())
+        self.moments = self.adam.moments
         self.largest: list[float] = []
         self._sums: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor, int | torch.Tensor]] = []
         self._done = 0
@@ -154,26 +130,24 @@ class EagerStep:
     @done.setter
     def done(self, steps: int) -> None:
         self._done = steps
-        for memory in self.optimiser.state.values():
-            memory["step"].fill_(steps)
+        self.adam.count(steps)
 
     def __call__(self, views: np.ndarray, share: float) -> None:
         """One step; see `Step`."""
-        for group in self.optimiser.param_groups:
-            group["lr"] = group["rate"] * self.settings.final_rate**share
-        self._turns["lr"] *= turning(self._done)
+        rates = {name: rate * self.settings.final_rate**share for name, rate in self.rates.items()}
+        rates["rotation"] *= turning(self._done)
         chosen, measured, weight, aside = self.rays.batch(views)
         predicted, skipped = self._predict(views, chosen)
         fitted = misfit(predicted, measured, weight, self.settings)
         loss = fitted + self._regularisation(predicted, measured, weight)
-        self.optimiser.zero_grad(set_to_none=True)
+        self.adam.forget_gradients()
         # On this thread: autograd's own would be woken and waited for at every step.
         with torch.autograd.set_multithreading_enabled(False):
             loss.backward()
         self._hold_materials(share)
         if (moved := self.gaussians.position.grad) is not None:
             self.pull += moved.norm(dim=1)
-        self.optimiser.step()
+        self.adam.step(rates)
         self._done += 1
         self._bound()
         with torch.no_grad():
@@ -195,8 +169,7 @@ class EagerStep:
 
     def set_rates(self, rates: Mapping[str, float]) -> None:
         """Go on with these; see `Step`."""
-        for group in self.optimiser.param_groups:
-            group["rate"] = rates[group["name"]]
+        self.rates = dict(rates)
 
     def read(self) -> tuple[float, float, int]:
         """Means since the last call; see `Step`."""

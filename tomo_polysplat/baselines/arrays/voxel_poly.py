@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.baselines.arrays.voxel_model import VoxelModel, start_voxels
+from tomo_polysplat.fit.adam import Adam
 from tomo_polysplat.fit.loss import misfit, total_variation
 from tomo_polysplat.fit.problem import OPAQUE
 from tomo_polysplat.fit.rays import Rays
@@ -25,7 +26,6 @@ from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.transmission import polychromatic_projection
 from tomo_polysplat.physics.water import areal_density, transmitted_energy
 from tomo_polysplat.plan.decisions.tv_corner import tv_corners
-from tomo_polysplat.quiet_imports import leaving_no_trace
 from tomo_polysplat.render.renderer import detector_views
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.scan.noise import photons_per_ray
@@ -145,11 +145,7 @@ class _Fit:
             settings,
             lambda bodies: halves_agree(measured, geometry, grid, bodies),
         )
-        self.parameters = [model.relative.requires_grad_(), model.own.requires_grad_()]
-        rates = (RATE_ATTENUATION, RATE_MATERIAL)
-        groups = [{"params": [p], "lr": r, "rate": r} for p, r in zip(self.parameters, rates)]
-        with leaving_no_trace():  # torch loads its compiler
-            self.optimiser = torch.optim.Adam(groups, eps=1e-15, fused=True)
+        self.adam = Adam({"attenuation": model.relative, "material": model.own})
 
     def run(
         self,
@@ -189,8 +185,7 @@ class _Fit:
 
     def _step(self, views: np.ndarray, share: float) -> torch.Tensor:
         """One step of Adam; misfit of the fitted rays, of the held-out ones times their weight, and this."""
-        for group in self.optimiser.param_groups:
-            group["lr"] = group["rate"] * self.settings.final_rate**share
+        falling = self.settings.final_rate**share
         _, measured, weight, aside = self.rays.batch(views)
         weights = self.model.weights(self.reference_curve)
         areal = project_voxels(weights, self.pair, views) * self.cm
@@ -199,9 +194,9 @@ class _Fit:
         rough = total_variation(
             self._output(weights), self.settings.tv_clip, self.corners, self.settings.bone_level
         )
-        self.optimiser.zero_grad(set_to_none=True)
+        self.adam.forget_gradients()
         (fitted + self.settings.tv_weight * rough).backward()
-        self.optimiser.step()
+        self.adam.step({"attenuation": RATE_ATTENUATION * falling, "material": RATE_MATERIAL * falling})
         self.model.hold()
         with torch.no_grad():
             weight = aside.sum()

@@ -1,0 +1,79 @@
+"""Adam (Kingma and Ba 2015, arXiv:1412.6980) as torch's function has it.
+
+torch's class of the same name loads torch's compiler when one is made, which takes more than a second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch.optim.adam import adam
+
+__all__ = ["Adam", "Moments", "new_moments"]
+
+# So small that gradients of any unit give the same steps.
+EPSILON = 1e-15
+_FIRST_DECAY, _SECOND_DECAY = 0.9, 0.999
+
+# First and second moment of each parameter by name.
+Moments = dict[str, tuple[torch.Tensor, torch.Tensor]]
+
+
+def new_moments(parameters: Mapping[str, torch.Tensor]) -> Moments:
+    """Adam's memory before its first step."""
+    return {name: (torch.zeros_like(t), torch.zeros_like(t)) for name, t in parameters.items()}
+
+
+class Adam:
+    """Steps of parameters along the gradients that autograd left in them.
+
+    Parameters
+    ----------
+    parameters : dict of name to tensor
+        Changed in place; they get gradients from now on.
+
+    Attributes
+    ----------
+    moments : dict of name to (exp_avg, exp_avg_sq)
+        To be changed in place only.
+    """
+
+    def __init__(self, parameters: Mapping[str, torch.Tensor]) -> None:
+        self.parameters = {name: tensor.requires_grad_() for name, tensor in parameters.items()}
+        self.moments = new_moments(parameters)
+        self._counts = {name: torch.zeros((), device=tensor.device) for name, tensor in parameters.items()}
+
+    def count(self, steps: int) -> None:
+        """Go on as after so many steps."""
+        for counted in self._counts.values():
+            counted.fill_(steps)
+
+    def forget_gradients(self) -> None:
+        """Before new ones are made."""
+        for tensor in self.parameters.values():
+            tensor.grad = None
+
+    @torch.no_grad()
+    def step(self, rates: Mapping[str, float]) -> None:
+        """One step at these learning rates, by name; a parameter without a gradient stays."""
+        for name, tensor in self.parameters.items():
+            if tensor.grad is None:
+                continue
+            first, second = self.moments[name]
+            adam(
+                [tensor],
+                [tensor.grad],
+                [first],
+                [second],
+                [],
+                [self._counts[name]],
+                fused=True,
+                amsgrad=False,
+                beta1=_FIRST_DECAY,
+                beta2=_SECOND_DECAY,
+                lr=rates[name],
+                weight_decay=0.0,
+                eps=EPSILON,
+                maximize=False,
+            )
