@@ -1,4 +1,4 @@
-"""Where the axis of rotation was, asked by default: of opposite rays, and of two short fits where they say it is off."""
+"""Where the axis of rotation was, asked by default: of opposite rays, then of two short fits if they say it is off."""
 
 from __future__ import annotations
 
