@@ -44,7 +44,7 @@ OPTIONS = {
     "--calibrate scater": "calibrate: expected one of scatter, kvp, filter, got 'scater'; did you mean scatter?",
     "--calibrate kvp": "calibrate: expected a known density for 'kvp', got none; pass soft_density=",
     "--align w": "align: expected one of u, v, roll",
-    "--align u --time-budget 9": "align: expected none beside a time_budget",
+    "--align u --time-budget 9": "align: expected 'auto' or none beside a time_budget",
     "--soft-density 1050": "soft_density: expected calibrate beside it, got none; pass calibrate=True",
     "--set passes": "--set: expected NAME=VALUE, got 'passes'",
     "--set pases=3": "expected the name of a setting, got 'pases'; did you mean passes?",

@@ -84,7 +84,7 @@ def reconstruct(
     filter_map: Sequence[Any] | None = None,
     calibrate: bool | str | Sequence[str] | None = None,
     soft_density: float | None = None,
-    align: bool | str | Sequence[str] | None = None,
+    align: bool | str | Sequence[str] | None = "auto",
     mend: bool = True,
     callbacks: Sequence[Callable[[FitState], Any]] = (),
     progress: bool | Callable[[float, str], Any] | None = None,
@@ -145,15 +145,18 @@ def reconstruct(
         is left as it is.
     soft_density : float, optional
         Known density in g/cm3, at most 25, of what most of the object is made of, the first of ``materials``.
-    align : bool, "auto" or names among "u", "v", "roll", "tilt", "slant", "distance", "skew", "views", optional
-        Move the scanner's geometry to where the rays have it, before the fit: the detector along its columns and rows
-        (pixels), its turns and the skew of the axis (degrees), its distance (per cent), and each view by itself.
-        True or "auto": what of these the rays tell. Moves that held-out rays do not confirm are not made.
+    align : "auto", bool, or names among "u", "v", "roll", "tilt", "slant", "distance", "skew", "views"
+        Move the scanner's geometry to where the rays have it, before the fit. "auto": the detector along its columns
+        where opposite rays say that the axis of rotation is off and two short fits confirm it; a scan that is right
+        stays as it is, bit for bit. True: what the rays tell of the axis, the detector's roll, the skew of the axis
+        and shifts of single views, by fits that take about as long as the run. Names: these alone, likewise; pixels,
+        degrees, and per cent of the distance. Moves that held-out rays do not confirm are not made.
         `Result.geometry` is the geometry found, ``result.plan["alignment"]`` the moves. None or False: the geometry
-        is as told. Not beside a ``time_budget``.
+        is as told. Beside a ``time_budget`` "auto" alone, without the fits.
     mend : bool
         Of a `Scan` with its own geometry, move the detector where the rays show beyond doubt that the axis of rotation
-        is off (`tomo_polysplat.scan.mending`). The log and ``result.plan["mended"]`` say so.
+        is off (`tomo_polysplat.scan.mending`). The log and ``result.plan["mended"]`` say so. False leaves the axis, and
+        ``align="auto"`` then moves it neither.
     callbacks : sequence of callables
         Each gets a :class:`~tomo_polysplat.fit.optimise.FitState` once a pass over the views; returning True
         ends the fit.
@@ -208,7 +211,7 @@ def reconstruct(
     problem, counts = _problem(measured, geometry, grid, materials, run_options)
     wanted = Calibration.of(calibrate, soft_density, problem.spectrum)
     flipped = is_planar_geometry(measured.geometries()[0])
-    moved = moves_of(align, time_budget)
+    moved = moves_of(align if mend or align != "auto" else None, time_budget)
     asked = None if wanted is None else {"names": wanted.names, "soft_density": wanted.soft_density}
     options = run_options.to_dict() | {
         "calibration": asked or ("as the rays ask" if calibrate is None else None),

@@ -136,7 +136,7 @@ def test_a_scan_of_one_plane_stays_in_it():
 
 
 def test_an_unknown_move_is_refused():
-    with pytest.raises(ValueError, match="align: expected 'auto' or names among u, v"):
+    with pytest.raises(ValueError, match="align: expected 'usual' or names among u, v"):
         Alignment(orbit(), 1.0, names=("rol",))
 
 

@@ -56,7 +56,9 @@ def test_a_perfect_scan_is_left_alone():
     record = search(alignment, fits, [4, 2])
     assert record["confirmed"] == [] and alignment.largest_shift() == 0.0
     assert [moving for _, moving in fits.asked[:3]] == [(), whole, ("views",)] and not alignment.names
-    assert [entry["factor"] for entry in record["levels"]] == [4, 2]
+    # By joined pixels of 32 columns all would have shown: finer ones are not asked.
+    more = search(Alignment(orbit(), 0.5), Fits(alignment, 0.0, 0.0), [4, 2, 1])
+    assert [entry["factor"] for entry in record["levels"]] == [4, 2] == [e["factor"] for e in more["levels"]]
 
 
 def test_what_is_confirmed_moves_on_and_is_not_asked_again():

@@ -1,6 +1,7 @@
 """A scanner that stood elsewhere than told: the moves are found, made, and kept for others to use."""
 
 import json
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -8,8 +9,14 @@ import pytest
 import torch
 
 import tomo_polysplat as tps
-from tomo_polysplat.plan.alignment import _joined, moves_of
+from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.plan import axis
+from tomo_polysplat.plan.alignment import moves_of
+from tomo_polysplat.plan.coarse import joined_pixels
+from tomo_polysplat.plan.means import Means
+from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.scan.layout import vector_form
+from tomo_polysplat.settings import make_settings
 
 QUICK = {"passes": 5.0, "views_per_step": 6, "pixel_rays": 1}
 
@@ -42,19 +49,52 @@ def test_an_axis_that_is_off_is_found_and_used():
     scan, told = fan(), off(fan(), 1.5)
     found, as_told, right = (
         reconstruct(scan, told, align="u"),
-        reconstruct(scan, told),
-        reconstruct(scan, scan.proj_geom),
+        reconstruct(scan, told, align=False),
+        reconstruct(scan, scan.proj_geom, align=False),
     )
     assert found.plan["alignment"].value["u"] == pytest.approx(1.5, abs=0.05)
     assert error(found, scan) < 1.1 * error(right, scan) < 0.5 * error(as_told, scan)
+    # By default, in a moment, and beside a time budget as well.
+    for options in ({}, {"time_budget": 60.0}):
+        mended = reconstruct(scan, told, **options)
+        assert mended.plan["alignment"].value["u"] == pytest.approx(1.5, abs=0.02)
+        assert error(mended, scan) < 1.1 * error(right, scan)
+    assert "alignment" not in as_told.plan
 
 
-def test_what_no_ray_confirms_is_not_moved():
+@pytest.mark.parametrize("align", ["auto", ("u",)])
+def test_what_no_ray_confirms_is_not_moved(align):
     scan = fan(metal=False)
-    asked, plain = (reconstruct(scan, scan.proj_geom, align=align) for align in (("u",), None))
-    assert asked.plan["alignment"].value == {} and "no move" in asked.plan["alignment"].why
+    asked, plain = (reconstruct(scan, scan.proj_geom, align=one) for one in (align, False))
+    assert asked.plan["alignment"].value == {}
+    assert ("no move" if align != "auto" else "where it was told") in asked.plan["alignment"].why
     assert np.array_equal(asked.volume, plain.volume)
-    np.testing.assert_allclose(asked.geometry["Vectors"], plain.geometry["Vectors"])
+    np.testing.assert_array_equal(asked.geometry["Vectors"], plain.geometry["Vectors"])
+    others = [
+        {k: v for k, v in r.plan.items() if k not in ("alignment", "compiling")} for r in (asked, plain)
+    ]
+    assert others[0] == others[1]
+
+
+def test_a_move_that_held_out_rays_do_not_confirm_is_not_made(monkeypatch):
+    misfits = iter([1.0, 1.0])
+    monkeypatch.setattr(axis, "_held_out", lambda *_: next(misfits))
+    problem = Problem.of(
+        np.ascontiguousarray(fan().projections.transpose(1, 0, 2)),
+        *from_astra(off(fan(), 1.5), fan().vol_geom),
+        "cm",
+        None,
+        None,
+    )
+    means = Means(make_settings("balanced", None), None, 0, torch.device("cpu"))
+    answer = axis.find_axis(problem, means, lambda *_: None)
+    assert answer.value == {} and "do not confirm" in answer.why and answer.evidence["offset"] > 1
+
+
+def test_who_leaves_the_axis_where_the_file_has_it_leaves_it_from_auto_too():
+    scan = replace(fan(), proj_geom=off(fan(), 0.4))
+    result = tps.reconstruct(scan, mend=False, settings=QUICK | {"passes": 1.0}, progress=False)
+    assert "alignment" not in result.plan and "mended" not in result.plan
 
 
 def test_the_geometry_that_was_found_is_in_the_file(tmp_path):
@@ -84,7 +124,7 @@ def test_an_interrupted_run_goes_on_by_the_scanner_that_was_found(tmp_path):
         arrays = dict(file)
     rest = reconstruct(scan, told, align="u", checkpoint=path, resume=True)
     assert rest.plan["alignment"].value["u"] == pytest.approx(1.5, abs=0.05)
-    assert error(rest, scan) < 0.5 * error(reconstruct(scan, told), scan)
+    assert error(rest, scan) < 0.5 * error(reconstruct(scan, told, align=False), scan)
     about = json.loads(arrays["about"].tobytes())
     for wrong in ({"sideways": 1.0}, {"u": "much"}, {"u": float("nan")}, None):
         about["plan"]["facts"]["alignment"]["value"] = wrong
@@ -97,8 +137,9 @@ def test_an_interrupted_run_goes_on_by_the_scanner_that_was_found(tmp_path):
 @pytest.mark.parametrize(
     "wanted, budget, word",
     [
-        ("auto", 3.0, "time_budget"),
+        (True, 3.0, "time_budget"),
         ("sideways", None, "one of"),
+        (["auto", "u"], None, "alone"),
         (3, None, "names"),
         (["u", "w"], None, "one of"),
     ],
@@ -111,7 +152,7 @@ def test_what_makes_no_sense_is_refused(wanted, budget, word):
 def test_joined_pixels_are_means_of_those_that_count():
     values = np.arange(2 * 3 * 5, dtype=np.float32).reshape(2, 3, 5)
     values[0, 0, 0] = np.nan
-    found = torch.from_numpy(_joined(values, 1, 2))
+    found = torch.from_numpy(joined_pixels(values, 1, 2))
     assert found.shape == (2, 3, 2) and found[0, 0, 0] == 1.0
     torch.testing.assert_close(found[1], torch.tensor([[15.5, 17.5], [20.5, 22.5], [25.5, 27.5]]))
-    assert _joined(values, 1, 1) is values
+    assert joined_pixels(values, 1, 1) is values

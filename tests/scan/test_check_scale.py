@@ -39,7 +39,8 @@ def test_the_noise_tells_the_base_of_the_logarithm(photons):
     natural = answer(scan, "base of the logarithm")
     assert natural.verdict == OK and natural.values["slope"] == pytest.approx(1.0, abs=0.3)
     decadic = answer(replace(scan, projections=scan.projections / np.log(10)), "base of the logarithm")
-    assert decadic.verdict == DEFECT and "2.3026" in decadic.remedy
+    # Fine detail can pass for such noise: what it may be is said, and no more.
+    assert decadic.verdict == UNKNOWN and "2.3026" in decadic.remedy
     # The slope goes with the factor exactly, for it is that of the same numbers.
     assert decadic.values["slope"] == pytest.approx(np.log(10) * natural.values["slope"], rel=0.2)
 

@@ -1,5 +1,7 @@
 """Moves of a scanner: what each does to where points fall, their derivatives, and what rays cannot tell of them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -162,3 +164,11 @@ def test_an_offset_is_told_from_a_move_of_the_object(arc):
     u = 0.7 + 0.5 * np.sin(angle) - 0.2 * np.cos(angle)
     shifts = torch.from_numpy(np.stack([u, 0 * u], axis=1))
     assert torch.allclose(common_offset(shifts, scanner), torch.tensor([0.7, 0.0]).double(), atol=1e-9)
+
+
+def test_a_lift_that_is_all_but_an_offset_makes_none_of_millions_of_pixels():
+    """Rounding tells the two apart: without a bound each gets the other's with a huge factor."""
+    told, rng = orbit("cone", views=40), np.random.default_rng(0)
+    shaken = replace(told, v=told.v * (1 + 1e-12 * rng.normal(size=(40, 1))))
+    shifts = torch.from_numpy(rng.normal(0, 0.1, (40, 2)))
+    assert common_offset(shifts, Scanner(shaken)).abs().max() < 0.2

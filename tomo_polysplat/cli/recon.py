@@ -106,13 +106,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     calibrated.add_argument(
         "--no-calibrate", action="store_true", help="do not look for scatter in the rays either"
     )
-    group.add_argument(
+    moved = group.add_mutually_exclusive_group()
+    moved.add_argument(
         "--align",
         nargs="*",
         metavar="MOVE",
         help="first move the geometry to where the rays have it: u, v, roll, tilt, slant, distance, skew, views;"
-        " alone: what of these the rays tell",
+        " alone: what of these the rays tell (default: an axis that is off)",
     )
+    moved.add_argument("--no-align", action="store_true", help="use the geometry as told")
     group.add_argument(
         "--no-mend",
         action="store_true",
@@ -186,7 +188,7 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
             device=arguments.device,
             devices=arguments.devices,
             calibrate=_calibrated(arguments),
-            align=None if arguments.align is None else arguments.align or True,
+            align=_aligned(arguments),
             soft_density=arguments.soft_density,
             mend=not arguments.no_mend,
             progress=progress,
@@ -211,6 +213,13 @@ def _follow(device: str) -> int:
 
     follow_torchrun(device)
     return 0
+
+
+def _aligned(arguments: argparse.Namespace) -> str | bool | list[str]:
+    """The argument ``align`` of `reconstruct`."""
+    if arguments.no_align:
+        return False
+    return "auto" if arguments.align is None else arguments.align or True
 
 
 def _calibrated(arguments: argparse.Namespace) -> bool | list[str] | None:

@@ -51,8 +51,8 @@ class Alignment(Nuisance):
         As told, in the coordinates of the fit.
     radius : float
         Of the object, likewise.
-    names : sequence of names of `MOVES`, or "auto"
-        What is moved; "auto" is what of `USUAL`, or of `IN_PLANE`, the rays tell.
+    names : sequence of names of `MOVES`, or "usual"
+        What is moved; "usual" is what of `USUAL`, or of `IN_PLANE`, the rays tell.
     pivot : (3,) array, optional
         A point on the axis of rotation, the origin by default.
     start : mapping of name to number, optional
@@ -85,25 +85,25 @@ class Alignment(Nuisance):
         geometry: Geometry,
         radius: float,
         *,
-        names: str | Sequence[str] = "auto",
+        names: str | Sequence[str] = "usual",
         pivot: np.ndarray | None = None,
         start: Mapping[str, float] | None = None,
     ) -> None:
         self.scanner = Scanner(geometry, pivot)
         usual = IN_PLANE if geometry.planar else USUAL
-        wanted = usual if isinstance(names, str) and names == "auto" else tuple(names)
+        wanted = usual if isinstance(names, str) and names == "usual" else tuple(names)
         for name in (*wanted, *(start or {})):
             if name not in MOVES:
-                raise fail("align", f"'auto' or names among {', '.join(MOVES)}", repr(name))
+                raise fail("align", f"'usual' or names among {', '.join(MOVES)}", repr(name))
         self.left: dict[str, str] = {}
         whole = [name for name in wanted if name != "views"]
         # Units that a step of one pixel makes.
         self._units: dict[str, float] = {}
         for name, effect in effects(self.scanner, whole, radius).items():
             self._units[name] = min(1 / max(effect.pixels, 1e-12), _MOST_A_PIXEL)
-            if names == "auto" and effect.told < _TOLD:
+            if names == "usual" and effect.told < _TOLD:
                 self.left[name] = f"the object can take its place but for {effect.told:.1%}"
-            elif names == "auto" and effect.pixels * _COMMON < _PIXELS:
+            elif names == "usual" and effect.pixels * _COMMON < _PIXELS:
                 self.left[name] = (
                     f"{_COMMON:g} {MOVES[name]} shift what is seen by {effect.pixels * _COMMON:.2f} px"
                 )

@@ -16,8 +16,9 @@ __all__ = ["Schedule", "levels", "schedule", "search", "worth_it"]
 
 logger = logging.getLogger(__name__)
 
-# Columns of the coarsest and of the finest joined detector.
-_COARSEST, _FINEST = 15, 64
+# Columns of the coarsest and of the finest joined detector, and those on which an axis that is off by a quarter of a
+# pixel shows: where nothing is confirmed there, nothing is looked for on finer ones.
+_COARSEST, _FINEST, _ENOUGH = 15, 64, 30
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ def search(
 
     Moves of the whole scanner come before those of single views. A kind that a level has confirmed moves on in all
     finer ones without being asked again: there it has little left to gain. Views are not asked for the first time by
-    pixels that are not joined.
+    pixels that are not joined. Where nothing is confirmed by joined pixels of 30 columns, the search ends.
 
     Parameters
     ----------
@@ -107,5 +108,7 @@ def search(
                 alignment.restore(kept)
         record.append(told)
         logger.info("alignment by pixels joined by %d: %s", factor, alignment.describe())
+        if not confirmed and alignment.scanner.geometry.columns // factor >= _ENOUGH:
+            break
     alignment.only(confirmed)
     return {"confirmed": list(confirmed), "levels": record}

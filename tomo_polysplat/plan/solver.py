@@ -17,8 +17,9 @@ from tomo_polysplat.fit.stopping import Clock, FitState, Stop, StopReason
 from tomo_polysplat.fit.surroundings import cut_out
 from tomo_polysplat.kernels.compile_time import compiled_seconds, working_time
 from tomo_polysplat.model.gaussians import Gaussians
-from tomo_polysplat.plan.alignment import align, aligned
+from tomo_polysplat.plan.alignment import align
 from tomo_polysplat.plan.answer import Answer, Status
+from tomo_polysplat.plan.axis import aligned, find_axis
 from tomo_polysplat.plan.calibration import Calibration
 from tomo_polysplat.plan.checkpoint import Checkpoint
 from tomo_polysplat.plan.decision import When
@@ -53,7 +54,7 @@ class Solver:
         When the reconstruction began, in seconds of ``kernels.compile_time.working_time``.
     flipped : bool
         Whether callbacks get slices with row 0 at the largest y.
-    moved : "auto", names of moves, or None
+    moved : "auto", "usual", names of moves, or None
         Which moves of the scanner the rays are asked about (`plan.alignment`).
     report : callable
         Gets the share done, and words.
@@ -125,8 +126,12 @@ class Solver:
         options = self.run_options
         if self.saved is not None and self.saved.plan is not None:
             found = self.saved.plan.facts["alignment"]
+        elif self.moved == "auto":
+            found = find_axis(problem, options, self.report)
         else:
-            found = align(problem, self.moved, options.settings, options.device, options.seed, self.report)
+            # Names are asked for as they stand: who leaves out "u" does not want the axis moved.
+            axis = find_axis(problem, options, self.report) if self.moved == "usual" else None
+            found = align(problem, self.moved, options, axis, self.report)
         return aligned(problem, found.value), {"alignment": found}
 
     def _anew(

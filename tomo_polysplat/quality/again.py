@@ -100,6 +100,7 @@ def fit_again(
         water_correction=scan.water_correction if spectrum is not None else None,
         filter_map=scan.filter_map,
         calibrate="scatter" if scattered and spectrum is not None else False,
+        align=False,
         seed=int(result.settings.get("seed", 0)),
         settings=settings_of(result),
         device=device,

@@ -71,7 +71,9 @@ def view_gauge(scanner: Scanner) -> torch.Tensor:
 def common_offset(shifts: torch.Tensor, scanner: Scanner) -> torch.Tensor:
     """(2,) offset along ``u`` and ``v`` that is in shifts (views, 2), beside what a move of the object explains."""
     columns = _no_single_views(scanner)
-    return torch.linalg.lstsq(columns, shifts.reshape(-1, 1), driver="gelsd").solution[:2, 0]
+    # A lift of the object is all but one of the detector: no large one of each may stand for nothing.
+    found = torch.linalg.lstsq(columns, shifts.reshape(-1, 1), rcond=_RANK, driver="gelsd")
+    return found.solution[:2, 0]
 
 
 def without_gauge(shifts: torch.Tensor, gauge: torch.Tensor) -> torch.Tensor:

@@ -1,0 +1,53 @@
+"""A scan by joined pixels and voxels, for fits that show where edges lie and not how fine they are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.scan.geometry import VolumeGrid
+from tomo_polysplat.settings import Settings
+
+__all__ = ["coarse_problem", "coarse_settings", "joined_pixels"]
+
+# Voxels of the coarsest volume along its edges, and the share of rays that is held out of a fit.
+_FEWEST_VOXELS, _HELD_OUT = 8, 0.1
+
+
+def coarse_problem(problem: Problem, factor: int) -> tuple[Problem, int]:
+    """The problem by joined pixels and voxels, and how many rows are joined.
+
+    Parameters
+    ----------
+    problem : Problem
+    factor : int
+        Columns, and rows where there are several, that are joined to one.
+    """
+    rows = min(factor, problem.geometry.rows)
+    geometry = problem.geometry.binned(factor, rows)
+    voxels = [n if n == 1 else max(_FEWEST_VOXELS, n // factor) for n in problem.grid.shape]
+    grid = VolumeGrid((voxels[0], voxels[1], voxels[2]), problem.grid.lower, problem.grid.upper)
+    values = joined_pixels(problem.projections, rows, factor)
+    behind = None if problem.filter_map is None else problem.filter_map.joined(rows, factor)
+    whole = replace(problem, projections=values, geometry=geometry, grid=grid, margin=(0, 0))
+    return replace(whole, filter_map=behind), rows
+
+
+def coarse_settings(settings: Settings) -> Settings:
+    """Those of such a fit."""
+    held_out = max(_HELD_OUT, settings.held_out)
+    return replace(settings, pixel_rays=1, growth=1.0, edges="blurred", soft_gain=0.0, held_out=held_out)
+
+
+def joined_pixels(values: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    """Means of so many rows and columns together, of those that are no NaN; the rest at the far ends is dropped."""
+    if rows == columns == 1:
+        return values
+    views, height, width = len(values), values.shape[1] // rows, values.shape[2] // columns
+    parts = values[:, : height * rows, : width * columns].reshape(views, height, rows, width, columns)
+    good = np.isfinite(parts)
+    sums = np.where(good, parts, 0).sum(axis=(2, 4), dtype=np.float64)
+    counts = good.sum(axis=(2, 4))
+    return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan).astype(np.float32)

@@ -1,0 +1,270 @@
+"""By how many columns the axis of rotation is off, and how sure that is, from rays measured from both ends."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tomo_polysplat.scan.opposite_rays import OppositeRays
+from tomo_polysplat.scan.view_geometry import Geometry
+
+__all__ = ["AxisOffset", "axis_offset"]
+
+# Half the range that is searched, as a share of the columns, and columns of the detector that it is searched on.
+_RANGE, _COARSE = 0.12, 96
+# Views, columns and rows that are compared, and values that are looked at.
+_VIEWS, _COLUMNS, _ROWS, _VALUES = 128, 512, 32, 6_000_000
+_COARSE_VIEWS, _COARSE_ROWS = 60, 8
+# Share of the most pairs of any place that a place must have.
+_ENOUGH = 0.2
+# A place farther than so many joined columns is another one; its rays must differ so many times more.
+_ELSEWHERE, _CLEARLY = 2.0, 2.0
+# Where more than this of the variance is not shared, rays are not opposite.
+_LARGEST_MISMATCH = 0.25
+# Steps of Newton's method, in columns at most, and how small the last must be.
+_STEPS, _LONGEST, _SETTLED = 12, 0.5, 1e-3
+# What varies with the views is enough where it tells the place with this standard error.
+_WELL = 0.05
+# The slope is taken between places so far on either side, in columns.
+_APART = 0.25
+# Groups of lines and of columns, each left out once; fewer lines than these are cut by rows instead.
+_LINE_GROUPS, _COLUMN_GROUPS, _FEWEST_LINES, _FEWEST_GROUPS = 16, 12, 8, 4
+_FEWEST_VIEWS, _FEWEST_COLUMNS = 12, 12
+# Relative change of the source's distance from the axis, and of its height, that still is a circle.
+_ROUND = 0.02
+# Columns by which the axis may wander on the detector, and rows.
+_STEADY, _LEVEL = 0.05, 1.0
+
+
+@dataclass(frozen=True)
+class AxisOffset:
+    """Where the axis of rotation is.
+
+    Attributes
+    ----------
+    columns : float
+        By which the detector stood above where it was told, as ``u`` of `tomo_polysplat.scan.moves` counts.
+    error : float
+        Its standard error.
+    doubt : str
+        Why nothing is known; empty where it is.
+    """
+
+    columns: float
+    error: float
+    doubt: str = ""
+
+
+def axis_offset(projections: np.ndarray, geometry: Geometry) -> AxisOffset:
+    """Tell by how many columns the detector was off, from opposite rays.
+
+    Parameters
+    ----------
+    projections : (views, rows, columns) array
+        -log(I/I0); NaN for rays that are not to be used.
+    geometry : Geometry
+        As told.
+
+    Returns
+    -------
+    AxisOffset
+        Unknown where no ray was measured from both ends, where such rays do not agree wherever the axis is, or where
+        they agree at several places.
+
+    Notes
+    -----
+    Of a parallel beam some of all rows are compared, of a fan or cone the row in the plane of the orbit, where a ray
+    runs both ways. The place is found on joined columns and refined by Newton's method on all of them. Its standard
+    error is the jackknife's (Efron 1982): the larger one of that over groups of views, whose noise differs, and of that
+    over groups of columns, whose gains do.
+    """
+    try:
+        rays = _rays(projections, geometry)
+        found, step = _rough(rays)
+        limit = _RANGE * geometry.columns
+        while True:
+            found, error = _refined(rays.joined(step), found / step, limit / step)
+            found *= step
+            if step == 1:
+                break
+            step = (step + 1) // 2
+    except ValueError as why:
+        return AxisOffset(0.0, np.inf, str(why))
+    try:
+        varying, its_error = (np.inf, np.inf) if rays.seam else _refined(rays, found, limit, varying=True)
+    except ValueError:
+        its_error = np.inf
+    return AxisOffset(-varying, its_error) if its_error < _WELL else AxisOffset(-found, error)
+
+
+def _rays(projections: np.ndarray, geometry: Geometry) -> OppositeRays:
+    """The rays that are compared, by rising azimuth, the largest gap at the end.
+
+    Raises
+    ------
+    ValueError
+        Where the geometry has no opposite rays.
+    """
+    if geometry.views < _FEWEST_VIEWS or geometry.columns < _FEWEST_COLUMNS:
+        raise ValueError(f"fewer than {_FEWEST_VIEWS} views or {_FEWEST_COLUMNS} columns do not tell")
+    azimuth, axis, slope, rows = (_of_parallel if geometry.beam == "parallel" else _of_cone)(geometry)
+    order = np.argsort(azimuth, kind="stable")
+    azimuth = azimuth[order]
+    last = int(np.argmax(np.diff(azimuth, append=azimuth[0] + 2 * np.pi)))
+    order, azimuth = np.roll(order, -last - 1), np.roll(azimuth, -last - 1)
+    azimuth = np.where(azimuth < azimuth[0], azimuth + 2 * np.pi, azimuth)
+    values = sum(share * np.asarray(projections[:, some], np.float64).swapaxes(1, 2) for share, some in rows)
+    return OppositeRays(np.where(np.isfinite(values), values, np.nan)[order], azimuth, axis, slope)
+
+
+def _of_parallel(geometry: Geometry) -> tuple[np.ndarray, float, float, list[tuple[float, np.ndarray]]]:
+    """Azimuth, column of the axis, slope and rows with their weights of a parallel beam."""
+    inverse, reference = geometry.projection_matrices()
+    # Points along z stay in their row's height on all views, and in their column.
+    along = inverse[:, :2, 2]
+    if np.abs(geometry.origin[:, 2]).max() > 1e-6 * np.linalg.norm(geometry.origin, axis=1).min():
+        raise ValueError("the beam is inclined to the axis")
+    if np.abs(along[:, 0]).max() * geometry.rows > _STEADY * np.abs(along[:, 1]).min():
+        raise ValueError("the axis leans on the detector")
+    foot = -np.einsum("vkl,vl->vk", inverse[:, :2], reference)
+    # Where the axis runs: the point of the plane whose column stays.
+    system = np.column_stack([inverse[:, 0, :2], -np.ones(geometry.views)])
+    solution, _, rank, _ = np.linalg.lstsq(system, -foot[:, 0], rcond=1e-9)
+    if rank < 3 or np.abs(system @ solution + foot[:, 0]).max() > _STEADY:
+        raise ValueError("the axis moves on the detector")
+    if np.ptp(foot[:, 1]) > _LEVEL:
+        raise ValueError("the object moves along the axis")
+    most = max(1, min(geometry.rows, _ROWS, _VALUES // (geometry.views * geometry.columns)))
+    rows = np.unique(((np.arange(most) + 0.5) * geometry.rows / most).astype(int))
+    return np.arctan2(geometry.origin[:, 1], geometry.origin[:, 0]), float(solution[2]), 0.0, [(1.0, rows)]
+
+
+def _of_cone(geometry: Geometry) -> tuple[np.ndarray, float, float, list[tuple[float, np.ndarray]]]:
+    """The same of a fan or cone beam: the plane of the orbit lies between two rows."""
+    # |p|^2 = 2 c.p + (r^2 - |c|^2), in coordinates about the mean.
+    mean = geometry.origin.mean(axis=0)
+    local = (geometry.origin - mean)[:, :2]
+    system = np.column_stack([2 * local, np.ones(len(local))])
+    centre = np.linalg.lstsq(system, (local**2).sum(axis=1), rcond=None)[0][:2]
+    arm = local - centre
+    distance = np.hypot(*arm.T)
+    if max(np.ptp(distance), np.ptp(geometry.origin[:, 2])) > _ROUND * distance.mean():
+        raise ValueError("the source does not go round on a circle")
+    inverse, _ = geometry.projection_matrices()
+    ahead = np.column_stack([-arm, np.zeros(len(arm))]) / distance[:, None]
+    foot = np.einsum("vkl,vl->vk", inverse, ahead)
+    foot = foot[:, :2] / foot[:, 2:]
+    if np.ptp(foot[:, 0]) > _STEADY or np.ptp(foot[:, 1]) > _LEVEL:
+        raise ValueError("the detector moves against the source")
+    axis, row = np.median(foot, axis=0)
+    if not -0.5 <= row <= geometry.rows - 0.5:
+        raise ValueError("the plane of the orbit is not on the detector")
+    left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
+    depth = np.einsum("vk,vk->v", geometry.corner + axis * geometry.u - geometry.origin, ahead)
+    slope = np.median(np.einsum("vk,vk->v", geometry.u[:, :2], left) / depth)
+    low = int(np.clip(row, 0, geometry.rows - 1))
+    share = float(np.clip(row - low, 0, 1))
+    both = [(1 - share, np.array([low])), (share, np.array([min(low + 1, geometry.rows - 1)]))]
+    azimuth = np.arctan2(arm[:, 1], arm[:, 0])
+    return azimuth, float(axis), float(slope), [part for part in both if part[0] > 1e-3]
+
+
+def _rough(rays: OppositeRays) -> tuple[float, int]:
+    """The place where opposite rays agree best, in columns, and how many columns were joined to find it."""
+    columns = rays.values.shape[1]
+    factor = max(1, columns // _COARSE)
+    some = np.unique(np.linspace(0, rays.values.shape[2] - 1, _COARSE_ROWS).astype(int))
+    coarse = OppositeRays(rays.values[..., some], rays.azimuth, rays.axis, rays.slope).joined(factor)
+    lines, columns = _spread(coarse, _COARSE_VIEWS)
+    reach = np.ceil(_RANGE * len(columns))
+    places = np.arange(-reach, reach + 0.25, 0.5)
+    compared = [coarse.pairs(place, lines, columns) for place in places]
+    many = np.array([np.count_nonzero(pairs.weight) for pairs in compared])
+    if not many.max() > 0:
+        raise ValueError("no ray was measured from both ends")
+    mismatch = np.array([pairs.mismatch for pairs in compared])
+    mismatch = np.where(many > _ENOUGH * many.max(), mismatch, np.inf)
+    best = int(np.argmin(mismatch))
+    elsewhere = mismatch[np.abs(places - places[best]) > _ELSEWHERE]
+    if not np.isfinite(mismatch[best]) or mismatch[best] > _LARGEST_MISMATCH:
+        raise ValueError("rays that should agree do not, wherever the axis is")
+    if len(elsewhere) and elsewhere.min() < _CLEARLY * mismatch[best]:
+        raise ValueError("opposite rays agree about as well at several places of the axis")
+    return float(places[best] * factor), factor
+
+
+def _spread(rays: OppositeRays, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Views and columns that are compared."""
+    views, columns, _ = rays.values.shape
+    return (
+        np.unique(np.linspace(0, views - 1, min(views, most)).round().astype(int)),
+        np.arange(0, columns, -(-columns // _COLUMNS)),
+    )
+
+
+def _refined(rays: OppositeRays, place: float, limit: float, varying: bool = False) -> tuple[float, float]:
+    """The place near this one at which opposite rays agree best, and its standard error, in columns of the rays.
+
+    Only what is ``varying`` with the views may be compared, in which gains of pixels have no part.
+    """
+    lines, columns = _spread(rays, _VIEWS)
+    for _ in range(_STEPS):
+        pairs, slope = rays.pairs(place, lines, columns), _slope(rays, place, lines, columns)
+        change = pairs.opposite - pairs.own
+        like = pairs.slope
+        if varying:
+            slope, change, like = (_varying(part, pairs.weight) for part in (slope, change, like))
+        above, below = pairs.weight * like * change, pairs.weight * like * slope
+        if not below.sum() > 0:
+            raise ValueError("opposite rays show no detail")
+        step = -float(above.sum() / below.sum())
+        place += float(np.clip(step, -_LONGEST, _LONGEST))
+        if abs(step) < _SETTLED:
+            break
+    if abs(step) > 20 * _SETTLED or abs(place) > limit:
+        raise ValueError("no single place of the axis was found")
+    if pairs.mismatch > _LARGEST_MISMATCH:
+        raise ValueError("rays that should agree do not, wherever the axis is")
+    distance = np.abs(columns - rays.axis - place)
+    return place, _jackknife(above, below, distance, 1.0 if rays.seam else 2.0)
+
+
+def _slope(rays: OppositeRays, place: float, lines: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Change of what opposite rays differ by with the place of the axis, (lines, columns, rows)."""
+    ahead, behind = (rays.pairs(place + step, lines, columns) for step in (_APART, -_APART))
+    moved = (ahead.opposite - ahead.own) - (behind.opposite - behind.own)
+    return np.where((ahead.weight > 0) & (behind.weight > 0), moved / (2 * _APART), 0)
+
+
+def _varying(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Values (lines, columns, rows) without their mean over lines, in which gains of pixels are."""
+    return values - (weight * values).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300)
+
+
+def _jackknife(above: np.ndarray, below: np.ndarray, distance: np.ndarray, times: float) -> float:
+    """Standard error of the quotient of the sums of (lines, columns, rows).
+
+    Each pair is there ``times`` times: in lines far apart, but in columns of the same ``distance`` from the axis.
+    """
+    errors = []
+    lines, rows = (np.flatnonzero(below.any(axis=axes)) for axes in ((1, 2), (0, 1)))
+    columns = np.argsort(distance, kind="stable")
+    columns = columns[np.asarray(below.any(axis=(0, 2)))[columns]]
+    many = len(lines) >= _FEWEST_LINES
+    for along, used, most, count in (
+        (0 if many else 2, lines if many else rows, _LINE_GROUPS, times if many else 1.0),
+        (1, columns, _COLUMN_GROUPS, 1.0),
+    ):
+        groups = np.array_split(used, min(most, len(used)))
+        if len(groups) < _FEWEST_GROUPS:
+            continue
+        one, two = (
+            np.array([values.take(group, along).sum() for group in groups]) for values in (above, below)
+        )
+        rest = two.sum() - two
+        if not (rest > 0).all():
+            return np.inf
+        without = (one.sum() - one) / rest
+        errors.append(float(np.sqrt(count * (len(groups) - 1) * without.var())))
+    return max(errors, default=np.inf)

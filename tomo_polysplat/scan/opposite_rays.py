@@ -1,0 +1,230 @@
+"""Rays of one circle, and those that ran the same way backwards, for any place of the axis of rotation.
+
+The ray of the view at azimuth t that falls ``j - a`` columns from the axis at ``a`` leaves at the angle g from the
+middle of the fan, and is met again ``a - j`` columns from it in the view at t + pi + 2 g. In a parallel beam g is zero.
+Both saw the same matter, whatever it is made of, so they agree if the axis is where it is thought to be.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+__all__ = ["OppositeRays", "RaysAndOpposites"]
+
+# Gaps between views of more than this many usual ones are not bridged.
+_GAP = 2.5
+# Views next to the seam of half a turn are evenly spaced to this share of a step.
+_EVEN = 0.05
+# Columns that the values are smoothed over, so that what lies between columns is as sharp as they are.
+_SMOOTH = 1.0
+# A ray counts where this share of those that it is smoothed with was measured.
+_WHOLE = 0.98
+# The 99th percentile of the values that tell how much light a ray has; of larger ones the unit is not known.
+_DARK = 6.0
+
+
+@dataclass(frozen=True)
+class RaysAndOpposites:
+    """Pairs of rays that ought to be equal.
+
+    Attributes
+    ----------
+    own, opposite : (lines, columns, rows)
+        0 where there is no pair.
+    slope : (lines, columns, rows)
+        Change of ``opposite - own`` with the place of the axis, told by the own rays alone.
+    weight : (lines, columns, rows)
+        Inverse of the noise's variance, up to a factor; 0 where there is no pair.
+    """
+
+    own: np.ndarray
+    opposite: np.ndarray
+    slope: np.ndarray
+    weight: np.ndarray
+
+    @property
+    def mismatch(self) -> float:
+        """Share of the variance that opposite rays do not share: 0 where they agree; infinite where there are none."""
+        total = float(self.weight.sum())
+        if not total > 0:
+            return np.inf
+        variance = sum(
+            float((self.weight * (side - (self.weight * side).sum() / total) ** 2).sum())
+            for side in (self.own, self.opposite)
+        )
+        difference = float((self.weight * (self.own - self.opposite) ** 2).sum())
+        return difference / variance if variance > 0 else np.inf
+
+
+@dataclass(frozen=True)
+class OppositeRays:
+    """Rows of a detector that went round the object.
+
+    Attributes
+    ----------
+    values : (views, columns, rows) float64
+        -log(I/I0); NaN for rays that are not to be used.
+    azimuth : (views,)
+        Of the source or the beam, rising, in radians.
+    axis : float
+        Column of the axis, as told.
+    slope : float
+        Change of the tangent of the angle g, anticlockwise, per column; 0 in a parallel beam.
+    """
+
+    values: np.ndarray
+    azimuth: np.ndarray
+    axis: float
+    slope: float
+
+    def joined(self, factor: int) -> OppositeRays:
+        """The same by pixels of which so many columns are joined; the rest at the far end is dropped."""
+        if factor == 1:
+            return self
+        views, columns, rows = self.values.shape
+        parts = self.values[:, : columns // factor * factor].reshape(views, -1, factor, rows)
+        good = np.isfinite(parts)
+        count = good.sum(axis=2)
+        mean = np.where(good, parts, 0).sum(axis=2) / np.maximum(count, 1)
+        axis = (self.axis - 0.5 * (factor - 1)) / factor
+        return OppositeRays(np.where(count, mean, np.nan), self.azimuth, axis, self.slope * factor)
+
+    def pairs(self, offset: float, lines: np.ndarray, columns: np.ndarray) -> RaysAndOpposites:
+        """Rays and their opposites if the axis is so many columns above the told one.
+
+        Parameters
+        ----------
+        offset : float
+        lines : (n,) int
+            Views, or, at the seam of half a turn, all that there are.
+        columns : (m,) int
+        """
+        own, slope, opposite, use = (
+            self._at_seam(offset, columns) if self.seam else self._around(offset, lines, columns)
+        )
+        light = [np.exp(self._dark * np.clip(side, 0, _DARK / self._dark)) for side in (own, opposite)]
+        weight = np.where(use, 2 / (light[0] + light[1]), 0)
+        own, opposite, slope = (np.where(use, part, 0) for part in (own, opposite, slope))
+        return RaysAndOpposites(own, opposite, slope, weight)
+
+    def _around(
+        self, offset: float, lines: np.ndarray, columns: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Rays of these views, slopes, their opposites between two views, and whether there are both."""
+        many = len(self.azimuth)
+        fan = np.arctan(self.slope * (columns - self.axis - offset))
+        begin = self.azimuth[0]
+        there = begin + np.mod(self.azimuth[lines, None] + np.pi + 2 * fan - begin, 2 * np.pi)
+        after = np.searchsorted(self.azimuth, there - 1e-9)
+        first, second = (after - 1) % many, after % many
+        gap = np.mod(self.azimuth[second] - self.azimuth[first], 2 * np.pi)
+        share = np.mod(there - self.azimuth[first] + 1e-9, 2 * np.pi) / np.where(gap > 0, gap, 1)
+        usable = (gap > 0) & (gap <= _GAP * self._step)
+        (a, use_a), (b, use_b) = (self._mirrored(offset, view, columns) for view in (first, second))
+        opposite = (1 - share[..., None]) * a + share[..., None] * b
+        own, steep = (part[lines][:, columns] for part in (self._smooth, self._steep))
+        return own, -2 * steep, opposite, use_a & use_b & usable[..., None] & self._good[lines][:, columns]
+
+    def _at_seam(
+        self, offset: float, columns: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Of half a turn: the first and the last view, and what neighbours on both sides of the seam make of them.
+
+        Beyond the seam lie the mirrored views of the other end. The views are taken for a cubic in the angle.
+        """
+        many = len(self.azimuth)
+        place = {}
+        for k in (-3, -2, -1):
+            view = np.full((1, len(columns)), many + k)
+            place[k] = tuple(part[0] for part in self._mirrored(offset, view, columns))
+        for k in (0, 1, 2):
+            place[k] = self._smooth[k, columns], self._good[k, columns]
+        own, opposite, use = [], [], []
+        for k in (0, -1):
+            around = [place[k + step] for step in (-2, -1, 1, 2)]
+            own.append(place[k][0])
+            opposite.append(sum(w * part for w, (part, _) in zip((-1 / 6, 4 / 6, 4 / 6, -1 / 6), around)))
+            use.append(np.logical_and.reduce([place[k][1], *(good for _, good in around)]))
+        # Of the four neighbours half lie beyond the seam, or all but half, and with them the view itself.
+        slopes = [-np.gradient(own[0], columns, axis=0), np.gradient(own[1], columns, axis=0)]
+        return np.stack(own), np.stack(slopes), np.stack(opposite), np.stack(use)
+
+    def _mirrored(
+        self, offset: float, views: np.ndarray, columns: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Values (lines, columns, rows) of views (lines, columns) at mirrored columns, and whether they are good."""
+        most = self.values.shape[1] - 1
+        where = 2 * (self.axis + offset) - columns
+        left = np.floor(where).astype(int)
+        f = where - left
+        inside = (where >= 0) & (where <= most)
+        # The cubic B-spline of samples that are mirrored at the ends.
+        weights = (
+            (1 - f) ** 3 / 6,
+            (4 - 6 * f**2 + 3 * f**3) / 6,
+            (1 + 3 * f + 3 * f**2 - 3 * f**3) / 6,
+            f**3 / 6,
+        )
+        values = np.zeros((*views.shape, self.values.shape[2]))
+        for step, weight in zip((-1, 0, 1, 2), weights):
+            column = np.abs(left + step)
+            column = np.clip(np.where(column > most, 2 * most - column, column), 0, most)
+            values += weight[:, None] * self._spline[views, column]
+        near = np.clip(np.round(where).astype(int), 0, most)
+        return values, self._good[views, near] & inside[:, None]
+
+    @cached_property
+    def _share(self) -> np.ndarray:
+        """How much of what is smoothed together was measured."""
+        from scipy.ndimage import gaussian_filter1d
+
+        return gaussian_filter1d(
+            np.isfinite(self.values).astype(np.float64), _SMOOTH, axis=1, mode="constant"
+        )
+
+    @cached_property
+    def _good(self) -> np.ndarray:
+        return self._share > _WHOLE
+
+    @cached_property
+    def _smooth(self) -> np.ndarray:
+        """The values a little smoothed along columns, where they were measured."""
+        from scipy.ndimage import gaussian_filter1d
+
+        known = np.where(np.isfinite(self.values), self.values, 0)
+        return gaussian_filter1d(known, _SMOOTH, axis=1, mode="constant") / np.maximum(self._share, 1e-3)
+
+    @cached_property
+    def _steep(self) -> np.ndarray:
+        return np.gradient(self._smooth, axis=1)
+
+    @cached_property
+    def _spline(self) -> np.ndarray:
+        from scipy.ndimage import spline_filter1d
+
+        return spline_filter1d(self._smooth, 3, axis=1, mode="mirror")
+
+    @cached_property
+    def _dark(self) -> float:
+        """What the values are multiplied by so that they are attenuations of no more than `_DARK`."""
+        usual = float(np.percentile(self._smooth[:: -(-len(self._smooth) // 32)], 99))
+        return min(1.0, _DARK / usual) if usual > 0 else 1.0
+
+    @cached_property
+    def _gaps(self) -> np.ndarray:
+        return np.diff(self.azimuth, append=self.azimuth[0] + 2 * np.pi)
+
+    @cached_property
+    def _step(self) -> float:
+        return float(np.median(self._gaps))
+
+    @cached_property
+    def seam(self) -> bool:
+        """Whether these are views of half a turn in a parallel beam that begins where `azimuth` does."""
+        if self.slope or len(self.azimuth) < 6:
+            return False
+        steps = np.concatenate([self._gaps[:3], self._gaps[-4:-1], [self._gaps[-1] - np.pi]])
+        return bool((np.abs(steps / self._step - 1) < _EVEN).all())
