@@ -155,12 +155,14 @@ def test_each_is_refused_at_no_cost(tmp_path):
     lines = done.stdout.splitlines()
     assert len(lines) == len(paths) - 1
     # Not every index of chunks stores how long a plain one is: then other bytes of the file may be read, at no cost.
+    # Old releases of HDF5 do not look whether a chunk of scaled numbers is whole.
+    unchecked = (
+        ("plain chunk", "scale and offset") if h5py.version.hdf5_version_tuple < (1, 14) else "plain chunk"
+    )
     bad = [
         f"{path.name}: {line}"
         for path, line in zip(paths[1:], lines)
-        if not (
-            line.startswith("ok") or (line.startswith("ACCEPTED") and path.name.startswith("plain chunk"))
-        )
+        if not (line.startswith("ok") or (line.startswith("ACCEPTED") and path.name.startswith(unchecked)))
     ]
     assert not bad, "\n".join(bad)
 

@@ -76,6 +76,8 @@ class Answer:
         evidence, why = parts["evidence"], parts["why"]
         if not isinstance(why, str) or not isinstance(evidence, Mapping):
             raise TypeError(f"an answer with words and evidence, got {parts!r}")
+        if not all(isinstance(number, int | float) for number in evidence.values()):
+            raise TypeError(f"evidence in numbers, got {evidence!r}"[:200])
         try:
             return cls(parts["value"], why, Status(parts["status"]), dict(evidence))
         except ValueError as error:
