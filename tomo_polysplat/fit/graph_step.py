@@ -107,7 +107,8 @@ class GraphStep(FusedStep):
             _give_back(device)
             try:
                 super().__call__(np.arange(batch), 0.0)
-                torch.cuda.synchronize()
+                # Not the whole device: another thread may be recording on it.
+                torch.cuda.current_stream().synchronize()
             finally:
                 self._forget(before)
             _give_back(device)
