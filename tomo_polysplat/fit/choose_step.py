@@ -97,7 +97,7 @@ def own_step(
     else:
         logger.debug("Steps one operation at a time: %s.", reason)
     if ranks.total(float(bool(full)))[0]:
-        graph = None
+        graph = None  # where only another rank lacks room, for who goes on to have it
         raise NoRoom(full or "the GPU of another rank has no room for its part of a step")
     # What the two forms add up over ranks is not the same.
     if ranks.same(graph is not None) and graph is not None:
