@@ -134,7 +134,10 @@ def test_a_rank_that_follows_shares_the_same_and_goes_on_without_a_step(problem,
     monkeypatch.setattr(follow, "kept_threads", nullcontext)
     messages = [
         ([], ("rays", 1, rays.projections)),
-        *(([], ("make", number, 1, parts | {"beside": beside})) for number, beside in ((2, 0), (3, 2), (4, 2))),
+        *(
+            ([], ("make", number, 1, parts | {"beside": beside}))
+            for number, beside in ((2, 0), (3, 2), (4, 2))
+        ),
         ([2], ("end",)),
     ]
     follow.follow(SimpleNamespace(hear=lambda: messages.pop(0), device=torch.device("cpu")))

@@ -83,7 +83,7 @@ def test_counts_beyond_32_bits_are_counted(monkeypatch):
 
 
 def test_a_step_takes_what_was_measured_on_a_gpu():
-    """On an H100: 330 B a Gaussian stay, a step makes 780 of it and 12 B a voxel, a second run 250 and a step's once more."""
+    """On an H100: 330 B a Gaussian, 780 and 12 a voxel by a step; by a second run 250, and a step once more."""
     count, voxels = 2_760_000, 192**3
     scene = {"gaussians": count, "views": 6, "pixels": 0, "voxels": voxels}
     for runs, a_gaussian in ((1, 330 + 780), (2, 330 + 250 + 2 * 780)):

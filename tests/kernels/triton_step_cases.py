@@ -143,7 +143,9 @@ def another_number_of_views_or_gaussians_is_no_other_kernel(device):
     from triton.runtime import interpreter
 
     found: set[tuple] = set()
-    with mock.patch.object(interpreter.InterpretedFunction, "run", lambda *a, **k: found.add(_special(*a, **k))):
+    with mock.patch.object(
+        interpreter.InterpretedFunction, "run", lambda *a, **k: found.add(_special(*a, **k))
+    ):
         for count, batch in ((17, 2), (16, 1), (33, 3), (32, 4)):
             before = set(found)
             for pixel_rays in (1, 2):

@@ -69,7 +69,9 @@ def linked(told, monkeypatch):
     """What ASTRA is given is kept here, and its algorithms end as ``told``."""
     kept = []
     monkeypatch.setattr(astra.data3d, "GPULink", lambda *_: None)
-    monkeypatch.setattr(astra.data3d, "link", lambda kind, geometry, data: kept.append((kind, data)) or len(kept))
+    monkeypatch.setattr(
+        astra.data3d, "link", lambda kind, geometry, data: kept.append((kind, data)) or len(kept)
+    )
     monkeypatch.setattr(astra.data3d, "delete", lambda _: None)
     for name in ("create", "delete"):
         monkeypatch.setattr(astra.algorithm, name, lambda _: 1)

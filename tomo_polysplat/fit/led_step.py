@@ -61,6 +61,7 @@ class LedStep:
         self._ranks, self._gaussians, self._projections = ranks, gaussians, rays.projections
         self._number = ranks.number()
         weakref.finalize(self, ranks.let_go, self._number).atexit = False
+        self._own: Step
         full = ""
         with ranks.together():
             views = rays.views
@@ -76,7 +77,7 @@ class LedStep:
                 "beside": 0 if beside is None else beside._number,
             }
             ranks.tell("make", self._number, _lent(self._projections, ranks), parts)
-            shared = None if beside is None else beside._own
+            shared: Step | None = None if beside is None else beside._own
             try:
                 self._own = make(gaussians, spacing, rays, scene, settings, batch, ranks, shared)
             except torch.OutOfMemoryError as problem:

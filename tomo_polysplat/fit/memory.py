@@ -184,9 +184,7 @@ def require_room(
     return words
 
 
-def room_for_gaussians(
-    device: torch.device, *, views: int, pixels: int, voxels: int, runs: int = 1
-) -> float:
+def room_for_gaussians(device: torch.device, *, views: int, pixels: int, voxels: int, runs: int = 1) -> float:
     """How many Gaussians of a run there is memory for, on a CPU too; infinity where nobody tells how much is free.
 
     Parameters

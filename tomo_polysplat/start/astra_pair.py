@@ -8,6 +8,7 @@ from types import TracebackType
 import numpy as np
 import torch
 
+from tomo_polysplat.free_memory import give_back
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, to_astra
 
 __all__ = ["AstraPair", "astra_has_gpu", "gpu_index", "make_room"]
@@ -29,7 +30,7 @@ def gpu_index(device: str | torch.device) -> int:
 def make_room(index: int | None, size: float) -> None:
     """Give back what torch keeps of a GPU for later, where ASTRA would have fewer than so many bytes without it."""
     if torch.cuda.mem_get_info(index)[0] < size:
-        torch.cuda.empty_cache()
+        give_back()
 
 
 class AstraPair:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from tomo_polysplat.free_memory import give_back
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, to_astra
 from tomo_polysplat.start import sirt as start
 from tomo_polysplat.start.astra_pair import astra_has_gpu, gpu_index
@@ -55,11 +56,10 @@ def _sirt_cuda(
     projections: np.ndarray, geometry: Geometry, grid: VolumeGrid, iterations: int, index: int
 ) -> np.ndarray:
     import astra
-    import torch
     from astra.log import AstraError
 
     # It asks for none of what torch keeps for later.
-    torch.cuda.empty_cache()
+    give_back()
     proj_geom, vol_geom = to_astra(geometry, grid)
     ordered = np.ascontiguousarray(projections.swapaxes(0, 1), dtype=np.float32)
     usable = np.isfinite(ordered)
