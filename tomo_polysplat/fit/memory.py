@@ -128,6 +128,7 @@ def step_bytes(
     )
 
 
+# All that a step takes, and the words of two kinds of device.
 def require_room(
     device: torch.device,
     *,
