@@ -120,6 +120,16 @@ def test_a_gpu_that_is_full_all_the_same_is_told_with_a_remedy(monkeypatch):
         fit(*problem, course)
 
 
+def test_what_recorded_graphs_keep_is_no_room_for_a_volume(monkeypatch):
+    """Torch keeps 8 GB, of which it can give back what is no graph's: 1 GB, or all."""
+    for free in (1.5e9, 8.5e9):
+        state = [5e8]
+        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _, state=state: (int(state[0]), int(1e10)))
+        monkeypatch.setattr(memory, "give_back", lambda free=free, state=state: state.insert(0, free))
+        with_free(monkeypatch, 5e8 + 8e9)
+        assert memory.voxels_at_once(GPU) == int(0.45 * free / memory._MADE)
+
+
 @pytest.mark.gpu
 def test_free_memory_is_what_an_allocation_takes():
     before = memory.free_bytes(GPU)

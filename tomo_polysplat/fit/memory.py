@@ -10,7 +10,7 @@ from contextlib import contextmanager
 import torch
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.free_memory import available_memory, free_bytes, in_gigabytes, require_memory
+from tomo_polysplat.free_memory import available_memory, free_bytes, give_back, in_gigabytes, require_memory
 from tomo_polysplat.kernels.portions import FEW_VIEWS, MANY
 from tomo_polysplat.ranks import current_ranks
 
@@ -62,6 +62,10 @@ def voxels_at_once(device: torch.device) -> int:
     free = available_memory() if device.type == "cpu" else free_bytes(device)
     if free is None:
         return _LARGEST_SLAB
+    if device.type != "cpu" and torch.cuda.mem_get_info(device)[0] < _LARGEST_SLAB * _MADE:
+        # What torch keeps counts as free; but what recorded graphs need, amid a run, only they can use.
+        give_back()
+        free = min(free, torch.cuda.mem_get_info(device)[0])
     return min(max(int(0.5 * _SHARE * free / _MADE), 1), _LARGEST_SLAB)
 
 
