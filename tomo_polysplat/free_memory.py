@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -21,8 +22,12 @@ if TYPE_CHECKING:
 
 __all__ = [
     *("available_memory", "bytes_of", "free_bytes", "in_gigabytes"),
-    *("limit_memory", "memory_limits", "require_memory"),
+    *("give_back", "limit_memory", "memory_limits", "recording", "require_memory"),
 ]
+
+# Held while a CUDA graph is recorded, which one thread of a process can do at a time. If another one gave memory back
+# meanwhile, torch would end that with an error.
+recording = threading.Lock()
 
 _MEMINFO, _OWN_GROUPS, _GROUPS = Path("/proc/meminfo"), Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
 # Limit, use, and what of the use is files that the system can let go of, in both versions of control groups.
@@ -84,6 +89,14 @@ def free_bytes(device: torch.device) -> int:
     free = torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device) - held
     limit = _LIMITS.get({}).get("cuda")
     return free if limit is None else max(min(free, int(limit) - held), 0)
+
+
+def give_back() -> None:
+    """Give back what torch keeps of GPUs for later."""
+    import torch
+
+    with recording:
+        torch.cuda.empty_cache()
 
 
 def available_memory() -> int | None:

@@ -1,12 +1,15 @@
-"""A run's steps: how fast they go when time is short."""
+"""A run's steps: how fast they go when time is short, and what growing and branching hold and leave behind."""
 
 import math
 import sys
+import weakref
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from tomo_polysplat.fit import fitter as fitters
 from tomo_polysplat.fit.fitter import Batches, Fitter
 from tomo_polysplat.fit.stopping import Clock
 
@@ -52,3 +55,43 @@ def test_its_pace_goes_with_a_branch_and_a_snapshot():
     assert rates(resumed) != rates(hurried)
     resumed.restore(hurried.snapshot(None, {}))
     assert rates(resumed) == rates(hurried.branch(pixel_rays=1)) == rates(hurried)
+
+
+def test_a_cloud_grows_after_its_old_step_has_gone(monkeypatch):
+    """Which on a GPU holds as much as the new one."""
+    fitter = after_a_pass(400, Clock)
+    fitter.most, before, done = 2 * len(fitter.gaussians), len(fitter.gaussians), fitter.step.done
+    old, kept, make = weakref.ref(fitter.step), fitter.step.moments["blur"][0].clone(), fitters.make_step
+
+    def made(*parts, **options):
+        assert old() is None
+        return make(*parts, **options)
+
+    monkeypatch.setattr(fitters, "make_step", made)
+    fitter._grow()
+    assert len(fitter.gaussians) > before and fitter.step.done == done > 0
+    assert torch.equal(fitter.step.moments["blur"][0], kept)
+    assert fitter.step.moments["position"][0].any()
+
+
+def test_a_branch_without_room_leaves_no_trace(monkeypatch):
+    def full(gaussians, *_, **__):
+        # As the trial of a step would.
+        gaussians.position.fill_(torch.nan)
+        raise torch.OutOfMemoryError("full")
+
+    ends = []
+    for asked in (False, True):
+        fitter, clock = fitter_of(40), Clock(40, None)
+        fitter.ahead(clock, 1)
+        if asked:
+            with monkeypatch.context() as patch, pytest.raises(torch.OutOfMemoryError):
+                patch.setattr(fitters, "make_step", full)
+                fitter.branch(pixel_rays=2)
+        fitter.ahead(clock, 2)
+        ends.append(fitter.snapshot(None, {}))
+    one, other = ends
+    assert one.numbers == other.numbers and np.array_equal(one.order, other.order)
+    for name, tensor in one.gaussians.parameters().items():
+        assert torch.equal(tensor, other.gaussians.parameters()[name]), name
+        assert torch.equal(one.first[name], other.first[name]), name

@@ -1,10 +1,18 @@
 """What is said about memory, and when a run is refused or its projections stay on the host."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 from tomo_polysplat.fit import memory
+from tomo_polysplat.fit.optimise import Course, fit
+from tomo_polysplat.ranks import Ranks
+
+sys.path.append(str(Path(__file__).parents[1] / "kernels"))
+from step_scenes import fit_problem
 
 CPU, GPU = torch.device("cpu"), torch.device("cuda", 0)
 SCENE = {
@@ -72,6 +80,54 @@ def test_counts_beyond_32_bits_are_counted(monkeypatch):
     said = memory.require_room(GPU, **(SCENE | {"voxels": 4096**3, "projections": 2**33}))
     assert f"{(4096**3 * 12 + (12 << 25)) / 1e9:.2f} GB" in said and "on the GPU, 8.59 GB" in said
     assert "streamed" in memory.require_room(GPU, **(SCENE | {"projections": 0}))
+
+
+def test_a_step_takes_what_was_measured_on_a_gpu():
+    """On an H100: 330 B a Gaussian, 780 and 12 a voxel by a step; by a second run 250, and a step once more."""
+    count, voxels = 2_760_000, 192**3
+    scene = {"gaussians": count, "views": 6, "pixels": 0, "voxels": voxels}
+    for runs, a_gaussian in ((1, 330 + 780), (2, 330 + 250 + 2 * 780)):
+        taken = a_gaussian * count + runs * 12 * voxels
+        told = memory.step_bytes(GPU, **scene, runs=runs)
+        counted = sum(told.values()) - min(memory._SAMPLES, 27 * 12 * voxels)
+        assert taken <= counted < 1.1 * taken
+
+
+def test_a_cloud_a_little_too_small_to_be_drawn_by_parts_takes_the_most(monkeypatch):
+    """Two runs of it are no large cloud either."""
+    scene = {"views": 12, "pixels": 0, "voxels": 0}
+
+    def taken(count, runs=1):
+        return sum(memory.step_bytes(GPU, gaussians=count, runs=runs, **scene).values())
+
+    counts = [100_000, 600_000, 999_999, 1_000_001, 1_500_000, 3_000_000]
+    one = [taken(count) for count in counts]
+    assert sorted(one) == one and [taken(count, 2) for count in counts] == [2 * size for size in one]
+    monkeypatch.setattr(memory, "current_ranks", lambda: Ranks(0, 2))
+    assert all(taken(count) > alone for count, alone in zip(counts, one))
+
+
+def test_a_gpu_that_is_full_all_the_same_is_told_with_a_remedy(monkeypatch):
+    """Whatever a run has begun with."""
+    problem = fit_problem("cone", True, "cpu", "numba")
+
+    def full(*_, **__):
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
+
+    monkeypatch.setattr("tomo_polysplat.fit.fitter.make_step", full)
+    course = Course(views_per_step=2, rng=np.random.default_rng(0), started=0.0, volume=lambda _: None)
+    with pytest.raises(MemoryError, match="2.00 GiB.*max_gaussians.*settings=.*memory"):
+        fit(*problem, course)
+
+
+def test_what_recorded_graphs_keep_is_no_room_for_a_volume(monkeypatch):
+    """Torch keeps 8 GB, of which it can give back what is no graph's: 1 GB, or all."""
+    for free in (1.5e9, 8.5e9):
+        state = [5e8]
+        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _, state=state: (int(state[0]), int(1e10)))
+        monkeypatch.setattr(memory, "give_back", lambda free=free, state=state: state.insert(0, free))
+        with_free(monkeypatch, 5e8 + 8e9)
+        assert memory.voxels_at_once(GPU) == int(0.45 * free / memory._MADE)
 
 
 @pytest.mark.gpu

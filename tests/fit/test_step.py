@@ -146,13 +146,19 @@ def test_another_number_of_views_or_gaussians_compiles_nothing(monkeypatch):
     """Which would take longer than many a pass over the views."""
     import triton
 
-    from tomo_polysplat.kernels.step.triton_detector import _blurred_kernel
-
     compiled = []
-    monkeypatch.setattr(
-        triton.knobs.runtime, "jit_post_compile_hook", lambda **about: compiled.append(about["repr"])
-    )
-    _blurred_kernel.device_caches.clear()
+
+    def note(**about):
+        # torch has kernels of Triton's as well.
+        if about["fn"].module.startswith("tomo_polysplat"):
+            compiled.append(about["repr"])
+
+    monkeypatch.setattr(triton.knobs.runtime, "jit_post_compile_hook", note)
+    # Whatever ran before: without this some of the kernels, or all of them, are there already.
+    for module in [m for name, m in sys.modules.items() if name.startswith("tomo_polysplat.kernels.")]:
+        for kernel in vars(module).values():
+            if isinstance(kernel, triton.runtime.JITFunction):
+                kernel.device_caches.clear()
     found = []
     for count, batch in ((17, 2), (16, 1), (33, 3)):
         compiled.clear()
@@ -179,6 +185,87 @@ def test_a_graph_that_cannot_be_recorded_is_said_and_replaced(monkeypatch, caplo
         assert torch.equal(tensor, before.parameters()[name]), name
     step(np.array([0, 1]), 0.0)
     assert np.isfinite(step.read()[0])
+
+
+def stepped(step, turns):
+    """Of steps made so: the last one's Gaussians and what they read."""
+    for k in turns:
+        step(np.array([k % 5, (k + 2) % 5]), 0.1 * k)
+    return step.gaussians.copy(), step.read()
+
+
+def assert_alike(one, other):
+    np.testing.assert_allclose(one[1], other[1], rtol=1e-5)
+    for name, tensor in one[0].parameters().items():
+        torch.testing.assert_close(tensor, other[0].parameters()[name], rtol=1e-4, atol=1e-5, msg=name)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("every", [1, 2])
+def test_runs_that_share_memory_step_as_if_alone(every):
+    """One after the other, each twice; also when the first has gone, and a third one shares with the second."""
+
+    def problem(rays):
+        return fit_problem("cone", True, "cuda", "triton", every=every, pixel_rays=rays)
+
+    alone = {rays: stepped(make_step(*problem(rays), batch=BATCH), range(6)) for rays in (1, 2)}
+    first = make_step(*problem(1), batch=BATCH)
+    second = make_step(*problem(2), batch=BATCH, beside=first)
+    assert second._pool == first._pool
+    for step in (first, second):
+        for k in range(3):
+            step(np.array([k % 5, (k + 2) % 5]), 0.1 * k)
+    assert_alike(stepped(first, range(3, 6)), alone[1])
+    assert_alike(stepped(second, range(3, 6)), alone[2])
+    del first
+    torch.cuda.empty_cache()
+    third = make_step(*problem(1), batch=BATCH, beside=second)
+    assert_alike(stepped(third, range(6)), alone[1])
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("place", ["_of_rays", "_volume_gradients", "_update"])
+def test_a_gpu_without_room_for_a_second_run_goes_on_with_the_first(place, monkeypatch):
+    """Wherever in the recording it ends; torch can then give memory back and record again."""
+    from tomo_polysplat.fit.choose_step import NoRoom
+    from tomo_polysplat.fit.graph_step import GraphStep
+
+    problem = fit_problem("cone", True, "cuda", "triton")
+    alone = stepped(make_step(*problem, batch=BATCH), range(6))
+    first, do = (
+        make_step(*fit_problem("cone", True, "cuda", "triton"), batch=BATCH),
+        getattr(GraphStep, place),
+    )
+    for k in range(3):
+        first(np.array([k, (k + 2) % 5]), 0.1 * k)
+
+    def full(step, *parts):
+        made = do(step, *parts)
+        if torch.cuda.is_current_stream_capturing():
+            torch.empty(1 << 50, dtype=torch.uint8, device="cuda")
+        return made
+
+    with monkeypatch.context() as patch, pytest.raises(NoRoom):
+        patch.setattr(GraphStep, place, full)
+        make_step(*fit_problem("cone", True, "cuda", "triton"), batch=BATCH, beside=first)
+    torch.cuda.empty_cache()
+    again = make_step(*fit_problem("cone", True, "cuda", "triton"), batch=BATCH, beside=first)
+    assert_alike(stepped(first, range(3, 6)), alone)
+    assert_alike(stepped(again, range(6)), alone)
+
+
+@pytest.mark.gpu
+def test_a_recording_that_is_invalidated_leaves_torch_in_order():
+    """Other steps are made in its place, and memory can be given back."""
+    from tomo_polysplat.fit.graph_step import GraphStep
+
+    with pytest.MonkeyPatch.context() as patch:
+        do = GraphStep._update
+        # To wait for a stream that is recorded is forbidden, and ends the recording.
+        patch.setattr(GraphStep, "_update", lambda step, made: (do(step, made), made.scale.cpu()))
+        assert isinstance(make_step(*fit_problem("cone", True, "cuda", "triton"), batch=BATCH), EagerStep)
+    torch.cuda.empty_cache()
+    assert isinstance(make_step(*fit_problem("cone", True, "cuda", "triton"), batch=BATCH), GraphStep)
 
 
 def test_a_step_does_not_load_the_compiler_of_torch():

@@ -1,6 +1,7 @@
 """Steps of the optimiser by the Triton kernels against those by autograd."""
 
 import functools
+import inspect
 from unittest import mock
 
 import numpy as np
@@ -132,6 +133,44 @@ def what_is_not_a_number_shows_in_the_misfit(device):
         problem[0].attenuation[3] = float("nan")
         step(np.array([0, 3]), 0.0)
         assert np.isnan(step.read()[0]), (blurring, rays)
+
+
+@case
+def another_number_of_views_or_gaussians_is_no_other_kernel(device):
+    """Triton compiles anew for what begins at 16 bytes or does not, and for some whole numbers."""
+    if device != "cpu":
+        return  # tests/fit/test_step.py counts what is compiled
+    from triton.runtime import interpreter
+
+    found: set[tuple] = set()
+    with mock.patch.object(
+        interpreter.InterpretedFunction, "run", lambda *a, **k: found.add(_special(*a, **k))
+    ):
+        for count, batch in ((17, 2), (16, 1), (33, 3), (32, 4)):
+            before = set(found)
+            for pixel_rays in (1, 2):
+                problem = fit_problem("cone", True, device, "triton", count=count, pixel_rays=pixel_rays)
+                _fused(*problem, batch)(np.arange(batch), 0.0)
+            assert not before or found == before, found - before
+    assert len(found) > 10
+
+
+def _special(kernel, *args, grid, warmup, **named):
+    """What Triton makes a kernel for: of arguments their types, or their values where it looks at these."""
+    from tomo_polysplat.kernels.triton_maths import SIZES
+
+    told = [kernel.fn.__name__]
+    parameters = inspect.signature(kernel.fn).parameters
+    own = {name: value for name, value in named.items() if name in parameters}
+    for name, value in inspect.signature(kernel.fn).bind(*args, **own).arguments.items():
+        if "constexpr" in str(parameters[name].annotation) or value is None:
+            told.append((name, str(value)))
+        elif isinstance(value, torch.Tensor):
+            told.append((name, value.dtype, value.data_ptr() % 16 == 0))
+        else:
+            looks = type(value) is int and name not in SIZES
+            told.append((name, type(value), looks and (value == 1, value % 16 == 0)))
+    return tuple(told)
 
 
 @case

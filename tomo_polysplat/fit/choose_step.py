@@ -14,9 +14,13 @@ from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.ranks import ALONE, Ranks, current_ranks
 from tomo_polysplat.settings import Settings
 
-__all__ = ["make_step", "own_step", "why_eager"]
+__all__ = ["NoRoom", "make_step", "own_step", "why_eager"]
 
 logger = logging.getLogger(__name__)
+
+
+class NoRoom(torch.OutOfMemoryError):
+    """A GPU has no room for a step, that of any of the ranks, which all go on without it."""
 
 
 def why_eager(scene: FitScene, settings: Settings) -> str:
@@ -50,7 +54,7 @@ def make_step(
 
     Raises
     ------
-    torch.OutOfMemoryError
+    NoRoom
         Where a GPU has no room for the graph: operation by operation would need more.
     """
     ranks = current_ranks()
@@ -58,7 +62,8 @@ def make_step(
         if ranks.count > 1:
             logger.warning("One device makes the steps: structural similarity is of whole steps.")
         return own_step(gaussians, spacing, rays, scene, settings, batch, beside=beside)
-    return LedStep(own_step, gaussians, spacing, rays, scene, settings, batch, ranks)
+    led = beside if isinstance(beside, LedStep) else None
+    return LedStep(own_step, gaussians, spacing, rays, scene, settings, batch, ranks, led)
 
 
 # What a step needs, and whom it shares it with.
@@ -73,7 +78,7 @@ def own_step(
     beside: Step | None = None,
 ) -> Step:
     """This process's step, or its part of that of ``ranks``, which all make theirs; see `make_step`."""
-    reason = why_eager(scene, settings)
+    reason, full = why_eager(scene, settings), ""
     graph: Step | None = None
     if not reason:
         from tomo_polysplat.fit.graph_step import GraphStep
@@ -83,13 +88,27 @@ def own_step(
             graph = GraphStep(gaussians, spacing, rays, scene, settings, batch, ranks, shared)
         # Of compiler or driver, of any kind: the slower way gives the same result.
         except Exception as problem:
-            if isinstance(problem, torch.OutOfMemoryError) and ranks.count == 1:
-                raise
             logger.debug("no CUDA graph", exc_info=True)
-            logger.warning("Steps one operation at a time: no CUDA graph could be recorded: %s", problem)
+            if _of_memory(problem):
+                # Its text alone: the error holds all that was made.
+                full = str(problem)
+            else:
+                logger.warning("Steps one operation at a time: no CUDA graph could be recorded: %s", problem)
     else:
         logger.debug("Steps one operation at a time: %s.", reason)
+    if ranks.total(float(bool(full)))[0]:
+        graph = None  # where only another rank lacks room, for who goes on to have it
+        raise NoRoom(full or "the GPU of another rank has no room for its part of a step")
     # What the two forms add up over ranks is not the same.
     if ranks.same(graph is not None) and graph is not None:
         return graph
     return EagerStep(gaussians, spacing, rays, scene, settings, ranks)
+
+
+def _of_memory(problem: BaseException | None) -> bool:
+    """Whether an error is for want of memory, or has come of such a one: a recording that it ends may fail anew."""
+    while problem is not None:
+        if isinstance(problem, torch.OutOfMemoryError) or "out of memory" in str(problem):
+            return True
+        problem = problem.__context__
+    return False

@@ -118,7 +118,8 @@ class Fitter:
     def _settle(self) -> None:
         device = self.gaussians.position.device
         if device.type == "cuda":
-            torch.cuda.synchronize(device)
+            # Its own work alone: while another thread records a graph, nobody may wait for the whole device.
+            torch.cuda.current_stream(device).synchronize()
 
     def ahead(self, clock: Clock, passes: int) -> list[tuple[float, float, int]]:
         """What so many more passes gave, as `passes` tells it."""
@@ -203,22 +204,25 @@ class Fitter:
         """Split Gaussians where the rays ask for more detail, with a fresh memory of the optimiser."""
         self.relocation_due = False
         before, old = len(self.gaussians), self.step
+        moments_before, done, largest = old.moments, old.done, old.largest
         dense = self.settings.bone_level
         count = math.ceil(_SPLIT * int(splittable(self.gaussians, dense).sum()))
         grown, changed = grow(self.gaussians, old.pull, min(count, self.most - before), dense)
         order = spatial_order(grown.position)
         self.gaussians = grown.select(order)
         hurry = hurried(self.settings, self.steps)
+        # What the old step holds on its way is as much again, and too small for the new one.
+        del old, self.step
         self.step = make_step(self.gaussians, self.spacing, self.rays, self.scene, hurry, batch=self.batch)
         for name, moments in self.step.moments.items():
-            for moment, kept in zip(moments, old.moments[name]):
+            for moment, kept in zip(moments, moments_before[name]):
                 if name in OF_ALL:
                     moment.copy_(kept)
                     continue
                 wider = torch.cat([kept, kept.new_zeros((len(grown) - before, *kept.shape[1:]))])
                 wider[changed] = 0.0
                 moment.copy_(wider[order])
-        self.step.done, self.step.largest = old.done, old.largest
+        self.step.done, self.step.largest = done, largest
 
     def _next_views(self, batch: int) -> np.ndarray:
         chosen, self.order = next_views(self.order, batch, len(self.rays.views), self.rng)

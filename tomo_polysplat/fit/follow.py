@@ -6,12 +6,13 @@ import os
 import signal
 import sys
 import threading
+from contextlib import suppress
 from typing import Any
 
 import torch
 import torch.distributed as dist
 
-from tomo_polysplat.fit.choose_step import own_step
+from tomo_polysplat.fit.choose_step import NoRoom, own_step
 from tomo_polysplat.fit.led_step import fingerprint, state_of
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.step import Step
@@ -29,7 +30,12 @@ class _Followed:
     """A step as this rank makes it."""
 
     def __init__(
-        self, number_of_rays: int, projections: torch.Tensor, parts: dict[str, Any], ranks: Ranks
+        self,
+        number_of_rays: int,
+        projections: torch.Tensor,
+        parts: dict[str, Any],
+        ranks: Ranks,
+        beside: Step | None = None,
     ) -> None:
         self.number_of_rays = number_of_rays
         self.gaussians: Gaussians = parts["gaussians"]
@@ -38,7 +44,7 @@ class _Followed:
         views = DetectorViews(*parts["views"])
         self.rays = Rays(projections, views, photons, model_error, held_out, streamed, dimmed)
         about = (parts["spacing"], self.rays, parts["scene"], parts["settings"], parts["batch"])
-        self.step: Step = own_step(self.gaussians, *about, ranks)
+        self.step: Step = own_step(self.gaussians, *about, ranks, beside)
 
     @torch.no_grad()
     def restore(self, state: list[torch.Tensor], done: int, rates: Any) -> None:
@@ -70,7 +76,13 @@ def _follow(ranks: Ranks) -> None:
         if what == "rays":
             _take(number, parts[0], lent, steps)
         elif what == "make":
-            steps[number] = _Followed(parts[0], lent[parts[0]], parts[1], ranks)
+            other = steps.get(parts[1]["beside"])
+            beside = None if other is None else other.step
+            # All ranks know of it, and rank 0 says what becomes of it.
+            with suppress(NoRoom):
+                steps[number] = _Followed(parts[0], lent[parts[0]], parts[1], ranks, beside)
+            # Nothing that is gone is to be held until the next message.
+            other = beside = None
         elif what == "state":
             steps[number].restore(*parts)
         elif what == "step":

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +13,7 @@ from tomo_polysplat.fit.fused_step import FusedStep, Gradients
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.step import smoothing
+from tomo_polysplat.free_memory import give_back, recording
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.ranks import ALONE, Ranks
 from tomo_polysplat.settings import Settings
@@ -21,8 +22,6 @@ __all__ = ["GraphStep"]
 
 # Steps that the host may be ahead of the device: enough to hide its work, few enough to keep a time budget.
 _AHEAD = 4
-# CUDA graphs of one process can be recorded only one after the other.
-_recording = threading.Lock()
 # Of the device's memory, what torch may keep unused while a step is recorded.
 _UNUSED = 0.02
 
@@ -34,7 +33,7 @@ def _give_back(device: torch.device) -> None:
     """
     unused = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
     if unused > _UNUSED * torch.cuda.mem_get_info(device)[1]:
-        torch.cuda.empty_cache()
+        give_back()
 
 
 class _Recorded(NamedTuple):
@@ -107,7 +106,8 @@ class GraphStep(FusedStep):
             _give_back(device)
             try:
                 super().__call__(np.arange(batch), 0.0)
-                torch.cuda.synchronize()
+                # Not the whole device: another thread may be recording on it.
+                torch.cuda.current_stream().synchronize()
             finally:
                 self._forget(before)
             _give_back(device)
@@ -137,14 +137,29 @@ class GraphStep(FusedStep):
         again: more than the recording itself.
         """
         graph = torch.cuda.CUDAGraph()
-        with _recording, torch.cuda.stream(stream):
+        with recording, torch.cuda.stream(stream):
             torch.cuda.synchronize()
-            graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
             try:
-                made = make()
-            finally:
-                graph.capture_end()
+                graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
+                try:
+                    made = make()
+                finally:
+                    graph.capture_end()
+            except BaseException:
+                self._end_recording()
+                raise
         return graph, made
+
+    def _end_recording(self) -> None:
+        """Tell torch's allocator that a recording has ended which could not be ended in order.
+
+        It would give nothing back any more: ``torch.cuda.empty_cache`` would be an error in this process from now on.
+        """
+        # One that has ended in order, or never began, is refused by the first of the two.
+        with suppress(RuntimeError, AttributeError):
+            device = torch.cuda.current_device()
+            torch._C._cuda_endAllocateToPool(device, self._pool)
+            torch._C._cuda_releasePool(device, self._pool)
 
     def _forget(self, before: Gaussians) -> None:
         for name, tensor in self.gaussians.parameters().items():

@@ -36,6 +36,13 @@ class LedStep:
     gaussians, spacing, rays, scene, settings, batch
         See `fit.choose_step.make_step`.
     ranks : Ranks
+    beside : LedStep, optional
+        Another one of the same run, never made at the same time.
+
+    Raises
+    ------
+    torch.OutOfMemoryError
+        Where the device of a rank has no room for its part; more can be made together all the same.
     """
 
     # As many parameters as a step has, and who makes it.
@@ -49,10 +56,13 @@ class LedStep:
         settings: Settings,
         batch: int,
         ranks: Ranks,
+        beside: LedStep | None = None,
     ) -> None:
         self._ranks, self._gaussians, self._projections = ranks, gaussians, rays.projections
         self._number = ranks.number()
         weakref.finalize(self, ranks.let_go, self._number).atexit = False
+        self._own: Step
+        full = ""
         with ranks.together():
             views = rays.views
             parts = {
@@ -64,9 +74,16 @@ class LedStep:
                 "scene": replace(scene, solid_number=None),
                 "settings": settings,
                 "batch": batch,
+                "beside": 0 if beside is None else beside._number,
             }
             ranks.tell("make", self._number, _lent(self._projections, ranks), parts)
-            self._own = make(gaussians, spacing, rays, scene, settings, batch, ranks)
+            shared: Step | None = None if beside is None else beside._own
+            try:
+                self._own = make(gaussians, spacing, rays, scene, settings, batch, ranks, shared)
+            except torch.OutOfMemoryError as problem:
+                full = str(problem) or "no room"
+        if full:
+            raise torch.OutOfMemoryError(full)
         self.pull, self.moments = self._own.pull, self._own.moments
         self._changed = True
         self._rates: dict[str, float] | None = None

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.free_memory import available_memory, free_bytes, in_gigabytes, require_memory
-from tomo_polysplat.kernels.portions import FEW_VIEWS, MANY, views_at_once
+from tomo_polysplat.free_memory import available_memory, free_bytes, give_back, in_gigabytes, require_memory
+from tomo_polysplat.kernels.portions import FEW_VIEWS, MANY
+from tomo_polysplat.ranks import current_ranks
 
 __all__ = [
     "free_bytes",
@@ -21,15 +24,18 @@ __all__ = [
     "start_bytes",
     "start_stays",
     "step_bytes",
+    "told_of_lack",
     "voxels_at_once",
 ]
 
 logger = logging.getLogger(__name__)
 
-# Bytes a Gaussian takes: parameters, both moments, the best copy and gradients; and its footprint and sums in
-# each view of a step.
-_GAUSSIAN, _FOOTPRINT = 640, 144
-# Runs of a large cloud at once, while the rays are asked which of two models explains them.
+# Bytes a Gaussian takes: 330 for parameters, moments, the best copy, pull and no smoothing's gradients, and what a step
+# makes of it on its way; its footprint and sums in each view of a step; and what ranks add up, kept between graphs
+# (2.8e6 Gaussians, 192^3 voxels and 6 views a step on an H100: 330 and, with the footprints of three views, 780).
+_GAUSSIAN, _FOOTPRINT, _ADDED_UP = 680, 144, 110
+# Runs of a large cloud at once, while the rays are asked which of two models explains them. The second's step is tried
+# before it is recorded into the memory of the first, so that for a moment all of a step is there twice.
 _RUNS = 2
 # Bytes a pixel of a step takes: image and gradient of four channels, projections and their slopes.
 _PIXEL = 48
@@ -56,6 +62,10 @@ def voxels_at_once(device: torch.device) -> int:
     free = available_memory() if device.type == "cpu" else free_bytes(device)
     if free is None:
         return _LARGEST_SLAB
+    if device.type != "cpu" and torch.cuda.mem_get_info(device)[0] < _LARGEST_SLAB * _MADE:
+        # What torch keeps counts as free; but what recorded graphs need, amid a run, only they can use.
+        give_back()
+        free = min(free, torch.cuda.mem_get_info(device)[0])
     return min(max(int(0.5 * _SHARE * free / _MADE), 1), _LARGEST_SLAB)
 
 
@@ -114,27 +124,38 @@ def require_machine(rays: int, voxels: int, energies: int, device: torch.device)
 
 
 def step_bytes(
-    device: torch.device, *, gaussians: int, views: int, pixels: int, voxels: int
+    device: torch.device, *, gaussians: int, views: int, pixels: int, voxels: int, runs: int = 1
 ) -> dict[str, int]:
     """Bytes that the steps of a fit take on a device, by what takes them; parameters as for `require_room`."""
-    # A CPU holds the footprints of all views of a step.
-    of_a_gaussian = _of_a_gaussian(views if device.type == "cpu" else views_at_once(views, gaussians))
-    return {"Gaussians": gaussians * of_a_gaussian} | _of_all(views, pixels, voxels, device)
+    return {"Gaussians": _of_gaussians(gaussians, views, runs, device)} | _of_all(
+        views, pixels, voxels, runs, device
+    )
 
 
+# All that a step takes, and the words of two kinds of device.
 def require_room(
-    device: torch.device, *, gaussians: int, views: int, pixels: int, voxels: int, projections: int
+    device: torch.device,
+    *,
+    gaussians: int,
+    views: int,
+    pixels: int,
+    voxels: int,
+    projections: int,
+    runs: int = 1,
 ) -> str:
     """The estimate in words.
 
     Parameters
     ----------
     gaussians : int
+        Of a run.
     views, pixels : int
-        Of a step, and of a view.
+        Of a step, and of a view, in all runs.
     voxels : int
     projections : int
         Bytes of them on the device already; 0 where they stay on the host.
+    runs : int
+        That there are at once.
 
     Raises
     ------
@@ -143,7 +164,7 @@ def require_room(
     MemoryError
         If the host has too little memory left for the Gaussians of a fit on a CPU.
     """
-    parts = step_bytes(device, gaussians=gaussians, views=views, pixels=pixels, voxels=voxels)
+    parts = step_bytes(device, gaussians=gaussians, views=views, pixels=pixels, voxels=voxels, runs=runs)
     need = sum(parts.values())
     words = ", ".join(f"{name} {in_gigabytes(size)}" for name, size in parts.items())
     words = f"about {in_gigabytes(need)} ({words})"
@@ -160,28 +181,30 @@ def require_room(
     where = f"on the GPU, {in_gigabytes(projections)}" if projections else "streamed from the host"
     if need > _SHARE * free:
         remedy = "lower settings max_gaussians or views_per_step, take fewer voxels, or device='cpu'"
+        if runs > 1:
+            remedy = f"say settings pixel_rays and light, which saves a second run beside the first, {remedy}"
         raise fail("device", f"a GPU with {words} free", f"{in_gigabytes(free)} on {device}", remedy)
     words = f"{words} of {in_gigabytes(free)} free; projections {where}"
     logger.info("Memory: %s.", words)
     return words
 
 
-def room_for_gaussians(device: torch.device, *, views: int, pixels: int, voxels: int) -> float:
-    """How many Gaussians there is memory for, on a CPU too; infinity where nobody tells how much is free.
+def room_for_gaussians(device: torch.device, *, views: int, pixels: int, voxels: int, runs: int = 1) -> float:
+    """How many Gaussians of a run there is memory for, on a CPU too; infinity where nobody tells how much is free.
 
     Parameters
     ----------
-    views, pixels, voxels : int
+    views, pixels, voxels, runs : int
         As for `require_room`.
     """
     free = available_memory() if device.type == "cpu" else free_bytes(device)
     if free is None:
         return math.inf
-    left = max(_SHARE * free - sum(_of_all(views, pixels, voxels, device).values()), 0.0)
-    few = left / _of_a_gaussian(views)
+    left = max(_SHARE * free - sum(_of_all(views, pixels, voxels, runs, device).values()), 0.0)
+    few = left / (runs * _of_a_gaussian(views))
     if few < MANY or device.type == "cpu":
         return few
-    return left / _of_a_gaussian(views_at_once(views, MANY))
+    return left / (runs * _of_a_gaussian(min(views, FEW_VIEWS)))
 
 
 def most_gaussians(device: torch.device) -> float:
@@ -191,13 +214,46 @@ def most_gaussians(device: torch.device) -> float:
     return _SHARE * free_bytes(device) / (_RUNS * _of_a_gaussian(FEW_VIEWS))
 
 
+@contextmanager
+def told_of_lack() -> Iterator[None]:
+    """Torch's word that a GPU is full, as an error that says what to do.
+
+    Raises
+    ------
+    MemoryError
+        In its place.
+    """
+    try:
+        yield
+    except torch.OutOfMemoryError as full:
+        got = f"{full}".strip() or "no room"
+        remedy = (
+            "lower settings max_gaussians or views_per_step, take fewer or larger voxels, end what else uses the GPU,"
+            ' let the plan count on less of it (settings={"memory": "..."}), or device=\'cpu\''
+        )
+        raise fail("device", "a GPU with room for the fit", got, remedy, MemoryError) from full
+
+
+def _of_gaussians(count: int, views: int, runs: int, device: torch.device) -> int:
+    """Bytes of so many Gaussians in each run."""
+    whole = runs * count * _of_a_gaussian(views)
+    if device.type == "cpu":
+        return whole
+    # A GPU holds the footprints of fewer views at once of a large cloud, which may have grown from a smaller one.
+    few = runs * count * _of_a_gaussian(min(views, FEW_VIEWS))
+    return max(few, min(whole, runs * MANY * _of_a_gaussian(views)))
+
+
 def _of_a_gaussian(views: int) -> int:
-    return _GAUSSIAN + _FOOTPRINT * views
+    added_up = _ADDED_UP if current_ranks().count > 1 else 0
+    return _GAUSSIAN + _FOOTPRINT * views + added_up
 
 
-def _of_all(views: int, pixels: int, voxels: int, device: torch.device) -> dict[str, int]:
+def _of_all(views: int, pixels: int, voxels: int, runs: int, device: torch.device) -> dict[str, int]:
     """Bytes that a fit takes whatever the number of Gaussians."""
+    # On a CPU runs take turns and keep nothing of a step.
+    times = 1 if device.type == "cpu" else runs
     return {
         "images of a step": views * pixels * _PIXEL,
-        "volumes": voxels * _SMOOTHED[device.type] + min(_SAMPLES, 27 * 12 * voxels),
+        "volumes": times * voxels * _SMOOTHED[device.type] + min(_SAMPLES, 27 * 12 * voxels),
     }

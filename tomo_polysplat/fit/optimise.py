@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.fit.fitter import Batches, Fitter, views_of_a_pass
+from tomo_polysplat.fit.memory import told_of_lack
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.snapshot import Keeps
@@ -222,6 +223,7 @@ class Course:
     timed: Callable[[Clock, float], Any] | None = None
 
 
+@told_of_lack()
 def fit(
     gaussians: Gaussians, spacing: float, rays: Rays, scene: FitScene, settings: Settings, course: Course
 ) -> FitOutcome:
@@ -230,6 +232,11 @@ def fit(
     Stops after ``settings.passes`` over the views, at the deadline, when the held-out rays have not improved for
     ``settings.patience`` passes (`usual_patience`), when a callback returns True, or on KeyboardInterrupt. Returns the
     Gaussians that `Watch` holds for the best. Where the checkpoint holds a snapshot, ``gaussians`` are its own.
+
+    Raises
+    ------
+    MemoryError
+        If a GPU is full all the same; with what to do.
     """
     if not len(gaussians):
         logger.warning("The start volume is empty: no Gaussians, a volume of zeros.")

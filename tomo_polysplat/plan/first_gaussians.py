@@ -25,6 +25,9 @@ __all__ = ["AVERAGED_RAYS", "first_gaussians", "room_to_grow"]
 AVERAGED_RAYS = 2
 # Largest number of Gaussians that is worth its time, those of metal included, as a multiple of the number of seeds.
 _OF_SEEDS = 2
+# Memory of a single run whose cloud grows, over that of one of as many: the smaller cloud and its moments are there
+# while the larger one's step is made. What two runs take is more anyway.
+_GROWING = 1.25
 
 
 def first_gaussians(
@@ -69,7 +72,7 @@ def first_gaussians(
     values = problem.measured(device)
     memory = require_room(
         device,
-        gaussians=math.ceil(_runs(plan) * max(settings.growth or 1.0, 1.0) * len(gaussians)),
+        gaussians=math.ceil(_times(settings.growth or 1.0, plan) * len(gaussians)),
         **_all_else(plan, problem, device),
         projections=values.nbytes if values.device.type == device.type else 0,
     )
@@ -92,10 +95,16 @@ def room_to_grow(gaussians: int, plan: Plan, problem: Problem, device: torch.dev
     problem : Problem
     device : torch.device
     """
-    room = room_for_gaussians(device, **_all_else(plan, problem, device)) / _runs(plan)
+    room = room_for_gaussians(device, **_all_else(plan, problem, device))
+    room /= _GROWING if _runs(plan) == 1 else 1.0
     if device.type != "cpu":
         room = min(room, most_gaussians(device), _OF_SEEDS * most_seeds(problem))
     return room / max(gaussians, 1)
+
+
+def _times(growth: float, plan: Plan) -> float:
+    """For how many times as many Gaussians a cloud that grows so many times needs memory."""
+    return growth * _GROWING if growth > 1 and _runs(plan) == 1 else max(growth, 1.0)
 
 
 def _runs(plan: Plan) -> int:
@@ -118,4 +127,5 @@ def _all_else(plan: Plan, problem: Problem, device: torch.device) -> dict[str, i
         "views": -(-plan.views_per_step // ranks),
         "pixels": rays * problem.geometry.rows * problem.geometry.columns,
         "voxels": planes * math.prod(slice_shape),
+        "runs": _runs(plan),
     }

@@ -87,11 +87,13 @@ def fdk_cuda_tensor(
     Raises
     ------
     RuntimeError
-        If ASTRA left any voxel unwritten, which is how it tells that it had no room.
+        If ASTRA failed, or left any voxel unwritten, which is how it tells that it had no room.
     """
     import astra
     import torch
     from astra.log import AstraError
+
+    from tomo_polysplat.start.astra_pair import make_room
 
     index = projections.device.index
     # ASTRA takes the origin for the centre of the orbit.
@@ -109,8 +111,7 @@ def fdk_cuda_tensor(
     volume = torch.full(grid.shape, torch.nan, dtype=torch.float32, device=sinogram.device)
     # ASTRA works on streams of its own and asks for none of torch's, nor for the memory that torch keeps for later.
     torch.cuda.synchronize(index)
-    if torch.cuda.mem_get_info(index)[0] < _OF_ASTRA * sinogram.nbytes:
-        torch.cuda.empty_cache()
+    make_room(index, _OF_ASTRA * sinogram.nbytes)
     data, algorithm, told = [], None, ""
     try:
         data.append(astra.data3d.link("-sino", proj_geom, linked))
@@ -129,7 +130,7 @@ def fdk_cuda_tensor(
         for identifier in data:
             astra.data3d.delete(identifier)
     torch.cuda.synchronize(index)
-    if not bool(torch.isfinite(volume).all()):
+    if told or not bool(torch.isfinite(volume).all()):
         raise RuntimeError(_no_room(sinogram, volume) + told)
     return volume
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import TracebackType
 
 import numpy as np
 import torch
 
+from tomo_polysplat.free_memory import give_back
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, to_astra
 
-__all__ = ["AstraPair", "astra_has_gpu", "gpu_index"]
+__all__ = ["AstraPair", "astra_has_gpu", "gpu_index", "make_room"]
 
 
 def astra_has_gpu() -> bool:
@@ -25,6 +27,12 @@ def gpu_index(device: str | torch.device) -> int:
     return torch.cuda.current_device() if index is None else index
 
 
+def make_room(index: int | None, size: float) -> None:
+    """Give back what torch keeps of a GPU for later, where ASTRA would have fewer than so many bytes without it."""
+    if torch.cuda.mem_get_info(index)[0] < size:
+        give_back()
+
+
 class AstraPair:
     """Line integrals of a volume of voxels, and the backprojection nearly adjoint to them.
 
@@ -33,6 +41,11 @@ class AstraPair:
     geometry, grid : Geometry, VolumeGrid
     device : torch.device
         A CUDA device; tensors go in and come out there.
+
+    Raises
+    ------
+    RuntimeError
+        On use, where ASTRA refuses the geometry or has no room.
     """
 
     def __init__(self, geometry: Geometry, grid: VolumeGrid, device: torch.device) -> None:
@@ -58,7 +71,7 @@ class AstraPair:
         shape = (self.geometry.rows, len(views), self.geometry.columns)
         volume = volume.contiguous()
         projections = self._unwritten(shape, volume)
-        direct_FP3D(self._projector(views), volume, projections)
+        self._call(direct_FP3D, views, volume, projections)
         return self._written(projections, "projection").transpose(0, 1)
 
     def adjoint(self, projections: torch.Tensor, views: np.ndarray) -> torch.Tensor:
@@ -67,8 +80,22 @@ class AstraPair:
 
         ordered = projections.transpose(0, 1).contiguous()
         volume = self._unwritten(self.grid.shape, projections)
-        direct_BP3D(self._projector(views), volume, ordered)
+        self._call(direct_BP3D, views, volume, ordered)
         return self._written(volume, "backprojection")
+
+    def _call(
+        self, run: Callable[..., None], views: np.ndarray, volume: torch.Tensor, projections: torch.Tensor
+    ) -> None:
+        from astra.log import AstraError
+
+        projector = self._projector(views)
+        # It takes as much again on its way.
+        make_room(self.index, volume.nbytes + projections.nbytes)
+        try:
+            run(projector, volume, projections)
+        except AstraError as problem:
+            # Other releases say nothing, and leave the tensor unwritten.
+            raise RuntimeError(f"ASTRA failed; is its GPU out of memory? It says: {problem}") from problem
 
     def _projector(self, views: np.ndarray) -> int:
         """ASTRA's projector of some views, made once; RuntimeError where it refuses them."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tomo_polysplat.free_memory import free_bytes, in_gigabytes
+from tomo_polysplat.free_memory import free_bytes, give_back, in_gigabytes
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.orbit import Orbit
 
@@ -131,7 +131,7 @@ def fdk_on_device(
                 raise
             logger.info("%s Slabs are tried that take less than %s.", problem, in_gigabytes(room / 2))
         # What torch holds for later is of no use to ASTRA; only now does the error no longer hold the tensors.
-        torch.cuda.empty_cache()
+        give_back()
     raise AssertionError("unreachable")
 
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from tomo_polysplat.free_memory import give_back
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, to_astra
 from tomo_polysplat.start import sirt as start
 from tomo_polysplat.start.astra_pair import astra_has_gpu, gpu_index
 
 __all__ = ["sirt"]
+
+_FAILED = "ASTRA's SIRT3D_CUDA failed; is its GPU out of memory?"
 
 
 def sirt(
@@ -38,6 +41,11 @@ def sirt(
     -------
     (nz, ny, nx) float32
         Attenuation in 1/unit.
+
+    Raises
+    ------
+    RuntimeError
+        If ASTRA fails on a GPU, mostly for want of memory.
     """
     if device.startswith("cuda") and subsets == 1 and astra_has_gpu():
         return _sirt_cuda(projections, geometry, grid, iterations, gpu_index(device))
@@ -48,7 +56,10 @@ def _sirt_cuda(
     projections: np.ndarray, geometry: Geometry, grid: VolumeGrid, iterations: int, index: int
 ) -> np.ndarray:
     import astra
+    from astra.log import AstraError
 
+    # It asks for none of what torch keeps for later.
+    give_back()
     proj_geom, vol_geom = to_astra(geometry, grid)
     ordered = np.ascontiguousarray(projections.swapaxes(0, 1), dtype=np.float32)
     usable = np.isfinite(ordered)
@@ -71,9 +82,14 @@ def _sirt_cuda(
             config["option"]["SinogramMaskId"] = link("-sino", mask)
         algorithm = astra.algorithm.create(config)
         astra.algorithm.run(algorithm, iterations)
+    except AstraError as problem:
+        raise RuntimeError(f"{_FAILED}; it says: {problem}") from problem
     finally:
         if algorithm is not None:
             astra.algorithm.delete(algorithm)
         for identifier in data:
             astra.data3d.delete(identifier)
+    # Other releases say nothing, and leave the volume as it was.
+    if iterations and not volume.any() and measured.max(initial=0) > 0:
+        raise RuntimeError(_FAILED)
     return volume

@@ -155,8 +155,9 @@ def detected_misfit_gradient(splat: Splat, blur: torch.Tensor, grad_blur: torch.
     (behind, by_node), filtered = splat.filters(), measurement.behind is not None
     down, across = splat.parts
     rows, columns = views.rows // down, views.columns // across
-    size = (2, len(views) * splat.area)
-    sharp, slopes = torch.empty(size, dtype=torch.float32, device=splat.raw.device)
+    # Each begins at 16 bytes whatever the batch: elsewhere the kernels would be compiled once more.
+    sharp = torch.empty(len(views) * splat.area, dtype=torch.float32, device=splat.raw.device)
+    slopes = torch.empty_like(sharp)
     with on_device(splat.raw):
         _sharp_kernel[splat.blocks()](
             splat.raw, sharp, splat.table, log_weights, attenuation, behind, by_node, splat.largest,

@@ -89,7 +89,7 @@ def _by_short_fits(lab: Lab, most: float, evidence: dict[str, float]) -> Answer:
     assert lab.calibrate is not None and lab.run is not None
     try:
         found = lab.calibrate()
-    except (RuntimeError, FloatingPointError, ValueError) as error:
+    except (RuntimeError, FloatingPointError, ValueError, MemoryError) as error:
         # Torch's or ours, of a GPU that has no room for a second cloud, or a fit that did not converge.
         logger.warning("Scatter is not looked for: %s", error)
         raise Untold(f"{error}") from error
