@@ -53,7 +53,7 @@ def failing(first, then=None):
     return Failing
 
 
-FULL = torch.OutOfMemoryError("CUDA out of memory")
+FULL = torch.cuda.OutOfMemoryError("CUDA out of memory")
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_after_a_step_that_has_no_room_ranks_make_others(problem):
         return Recorded(*parts)
 
     first = LedStep(make, *problem, BATCH, ranks)
-    with pytest.raises(torch.OutOfMemoryError, match="full"):
+    with pytest.raises(torch.cuda.OutOfMemoryError, match="full"):
         LedStep(make, *problem, BATCH, ranks, first)
     assert ranks.usable
     LedStep(make, *problem, BATCH, ranks)

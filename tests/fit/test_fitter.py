@@ -78,14 +78,14 @@ def test_a_branch_without_room_leaves_no_trace(monkeypatch):
     def full(gaussians, *_, **__):
         # As the trial of a step would.
         gaussians.position.fill_(torch.nan)
-        raise torch.OutOfMemoryError("full")
+        raise torch.cuda.OutOfMemoryError("full")
 
     ends = []
     for asked in (False, True):
         fitter, clock = fitter_of(40), Clock(40, None)
         fitter.ahead(clock, 1)
         if asked:
-            with monkeypatch.context() as patch, pytest.raises(torch.OutOfMemoryError):
+            with monkeypatch.context() as patch, pytest.raises(torch.cuda.OutOfMemoryError):
                 patch.setattr(fitters, "make_step", full)
                 fitter.branch(pixel_rays=2)
         fitter.ahead(clock, 2)

@@ -77,7 +77,7 @@ def test_the_allocator_goes_on_after_a_recording_that_fails(begins, makes, ends,
     def make():
         assert free_memory.recording.locked(), "nobody else gives memory back"
         if not makes:
-            raise torch.OutOfMemoryError("full")
+            raise torch.cuda.OutOfMemoryError("full")
 
     try:
         step._captured(make, None)

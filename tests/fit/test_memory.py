@@ -112,7 +112,7 @@ def test_a_gpu_that_is_full_all_the_same_is_told_with_a_remedy(monkeypatch):
     problem = fit_problem("cone", True, "cpu", "numba")
 
     def full(*_, **__):
-        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
 
     monkeypatch.setattr("tomo_polysplat.fit.fitter.make_step", full)
     course = Course(views_per_step=2, rng=np.random.default_rng(0), started=0.0, volume=lambda _: None)

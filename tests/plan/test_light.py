@@ -230,7 +230,7 @@ def test_soft_matter_that_is_no_water_is_not_asked(much_light):
 
 def test_a_gpu_without_room_for_another_cloud_goes_on_without_asking(much_light):
     def full(light_u):
-        raise torch.OutOfMemoryError("no room")
+        raise torch.cuda.OutOfMemoryError("no room")
 
     fitter = fake_fitter(None)
     fitter.branch = full

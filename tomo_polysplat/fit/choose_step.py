@@ -19,7 +19,7 @@ __all__ = ["NoRoom", "make_step", "own_step", "why_eager"]
 logger = logging.getLogger(__name__)
 
 
-class NoRoom(torch.OutOfMemoryError):
+class NoRoom(torch.cuda.OutOfMemoryError):
     """A GPU has no room for a step, that of any of the ranks, which all go on without it."""
 
 
@@ -108,7 +108,7 @@ def own_step(
 def _of_memory(problem: BaseException | None) -> bool:
     """Whether an error is for want of memory, or has come of such a one: a recording that it ends may fail anew."""
     while problem is not None:
-        if isinstance(problem, torch.OutOfMemoryError) or "out of memory" in str(problem):
+        if isinstance(problem, torch.cuda.OutOfMemoryError) or "out of memory" in str(problem):
             return True
         problem = problem.__context__
     return False

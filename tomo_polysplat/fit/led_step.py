@@ -41,7 +41,7 @@ class LedStep:
 
     Raises
     ------
-    torch.OutOfMemoryError
+    torch.cuda.OutOfMemoryError
         Where the device of a rank has no room for its part; more can be made together all the same.
     """
 
@@ -80,10 +80,10 @@ class LedStep:
             shared: Step | None = None if beside is None else beside._own
             try:
                 self._own = make(gaussians, spacing, rays, scene, settings, batch, ranks, shared)
-            except torch.OutOfMemoryError as problem:
+            except torch.cuda.OutOfMemoryError as problem:
                 full = str(problem) or "no room"
         if full:
-            raise torch.OutOfMemoryError(full)
+            raise torch.cuda.OutOfMemoryError(full)
         self.pull, self.moments = self._own.pull, self._own.moments
         self._changed = True
         self._rates: dict[str, float] | None = None

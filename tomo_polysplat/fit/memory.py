@@ -225,7 +225,7 @@ def told_of_lack() -> Iterator[None]:
     """
     try:
         yield
-    except torch.OutOfMemoryError as full:
+    except torch.cuda.OutOfMemoryError as full:
         got = f"{full}".strip() or "no room"
         remedy = (
             "lower settings max_gaussians or views_per_step, take fewer or larger voxels, end what else uses the GPU,"
