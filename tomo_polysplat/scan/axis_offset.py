@@ -206,15 +206,20 @@ def _spread(rays: OppositeRays, most: int) -> tuple[np.ndarray, np.ndarray]:
 def _refined(rays: OppositeRays, place: float, limit: float, varying: bool = False) -> tuple[float, float]:
     """The place near this one at which opposite rays agree best, and its standard error, in columns of the rays.
 
-    Only what is ``varying`` with the views may be compared, in which gains of pixels have no part.
+    Only what is ``varying`` with the views may be compared, in which gains of pixels have no part. Else what is linear
+    in the column has none: light that drifts, and a flat field that slopes from side to side, make that.
     """
     lines, columns = _spread(rays, _VIEWS)
     for _ in range(_STEPS):
         pairs, slope = rays.pairs(place, lines, columns), _slope(rays, place, lines, columns)
         change = pairs.opposite - pairs.own
         like = pairs.slope
+        parts = slope, change, like
         if varying:
-            slope, change, like = (_varying(part, pairs.weight) for part in (slope, change, like))
+            slope, change, like = (_varying(part, pairs.weight) for part in parts)
+        else:
+            away = columns - rays.axis - place
+            slope, change, like = (_without_ramps(part, pairs.weight, away) for part in parts)
         above, below = pairs.weight * like * change, pairs.weight * like * slope
         if not below.sum() > 0:
             raise ValueError("opposite rays show no detail")
@@ -240,6 +245,18 @@ def _slope(rays: OppositeRays, place: float, lines: np.ndarray, columns: np.ndar
 def _varying(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Values (lines, columns, rows) without their mean over lines, in which gains of pixels are."""
     return values - (weight * values).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300)
+
+
+def _without_ramps(values: np.ndarray, weight: np.ndarray, away: np.ndarray) -> np.ndarray:
+    """Values (lines, columns, rows) without each line's straight line in the column's distance from the axis."""
+    light = weight.sum(axis=2)
+    value = (weight * values).sum(axis=2) / np.maximum(light, 1e-300)
+    total = np.maximum(light.sum(axis=1, keepdims=True), 1e-300)
+    from_middle = away - (light * away).sum(axis=1, keepdims=True) / total
+    mean = (light * value).sum(axis=1, keepdims=True) / total
+    spread = np.maximum((light * from_middle**2).sum(axis=1, keepdims=True), 1e-300)
+    ramp = (light * from_middle * value).sum(axis=1, keepdims=True) / spread
+    return values - (mean + ramp * from_middle)[..., None]
 
 
 def _jackknife(above: np.ndarray, below: np.ndarray, distance: np.ndarray, times: float) -> float:
