@@ -31,6 +31,8 @@ _APART = 0.25
 # Groups of lines and of columns, each left out once; fewer lines than these are cut by rows instead.
 _LINE_GROUPS, _COLUMN_GROUPS, _FEWEST_LINES, _FEWEST_GROUPS = 16, 12, 8, 4
 _FEWEST_VIEWS, _FEWEST_COLUMNS = 12, 12
+# Places between other views at which the rule of the seam is tried.
+_SEAMS = 24
 # Relative change of the source's distance from the axis, and of its height, that still is a circle.
 _ROUND = 0.02
 # Columns by which the axis may wander on the detector, and rows.
@@ -77,7 +79,9 @@ def axis_offset(projections: np.ndarray, geometry: Geometry) -> AxisOffset:
     Of a parallel beam some of all rows are compared, of a fan or cone the row in the plane of the orbit, where a ray
     runs both ways. The place is found on joined columns and refined by Newton's method on all of them. Its standard
     error is the jackknife's (Efron 1982): the larger one of that over groups of views, whose noise differs, and of that
-    over groups of columns, whose gains do.
+    over groups of columns, whose gains do. What is added to its square is of views too far apart: by how much the place
+    changes if rays between two views bend as their neighbours do, or, of half a turn, the place that comes out between
+    neighbouring views, where it is known.
     """
     try:
         rays = _rays(projections, geometry)
@@ -210,16 +214,16 @@ def _refined(rays: OppositeRays, place: float, limit: float, varying: bool = Fal
     in the column has none: light that drifts, and a flat field that slopes from side to side, make that.
     """
     lines, columns = _spread(rays, _VIEWS)
+    away = columns - rays.axis - place
+
+    def told(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        return _varying(values, weight) if varying else _without_ramps(values, weight, away)
+
     for _ in range(_STEPS):
         pairs, slope = rays.pairs(place, lines, columns), _slope(rays, place, lines, columns)
         change = pairs.opposite - pairs.own
         like = pairs.slope
-        parts = slope, change, like
-        if varying:
-            slope, change, like = (_varying(part, pairs.weight) for part in parts)
-        else:
-            away = columns - rays.axis - place
-            slope, change, like = (_without_ramps(part, pairs.weight, away) for part in parts)
+        slope, change, like = (told(part, pairs.weight) for part in (slope, change, like))
         above, below = pairs.weight * like * change, pairs.weight * like * slope
         if not below.sum() > 0:
             raise ValueError("opposite rays show no detail")
@@ -232,7 +236,23 @@ def _refined(rays: OppositeRays, place: float, limit: float, varying: bool = Fal
     if pairs.mismatch > _LARGEST_MISMATCH:
         raise ValueError("rays that should agree do not, wherever the axis is")
     distance = np.abs(columns - rays.axis - place)
-    return place, _jackknife(above, below, distance, 1.0 if rays.seam else 2.0)
+    error = _jackknife(above, below, distance, 1.0 if rays.seam else 2.0)
+    bent = told(rays.bent(place, lines, columns), pairs.weight)
+    between = float((pairs.weight * like * bent).sum() / below.sum())
+    return place, float(np.hypot(error, _elsewhere(rays, columns) if rays.seam else between))
+
+
+def _elsewhere(rays: OppositeRays, columns: np.ndarray) -> float:
+    """Root of the mean square of the places that the rule of the seam tells between other views, where all are 0."""
+    found = []
+    for pairs in rays.elsewhere(columns, _SEAMS):
+        like, change = (
+            _without_ramps(part, pairs.weight, columns - rays.axis)
+            for part in (pairs.slope, pairs.opposite - pairs.own)
+        )
+        below = float((pairs.weight * like**2).sum())
+        found.append(float((pairs.weight * like * change).sum()) / below if below > 0 else np.inf)
+    return float(np.sqrt(np.mean(np.square(found)))) if len(found) >= _FEWEST_GROUPS else np.inf
 
 
 def _slope(rays: OppositeRays, place: float, lines: np.ndarray, columns: np.ndarray) -> np.ndarray:
