@@ -14,7 +14,7 @@ __all__ = ["AxisOffset", "axis_offset"]
 # Half the range that is searched, as a share of the columns, and columns of the detector that it is searched on.
 _RANGE, _COARSE = 0.12, 96
 # Views, columns and rows that are compared, and values that are looked at.
-_VIEWS, _COLUMNS, _ROWS, _VALUES = 128, 512, 32, 6_000_000
+_VIEWS, _COLUMNS, _ROWS, _VALUES = 128, 512, 32, 2_000_000
 _COARSE_VIEWS, _COARSE_ROWS = 60, 8
 # Share of the most pairs of any place that a place must have.
 _ENOUGH = 0.2
