@@ -89,7 +89,9 @@ def test_a_move_that_held_out_rays_do_not_confirm_is_not_made(monkeypatch):
     assert answer.value == {} and "do not confirm" in answer.why and answer.evidence["offset"] > 1
 
 
-@pytest.mark.parametrize("part, words", [("axis_offset", "comparing them failed"), ("_held_out", "not be asked")])
+@pytest.mark.parametrize(
+    "part, words", [("axis_offset", "comparing them failed"), ("_held_out", "not be asked")]
+)
 def test_a_probe_that_fails_moves_nothing_and_ends_no_run(monkeypatch, caplog, part, words):
     def failing(*_):
         raise RuntimeError("broken")

@@ -60,9 +60,9 @@ def find_axis(problem: Problem, means: Means, report: Callable[[float, str], Any
             misfits, why = _asked_of_fits(problem, moves, means)
             evidence = evidence | misfits if misfits else {}
             if not misfits or not misfits["moved"] < misfits["without"]:
-                moves, words = {}, f"{words}, which {why}"
+                moves, words = {}, f"opposite rays tell {_moved_by(found)}, which {why}"
     if moves:
-        words = f"u {found.columns:+.3f} px (standard error {found.error:.2g}), told by opposite rays"
+        words = f"{_moved_by(found)}, told by opposite rays"
         logger.warning("The axis of rotation was off. Moved: %s. align=False leaves it.", words)
     else:
         logger.info("Alignment: %s", words)
@@ -102,6 +102,10 @@ def _in_words(found: AxisOffset) -> str:
         return f"the axis of rotation is known to {found.error:.2g} px only"
     off = f"{abs(found.columns):.3f} px (standard error {found.error:.2g})"
     return f"the axis of rotation is where it was told, to {off}"
+
+
+def _moved_by(found: AxisOffset) -> str:
+    return f"u {found.columns:+.3f} px (standard error {found.error:.2g})"
 
 
 def _told_by_rays(problem: Problem) -> AxisOffset:

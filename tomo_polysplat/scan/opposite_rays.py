@@ -179,7 +179,9 @@ class OppositeRays:
         steps = range(-3, 3)
         return [
             self._compared(
-                *_across({k: (self._smooth[j + k, columns], self._good[j + k, columns]) for k in steps}, columns)
+                *_across(
+                    {k: (self._smooth[j + k, columns], self._good[j + k, columns]) for k in steps}, columns
+                )
             )
             for j in some
         ]
