@@ -24,13 +24,14 @@ _ELSEWHERE, _CLEARLY = 2.0, 2.0
 _LARGEST_MISMATCH = 0.25
 # Steps of Newton's method, in columns at most, and how small the last must be.
 _STEPS, _LONGEST, _SETTLED = 12, 0.5, 1e-3
-# What varies with the views is enough where it tells the place with this standard error.
-_WELL = 0.05
 # The slope is taken between places so far on either side, in columns.
 _APART = 0.25
 # Groups of lines and of columns, each left out once; fewer lines than these are cut by rows instead.
 _LINE_GROUPS, _COLUMN_GROUPS, _FEWEST_LINES, _FEWEST_GROUPS = 16, 12, 8, 4
 _FEWEST_VIEWS, _FEWEST_COLUMNS = 12, 12
+# Standard errors by which slopes along columns and of opposite rays must be correlated, and pairs that noise makes
+# alike: neighbours, by smoothing, and each pair is there twice.
+_CORRELATED, _ALIKE = 4.0, 6.0
 # Places between other views at which the rule of the seam is tried.
 _SEAMS = 24
 # Relative change of the source's distance from the axis, and of its height, that still is a circle.
@@ -76,6 +77,9 @@ def axis_offset(projections: np.ndarray, geometry: Geometry) -> AxisOffset:
 
     Notes
     -----
+    What all views share is left out: it is a body of revolution about the axis, or defects of pixels that seem to be
+    one. Only at the seam of half a turn, of two lines, it cannot be; what is linear along columns is left out there.
+
     Of a parallel beam some of all rows are compared, of a fan or cone the row in the plane of the orbit, where a ray
     runs both ways. The place is found on joined columns and refined by Newton's method on all of them. Its standard
     error is the jackknife's (Efron 1982): the larger one of that over groups of views, whose noise differs, and of that
@@ -93,13 +97,13 @@ def axis_offset(projections: np.ndarray, geometry: Geometry) -> AxisOffset:
             if step == 1:
                 break
             step = (step + 1) // 2
+        if not rays.seam:
+            found, error = _refined(rays, found, limit, varying=True)
     except ValueError as why:
         return AxisOffset(0.0, np.inf, str(why))
-    try:
-        varying, its_error = (np.inf, np.inf) if rays.seam else _refined(rays, found, limit, varying=True)
-    except ValueError:
-        its_error = np.inf
-    return AxisOffset(-varying, its_error) if its_error < _WELL else AxisOffset(-found, error)
+    if not np.isfinite(error):
+        return AxisOffset(0.0, np.inf, "too few rays show detail from both ends")
+    return AxisOffset(-found, error)
 
 
 def _rays(projections: np.ndarray, geometry: Geometry) -> OppositeRays:
@@ -225,8 +229,8 @@ def _refined(rays: OppositeRays, place: float, limit: float, varying: bool = Fal
         like = pairs.slope
         slope, change, like = (told(part, pairs.weight) for part in (slope, change, like))
         above, below = pairs.weight * like * change, pairs.weight * like * slope
-        if not below.sum() > 0:
-            raise ValueError("opposite rays show no detail")
+        if not below.sum() > (_least(pairs.weight, like, slope) if varying else 0):
+            raise ValueError("opposite rays show no detail in common")
         step = -float(above.sum() / below.sum())
         place += float(np.clip(step, -_LONGEST, _LONGEST))
         if abs(step) < _SETTLED:
@@ -253,6 +257,12 @@ def _elsewhere(rays: OppositeRays, columns: np.ndarray) -> float:
         below = float((pairs.weight * like**2).sum())
         found.append(float((pairs.weight * like * change).sum()) / below if below > 0 else np.inf)
     return float(np.sqrt(np.mean(np.square(found)))) if len(found) >= _FEWEST_GROUPS else np.inf
+
+
+def _least(weight: np.ndarray, like: np.ndarray, slope: np.ndarray) -> float:
+    """What the sum of the slopes' weighted product must be more than, for noise alone seldom is."""
+    size = float((weight * like**2).sum() * (weight * slope**2).sum())
+    return _CORRELATED * np.sqrt(_ALIKE * size / max(np.count_nonzero(weight), 1))
 
 
 def _slope(rays: OppositeRays, place: float, lines: np.ndarray, columns: np.ndarray) -> np.ndarray:
