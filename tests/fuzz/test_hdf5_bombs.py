@@ -140,8 +140,15 @@ def test_each_is_refused_at_no_cost(tmp_path):
         paths.append(tmp_path / name)
         paths[-1].write_bytes(sound)
         with h5py.File(paths[-1], "r+") as file:
-            trick(file)
+            try:
+                trick(file)
+            except OSError as refused:
+                # Old releases of HDF5 write no chunk that is longer than its shape.
+                assert "chunk size can't be encoded" in str(refused)
+                paths.pop()
+                continue
         assert paths[-1].stat().st_size < 5e6
+    assert len(paths) > len(TRICKS) - 4
     paths += results(tmp_path)
     done = subprocess.run([sys.executable, "-c", READ, *map(str, paths)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-500:]
