@@ -262,7 +262,7 @@ def _elsewhere(rays: OppositeRays, columns: np.ndarray) -> float:
 def _least(weight: np.ndarray, like: np.ndarray, slope: np.ndarray) -> float:
     """What the sum of the slopes' weighted product must be more than, for noise alone seldom is."""
     size = float((weight * like**2).sum() * (weight * slope**2).sum())
-    return _CORRELATED * np.sqrt(_ALIKE * size / max(np.count_nonzero(weight), 1))
+    return _CORRELATED * np.sqrt(_ALIKE * size / max(int(np.count_nonzero(weight)), 1))
 
 
 def _slope(rays: OppositeRays, place: float, lines: np.ndarray, columns: np.ndarray) -> np.ndarray:

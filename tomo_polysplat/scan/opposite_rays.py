@@ -155,7 +155,7 @@ class OppositeRays:
             (after - before) / np.where(step > 0, step, 1)
             for before, after, step in zip(values, values[1:], gaps)
         ]
-        curved, known = 0.0, 0
+        curved, known = np.zeros(values[0].shape), np.zeros(values[0].shape)
         for k in (0, 1):
             use = even[k] & even[k + 1] & good[k] & good[k + 1] & good[k + 2]
             change = 2 * (steep[k + 1] - steep[k]) / np.maximum(gaps[k] + gaps[k + 1], 1e-12)
