@@ -76,19 +76,50 @@ def test_what_no_ray_confirms_is_not_moved(align):
     assert others[0] == others[1]
 
 
+def problem_off(columns):
+    projections = np.ascontiguousarray(fan().projections.transpose(1, 0, 2))
+    problem = Problem.of(projections, *from_astra(off(fan(), columns), fan().vol_geom), "cm", None, None)
+    return problem, Means(make_settings("balanced", None), None, 0, torch.device("cpu")), lambda *_: None
+
+
 def test_a_move_that_held_out_rays_do_not_confirm_is_not_made(monkeypatch):
     misfits = iter([1.0, 1.0])
     monkeypatch.setattr(axis, "_held_out", lambda *_: next(misfits))
-    problem = Problem.of(
-        np.ascontiguousarray(fan().projections.transpose(1, 0, 2)),
-        *from_astra(off(fan(), 1.5), fan().vol_geom),
-        "cm",
-        None,
-        None,
-    )
-    means = Means(make_settings("balanced", None), None, 0, torch.device("cpu"))
-    answer = axis.find_axis(problem, means, lambda *_: None)
+    answer = axis.find_axis(*problem_off(1.5))
     assert answer.value == {} and "do not confirm" in answer.why and answer.evidence["offset"] > 1
+
+
+@pytest.mark.parametrize(
+    "part, words", [("axis_offset", "comparing them failed"), ("_held_out", "not be asked")]
+)
+def test_a_probe_that_fails_moves_nothing_and_ends_no_run(monkeypatch, caplog, part, words):
+    def failing(*_):
+        raise RuntimeError("broken")
+
+    monkeypatch.setattr(axis, part, failing)
+    answer = axis.find_axis(*problem_off(1.5))
+    assert answer.value == {} and words in answer.why and not axis.is_known(answer)
+    assert "broken" in caplog.text
+
+
+def test_a_user_who_interrupts_the_probe_is_heard(monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(axis, "axis_offset", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        axis.find_axis(*problem_off(0.0))
+
+
+def test_fits_that_confirm_nothing_leave_no_trace_in_the_result(monkeypatch):
+    fits, scan = axis._held_out, fan()
+    told = off(scan, 0.5)
+    plain = reconstruct(scan, told, align=False, settings=QUICK | {"passes": 1.0})
+    monkeypatch.setattr(axis, "_held_out", lambda *asked: 0.0 * fits(*asked))
+    asked = reconstruct(scan, told, settings=QUICK | {"passes": 1.0})
+    assert "do not confirm" in asked.plan["alignment"].why
+    assert np.array_equal(asked.volume, plain.volume)
+    np.testing.assert_array_equal(asked.geometry["Vectors"], plain.geometry["Vectors"])
 
 
 def test_who_leaves_the_axis_where_the_file_has_it_leaves_it_from_auto_too():

@@ -14,6 +14,7 @@ from tomo_polysplat.plan.coarse import coarse_problem, coarse_settings
 from tomo_polysplat.plan.first_volume import first_volume
 from tomo_polysplat.plan.means import Means
 from tomo_polysplat.plan.short_fit import short_fit
+from tomo_polysplat.ranks import current_ranks
 from tomo_polysplat.scan.axis_offset import AxisOffset, axis_offset
 from tomo_polysplat.scan.moves import Scanner, moved_geometry
 
@@ -48,7 +49,7 @@ def find_axis(problem: Problem, means: Means, report: Callable[[float, str], Any
         not tell, or two fits, as told and moved, do not confirm it by rays held out of them.
     """
     report(0.0, "axis of rotation")
-    found = axis_offset(problem.projections, problem.geometry)
+    found = _told_by_rays(problem)
     evidence = {} if found.doubt else {"offset": found.columns, "error": found.error}
     moves: dict[str, Any] = {}
     needed = _SURE if means.time_budget is None else _SURE_ALONE
@@ -56,12 +57,12 @@ def find_axis(problem: Problem, means: Means, report: Callable[[float, str], Any
     if not found.doubt and abs(found.columns) > _TOLERATED + needed * found.error:
         moves = {"u": found.columns}
         if means.time_budget is None:
-            told, moved = (_held_out(one, means) for one in (problem, aligned(problem, moves)))
-            evidence |= {"without": told, "moved": moved}
-            if not moved < told:
-                moves, words = {}, f"{words}, which rays held out of two short fits do not confirm"
+            misfits, why = _asked_of_fits(problem, moves, means)
+            evidence = evidence | misfits if misfits else {}
+            if not misfits or not misfits["moved"] < misfits["without"]:
+                moves, words = {}, f"opposite rays tell {_moved_by(found)}, which {why}"
     if moves:
-        words = f"u {found.columns:+.3f} px (standard error {found.error:.2g}), told by opposite rays"
+        words = f"{_moved_by(found)}, told by opposite rays"
         logger.warning("The axis of rotation was off. Moved: %s. align=False leaves it.", words)
     else:
         logger.info("Alignment: %s", words)
@@ -101,6 +102,34 @@ def _in_words(found: AxisOffset) -> str:
         return f"the axis of rotation is known to {found.error:.2g} px only"
     off = f"{abs(found.columns):.3f} px (standard error {found.error:.2g})"
     return f"the axis of rotation is where it was told, to {off}"
+
+
+def _moved_by(found: AxisOffset) -> str:
+    return f"u {found.columns:+.3f} px (standard error {found.error:.2g})"
+
+
+def _told_by_rays(problem: Problem) -> AxisOffset:
+    """What opposite rays tell: nothing where their comparison fails, for the run does not need it."""
+    try:
+        return axis_offset(problem.projections, problem.geometry)
+    except Exception as error:
+        logger.warning("Comparing opposite rays failed, so the axis stays as told: %r", error)
+        return AxisOffset(0.0, np.inf, f"comparing them failed: {error!r}")
+
+
+def _asked_of_fits(problem: Problem, moves: dict[str, Any], means: Means) -> tuple[dict[str, float], str]:
+    """Misfit of held-out rays without the moves and moved, and what is to be said where the latter is not less.
+
+    A fit that fails confirms nothing. Of one over several processes the others may be left behind: then the run fails.
+    """
+    try:
+        told, moved = (_held_out(one, means) for one in (problem, aligned(problem, moves)))
+    except Exception as error:
+        if current_ranks().count > 1:
+            raise
+        logger.warning("A short fit failed, so the axis stays as told: %r", error)
+        return {}, f"could not be asked of two short fits: {error!r}"
+    return {"without": told, "moved": moved}, "rays held out of two short fits do not confirm"
 
 
 def _held_out(problem: Problem, means: Means) -> float:

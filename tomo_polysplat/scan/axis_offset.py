@@ -14,7 +14,7 @@ __all__ = ["AxisOffset", "axis_offset"]
 # Half the range that is searched, as a share of the columns, and columns of the detector that it is searched on.
 _RANGE, _COARSE = 0.12, 96
 # Views, columns and rows that are compared, and values that are looked at.
-_VIEWS, _COLUMNS, _ROWS, _VALUES = 128, 512, 32, 6_000_000
+_VIEWS, _COLUMNS, _ROWS, _VALUES = 128, 512, 32, 2_000_000
 _COARSE_VIEWS, _COARSE_ROWS = 60, 8
 # Share of the most pairs of any place that a place must have.
 _ENOUGH = 0.2
@@ -24,13 +24,16 @@ _ELSEWHERE, _CLEARLY = 2.0, 2.0
 _LARGEST_MISMATCH = 0.25
 # Steps of Newton's method, in columns at most, and how small the last must be.
 _STEPS, _LONGEST, _SETTLED = 12, 0.5, 1e-3
-# What varies with the views is enough where it tells the place with this standard error.
-_WELL = 0.05
 # The slope is taken between places so far on either side, in columns.
 _APART = 0.25
 # Groups of lines and of columns, each left out once; fewer lines than these are cut by rows instead.
 _LINE_GROUPS, _COLUMN_GROUPS, _FEWEST_LINES, _FEWEST_GROUPS = 16, 12, 8, 4
 _FEWEST_VIEWS, _FEWEST_COLUMNS = 12, 12
+# Standard errors by which slopes along columns and of opposite rays must be correlated, and pairs that noise makes
+# alike: neighbours, by smoothing, and each pair is there twice.
+_CORRELATED, _ALIKE = 4.0, 6.0
+# Places between other views at which the rule of the seam is tried.
+_SEAMS = 24
 # Relative change of the source's distance from the axis, and of its height, that still is a circle.
 _ROUND = 0.02
 # Columns by which the axis may wander on the detector, and rows.
@@ -74,10 +77,15 @@ def axis_offset(projections: np.ndarray, geometry: Geometry) -> AxisOffset:
 
     Notes
     -----
+    What all views share is left out: it is a body of revolution about the axis, or defects of pixels that seem to be
+    one. Only at the seam of half a turn, of two lines, it cannot be; what is linear along columns is left out there.
+
     Of a parallel beam some of all rows are compared, of a fan or cone the row in the plane of the orbit, where a ray
     runs both ways. The place is found on joined columns and refined by Newton's method on all of them. Its standard
     error is the jackknife's (Efron 1982): the larger one of that over groups of views, whose noise differs, and of that
-    over groups of columns, whose gains do.
+    over groups of columns, whose gains do. What is added to its square is of views too far apart: by how much the place
+    changes if rays between two views bend as their neighbours do, or, of half a turn, the place that comes out between
+    neighbouring views, where it is known.
     """
     try:
         rays = _rays(projections, geometry)
@@ -89,13 +97,13 @@ def axis_offset(projections: np.ndarray, geometry: Geometry) -> AxisOffset:
             if step == 1:
                 break
             step = (step + 1) // 2
+        if not rays.seam:
+            found, error = _refined(rays, found, limit, varying=True)
     except ValueError as why:
         return AxisOffset(0.0, np.inf, str(why))
-    try:
-        varying, its_error = (np.inf, np.inf) if rays.seam else _refined(rays, found, limit, varying=True)
-    except ValueError:
-        its_error = np.inf
-    return AxisOffset(-varying, its_error) if its_error < _WELL else AxisOffset(-found, error)
+    if not np.isfinite(error):
+        return AxisOffset(0.0, np.inf, "too few rays show detail from both ends")
+    return AxisOffset(-found, error)
 
 
 def _rays(projections: np.ndarray, geometry: Geometry) -> OppositeRays:
@@ -206,18 +214,23 @@ def _spread(rays: OppositeRays, most: int) -> tuple[np.ndarray, np.ndarray]:
 def _refined(rays: OppositeRays, place: float, limit: float, varying: bool = False) -> tuple[float, float]:
     """The place near this one at which opposite rays agree best, and its standard error, in columns of the rays.
 
-    Only what is ``varying`` with the views may be compared, in which gains of pixels have no part.
+    Only what is ``varying`` with the views may be compared, in which gains of pixels have no part. Else what is linear
+    in the column has none: light that drifts, and a flat field that slopes from side to side, make that.
     """
     lines, columns = _spread(rays, _VIEWS)
+    away = columns - rays.axis - place
+
+    def told(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        return _varying(values, weight) if varying else _without_ramps(values, weight, away)
+
     for _ in range(_STEPS):
         pairs, slope = rays.pairs(place, lines, columns), _slope(rays, place, lines, columns)
         change = pairs.opposite - pairs.own
         like = pairs.slope
-        if varying:
-            slope, change, like = (_varying(part, pairs.weight) for part in (slope, change, like))
+        slope, change, like = (told(part, pairs.weight) for part in (slope, change, like))
         above, below = pairs.weight * like * change, pairs.weight * like * slope
-        if not below.sum() > 0:
-            raise ValueError("opposite rays show no detail")
+        if not below.sum() > (_least(pairs.weight, like, slope) if varying else 0):
+            raise ValueError("opposite rays show no detail in common")
         step = -float(above.sum() / below.sum())
         place += float(np.clip(step, -_LONGEST, _LONGEST))
         if abs(step) < _SETTLED:
@@ -227,7 +240,29 @@ def _refined(rays: OppositeRays, place: float, limit: float, varying: bool = Fal
     if pairs.mismatch > _LARGEST_MISMATCH:
         raise ValueError("rays that should agree do not, wherever the axis is")
     distance = np.abs(columns - rays.axis - place)
-    return place, _jackknife(above, below, distance, 1.0 if rays.seam else 2.0)
+    error = _jackknife(above, below, distance, 1.0 if rays.seam else 2.0)
+    bent = told(rays.bent(place, lines, columns), pairs.weight)
+    between = float((pairs.weight * like * bent).sum() / below.sum())
+    return place, float(np.hypot(error, _elsewhere(rays, columns) if rays.seam else between))
+
+
+def _elsewhere(rays: OppositeRays, columns: np.ndarray) -> float:
+    """Root of the mean square of the places that the rule of the seam tells between other views, where all are 0."""
+    found = []
+    for pairs in rays.elsewhere(columns, _SEAMS):
+        like, change = (
+            _without_ramps(part, pairs.weight, columns - rays.axis)
+            for part in (pairs.slope, pairs.opposite - pairs.own)
+        )
+        below = float((pairs.weight * like**2).sum())
+        found.append(float((pairs.weight * like * change).sum()) / below if below > 0 else np.inf)
+    return float(np.sqrt(np.mean(np.square(found)))) if len(found) >= _FEWEST_GROUPS else np.inf
+
+
+def _least(weight: np.ndarray, like: np.ndarray, slope: np.ndarray) -> float:
+    """What the sum of the slopes' weighted product must be more than, for noise alone seldom is."""
+    size = float((weight * like**2).sum() * (weight * slope**2).sum())
+    return _CORRELATED * np.sqrt(_ALIKE * size / max(int(np.count_nonzero(weight)), 1))
 
 
 def _slope(rays: OppositeRays, place: float, lines: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -240,6 +275,18 @@ def _slope(rays: OppositeRays, place: float, lines: np.ndarray, columns: np.ndar
 def _varying(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Values (lines, columns, rows) without their mean over lines, in which gains of pixels are."""
     return values - (weight * values).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300)
+
+
+def _without_ramps(values: np.ndarray, weight: np.ndarray, away: np.ndarray) -> np.ndarray:
+    """Values (lines, columns, rows) without each line's straight line in the column's distance from the axis."""
+    light = weight.sum(axis=2)
+    value = (weight * values).sum(axis=2) / np.maximum(light, 1e-300)
+    total = np.maximum(light.sum(axis=1, keepdims=True), 1e-300)
+    from_middle = away - (light * away).sum(axis=1, keepdims=True) / total
+    mean = (light * value).sum(axis=1, keepdims=True) / total
+    spread = np.maximum((light * from_middle**2).sum(axis=1, keepdims=True), 1e-300)
+    ramp = (light * from_middle * value).sum(axis=1, keepdims=True) / spread
+    return values - (mean + ramp * from_middle)[..., None]
 
 
 def _jackknife(above: np.ndarray, below: np.ndarray, distance: np.ndarray, times: float) -> float:

@@ -102,9 +102,14 @@ class OppositeRays:
             Views, or, at the seam of half a turn, all that there are.
         columns : (m,) int
         """
-        own, slope, opposite, use = (
-            self._at_seam(offset, columns) if self.seam else self._around(offset, lines, columns)
+        return self._compared(
+            *(self._at_seam(offset, columns) if self.seam else self._around(offset, lines, columns))
         )
+
+    def _compared(
+        self, own: np.ndarray, slope: np.ndarray, opposite: np.ndarray, use: np.ndarray
+    ) -> RaysAndOpposites:
+        """Pairs with their weights, 0 where they are not to be used."""
         light = [np.exp(self._dark * np.clip(side, 0, _DARK / self._dark)) for side in (own, opposite)]
         weight = np.where(use, 2 / (light[0] + light[1]), 0)
         own, opposite, slope = (np.where(use, part, 0) for part in (own, opposite, slope))
@@ -115,25 +120,78 @@ class OppositeRays:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Rays of these views, slopes, their opposites between two views, and whether there are both."""
         many = len(self.azimuth)
-        fan = np.arctan(self.slope * (columns - self.axis - offset))
-        begin = self.azimuth[0]
-        there = begin + np.mod(self.azimuth[lines, None] + np.pi + 2 * fan - begin, 2 * np.pi)
-        after = np.searchsorted(self.azimuth, there - 1e-9)
-        first, second = (after - 1) % many, after % many
-        gap = np.mod(self.azimuth[second] - self.azimuth[first], 2 * np.pi)
-        share = np.mod(there - self.azimuth[first] + 1e-9, 2 * np.pi) / np.where(gap > 0, gap, 1)
+        first, past, gap = self._met(offset, lines, columns)
+        second, share = (first + 1) % many, past / np.where(gap > 0, gap, 1)
         usable = (gap > 0) & (gap <= _GAP * self._step)
         (a, use_a), (b, use_b) = (self._mirrored(offset, view, columns) for view in (first, second))
         opposite = (1 - share[..., None]) * a + share[..., None] * b
         own, steep = (part[lines][:, columns] for part in (self._smooth, self._steep))
         return own, -2 * steep, opposite, use_a & use_b & usable[..., None] & self._good[lines][:, columns]
 
+    def _met(
+        self, offset: float, lines: np.ndarray, columns: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(lines, columns) the view before the opposite ray, the angle from it to that, and to the next view."""
+        fan = np.arctan(self.slope * (columns - self.axis - offset))
+        begin = self.azimuth[0]
+        there = begin + np.mod(self.azimuth[lines, None] + np.pi + 2 * fan - begin, 2 * np.pi)
+        first = (np.searchsorted(self.azimuth, there - 1e-9) - 1) % len(self.azimuth)
+        past = np.mod(there - self.azimuth[first] + 1e-9, 2 * np.pi)
+        return first, past, np.mod(self._gaps[first], 2 * np.pi)
+
+    def bent(self, offset: float, lines: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """What opposite rays (lines, columns, rows) lack that are taken from the straight line between two views.
+
+        Of how the values bend in the angle, as the views before and after tell. Nothing at the seam of half a turn.
+        """
+        if self.seam:
+            return np.zeros((2, len(columns), self.values.shape[2]))
+        first, past, gap = self._met(offset, lines, columns)
+        views = [(first + step) % len(self.azimuth) for step in (-1, 0, 1, 2)]
+        values, good = zip(*(self._mirrored(offset, view, columns) for view in views))
+        gaps = [np.mod(self._gaps[view], 2 * np.pi)[..., None] for view in views[:3]]
+        even = [(step > 0) & (step <= _GAP * self._step) for step in gaps]
+        steep = [
+            (after - before) / np.where(step > 0, step, 1)
+            for before, after, step in zip(values, values[1:], gaps)
+        ]
+        curved, known = np.zeros(values[0].shape), np.zeros(values[0].shape)
+        for k in (0, 1):
+            use = even[k] & even[k + 1] & good[k] & good[k + 1] & good[k + 2]
+            change = 2 * (steep[k + 1] - steep[k]) / np.maximum(gaps[k] + gaps[k + 1], 1e-12)
+            curved, known = curved + np.where(use, change, 0), known + use
+        return -0.5 * (past * (gap - past))[..., None] * curved / np.maximum(known, 1)
+
+    def elsewhere(self, columns: np.ndarray, most: int) -> list[RaysAndOpposites]:
+        """What is compared at the seam of half a turn, by the same rule between other views: they ought to be equal.
+
+        Parameters
+        ----------
+        columns : (m,) int
+        most : int
+            So many places.
+        """
+        even = np.abs(self._gaps[:-1] / self._step - 1) < _EVEN
+        places = np.array(
+            [k for k in range(3, len(self.azimuth) - 2) if even[k - 3 : k + 2].all()], dtype=np.int64
+        )
+        some = places[np.unique(np.linspace(0, len(places) - 1, min(most, len(places))).astype(int))]
+        steps = range(-3, 3)
+        return [
+            self._compared(
+                *_across(
+                    {k: (self._smooth[j + k, columns], self._good[j + k, columns]) for k in steps}, columns
+                )
+            )
+            for j in some
+        ]
+
     def _at_seam(
         self, offset: float, columns: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Of half a turn: the first and the last view, and what neighbours on both sides of the seam make of them.
 
-        Beyond the seam lie the mirrored views of the other end. The views are taken for a cubic in the angle.
+        Beyond the seam lie the mirrored views of the other end.
         """
         many = len(self.azimuth)
         place = {}
@@ -142,15 +200,7 @@ class OppositeRays:
             place[k] = tuple(part[0] for part in self._mirrored(offset, view, columns))
         for k in (0, 1, 2):
             place[k] = self._smooth[k, columns], self._good[k, columns]
-        own, opposite, use = [], [], []
-        for k in (0, -1):
-            around = [place[k + step] for step in (-2, -1, 1, 2)]
-            own.append(place[k][0])
-            opposite.append(sum(w * part for w, (part, _) in zip((-1 / 6, 4 / 6, 4 / 6, -1 / 6), around)))
-            use.append(np.logical_and.reduce([place[k][1], *(good for _, good in around)]))
-        # Of the four neighbours half lie beyond the seam, or all but half, and with them the view itself.
-        slopes = [-np.gradient(own[0], columns, axis=0), np.gradient(own[1], columns, axis=0)]
-        return np.stack(own), np.stack(slopes), np.stack(opposite), np.stack(use)
+        return _across(place, columns)
 
     def _mirrored(
         self, offset: float, views: np.ndarray, columns: np.ndarray
@@ -228,3 +278,21 @@ class OppositeRays:
             return False
         steps = np.concatenate([self._gaps[:3], self._gaps[-4:-1], [self._gaps[-1] - np.pi]])
         return bool((np.abs(steps / self._step - 1) < _EVEN).all())
+
+
+def _across(
+    place: dict[int, tuple[np.ndarray, np.ndarray]], columns: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Views 0 and -1 of six, what their neighbours on both sides make of them, slopes, and whether there are all.
+
+    The views, values and whether they are good (columns, rows) each, are taken for a cubic in the angle.
+    """
+    own, opposite, use = [], [], []
+    for k in (0, -1):
+        around = [place[k + step] for step in (-2, -1, 1, 2)]
+        own.append(place[k][0])
+        opposite.append(sum(w * part for w, (part, _) in zip((-1 / 6, 4 / 6, 4 / 6, -1 / 6), around)))
+        use.append(np.logical_and.reduce([place[k][1], *(good for _, good in around)]))
+    # Of the four neighbours half lie beyond the seam, or all but half, and with them the view itself.
+    slopes = [-np.gradient(own[0], columns, axis=0), np.gradient(own[1], columns, axis=0)]
+    return np.stack(own), np.stack(slopes), np.stack(opposite), np.stack(use)
