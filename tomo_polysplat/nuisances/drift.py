@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from tomo_polysplat.nuisances.light_factor import LightFactor
 from tomo_polysplat.nuisances.nuisance import Parameter, Place
-from tomo_polysplat.nuisances.steady_light import SteadyLight
 
 __all__ = ["Drift"]
 
 
-class Drift(SteadyLight):
+class Drift(LightFactor):
     """One factor a view."""
 
     name = "drift"

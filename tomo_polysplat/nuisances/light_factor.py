@@ -6,13 +6,13 @@ from collections.abc import Mapping
 
 from tomo_polysplat.nuisances.nuisance import Found, Nuisance, Verdict
 
-__all__ = ["SteadyLight"]
+__all__ = ["LightFactor"]
 
 # In standard errors of the mean difference, each ray with the correction and without.
 _SURE = 3.0
 
 
-class SteadyLight(Nuisance):
+class LightFactor(Nuisance):
     """Factors of the light, found by what a fit leaves of the rays."""
 
     found_by = Found.RESIDUALS

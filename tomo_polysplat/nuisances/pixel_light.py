@@ -11,8 +11,8 @@ __all__ = ["PixelLight"]
 
 # Light is averaged where that leaves as much of the misfit of the rays at metal: a fit makes up for most of what it
 # does not model. 40 scans of several rays a pixel came to 0.75 to 1.15, six of thin or opaque metal to 1.16 to 1.55;
-# 24 of one ray to 1.32 and more, but for grains smaller than a voxel, 1.06, and for rods in the middle of a disc, which
-# all views see alike: 0.34 to 0.99.
+# 24 of one ray to 1.32 and more, but for grains smaller than a voxel, 1.06, for rods in the middle of a disc, which all
+# views see alike, 0.34 to 0.99, and for detail everywhere, 1.02 to 1.18 (docs/decisions/pixel_rays.md).
 _AS_WELL = (0.7, 1.2)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from tomo_polysplat.fit.fitter import Fitter
 from tomo_polysplat.fit.optimise import FitOutcome, Run
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays
@@ -103,6 +104,20 @@ class Lab:
     def means(self, settings: Settings) -> Means:
         """What a short fit under these settings may use."""
         return Means(settings, self.time_budget, self.seed, self.device)
+
+    def branch(self, **changes: Any) -> Fitter:
+        """Another way for the run to go on, with changes to its scene by name.
+
+        Raises
+        ------
+        Untold
+            Where there is no room for a second cloud.
+        """
+        assert self.run is not None
+        try:
+            return self.run.fitter.branch(**changes)
+        except RuntimeError as full:  # torch's, of a GPU
+            raise Untold(f"{full}") from full
 
     def seeds(self, **assumed: Any) -> Gaussians:
         """Seeds of the plan, or of one with other values of some answers; made once, to be copied before a fit."""

@@ -75,7 +75,7 @@ class LinkedSlices:
             for image, (name, axis) in zip(row, self.planes):
                 image.set_data(Plane(name, axis, int(point[axis])).of(values))
                 is_difference = self.difference and row is self._images[-1]
-                # Matplotlib before 3.9 shifts the one limit while the other is still that of before.
+                # Old releases of matplotlib (3.8) shift the one limit while the other is still that of before.
                 for _ in range(2):
                     image.set_clim(*((-half, half) if is_difference else window))
         for (name, axis), title, lines in zip(self.planes, self._titles, self._crosses):

@@ -89,11 +89,7 @@ class Light(Decision):
             raise Untold(f"{share:.0%} of the mass is light: too little to matter")
         if abs(fitter.gaussians.shared_material[0].item() - known[SoftReference]["number"]) > _MOVED:
             raise Untold("the soft matter has found a number of its own")
-        try:
-            other = fitter.branch(light_u=lab.settings.light_u)
-        except RuntimeError as full:
-            # Torch's, of a GPU that has no room for a second cloud.
-            raise Untold(f"{full}") from full
+        other = lab.branch(light_u=lab.settings.light_u)
         tell_light(other.gaussians, other.scene, clock.share())
         ways = fork(fitter, other, clock, passes)
         if ways.late:

@@ -71,11 +71,7 @@ class PixelRays(Decision):
         if not run.clock.allows(_SLOWER):
             raise Untold("the time budget is kept for the fit")
         fitter = run.fitter
-        try:
-            other = fitter.branch(pixel_rays=AVERAGED_RAYS)
-        except RuntimeError as full:
-            # Torch's, of a GPU that has no room for a second cloud.
-            raise Untold(f"{full}") from full
+        other = lab.branch(pixel_rays=AVERAGED_RAYS)
         ways = fork(fitter, other, run.clock, passes_of_a_fork(fitter, known[Passes], _STEPS, _MOST))
         if ways.late:
             run.made = ways.was
