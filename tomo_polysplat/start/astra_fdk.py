@@ -7,6 +7,7 @@ pixel. That is FDK's weight but for the constant V / A (1/A without the distance
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -84,10 +85,13 @@ def fdk_cuda_tensor(
     response = torch.from_numpy(ramp_response(length, filter_name)).to(projections)
     # In ASTRA's order.
     sinogram = projections.new_empty((rows, views, wide.columns))
-    at_once = max(1, _FILTERED_AT_ONCE // (rows * length))
+    at_once, weights = (
+        max(1, _FILTERED_AT_ONCE // (rows * length)),
+        weights_on(projections.device, geometry, orbit, arcs),
+    )
     for first in range(0, views, at_once):
         some = slice(first, min(first + at_once, views))
-        weighted = projections[some] * weights_on(projections.device, geometry, orbit, arcs, some)
+        weighted = projections[some] * weights(some)
         filtered = torch.fft.irfft(torch.fft.rfft(weighted, length) * response, length).transpose(0, 1)
         if before:
             sinogram[:, some, :before] = filtered[..., length - before :]
@@ -99,9 +103,9 @@ def fdk_cuda_tensor(
 
 
 def weights_on(
-    device: torch.device, geometry: Geometry, orbit: Orbit, arcs: np.ndarray, views: slice
-) -> torch.Tensor:
-    """`pixel_weights` on a device, (views, rows, columns) or (views, 1, columns) float32.
+    device: torch.device, geometry: Geometry, orbit: Orbit, arcs: np.ndarray
+) -> Callable[[slice], torch.Tensor]:
+    """What gives `pixel_weights` of some views on a device, (views, rows, columns) or (views, 1, columns) float32.
 
     Lengths of rays and their parts towards the axis are polynomials in row and column: no ray is stored.
     """
@@ -110,25 +114,36 @@ def weights_on(
     def there(values: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(values, np.float32)).to(device)
 
-    part = geometry.select(views)
-    normal = np.cross(part.u, part.v)
+    normal = np.cross(geometry.u, geometry.v)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    scale = (arcs[views] / np.linalg.norm(part.u, axis=1)[:, None])[:, None]
-    if part.beam == "parallel":
-        beam = part.origin / np.linalg.norm(part.origin, axis=1, keepdims=True)
-        return there(scale / np.abs((normal * beam).sum(axis=1))[:, None, None])
+    scale = arcs / np.linalg.norm(geometry.u, axis=1)[:, None]
+    if geometry.beam == "parallel":
+        beam = geometry.origin / np.linalg.norm(geometry.origin, axis=1, keepdims=True)
+        plain = there(scale / np.abs((normal * beam).sum(axis=1))[:, None])
+        return lambda some: plain[some, None]
     # Seen from the pixel in the middle, so that little is lost in float32.
-    rows, columns = (np.arange(count) - 0.5 * (count - 1) for count in (part.rows, part.columns))
-    ray = part.corner - part.origin - rows[0] * part.v - columns[0] * part.u
+    rows, columns = (np.arange(count) - 0.5 * (count - 1) for count in (geometry.rows, geometry.columns))
+    u, v = geometry.u, geometry.v
+    ray = geometry.corner - geometry.origin - rows[0] * v - columns[0] * u
     depth = np.abs((normal * ray).sum(axis=1))
-    towards = np.pad(orbit.axis - part.origin[:, :2], ((0, 0), (0, 1))) / depth[:, None]
+    towards = np.pad(orbit.axis - geometry.origin[:, :2], ((0, 0), (0, 1))) / depth[:, None]
+    pairs = (
+        (ray, towards),
+        (v, towards),
+        (u, towards),
+        (ray, ray),
+        (v, v),
+        (u, u),
+        (ray, v),
+        (ray, u),
+        (u, v),
+    )
+    products = there(np.stack([(a * b).sum(axis=1) for a, b in pairs]))[..., None, None]
+    row, column, scales = there(rows)[:, None], there(columns), there(scale)
 
-    def by_view(a: np.ndarray, b: np.ndarray) -> torch.Tensor:
-        return there((a * b).sum(axis=1)[:, None, None])
+    def weights(some: slice) -> torch.Tensor:
+        rt, vt, ut, rr, vv, uu, rv, ru, uv = products[:, some]
+        squared = rr + row * (row * vv + 2 * rv) + column * (column * uu + 2 * ru + 2 * row * uv)
+        return scales[some, None] * (rt + row * vt + column * ut) * squared.rsqrt()
 
-    row, column = there(rows)[:, None], there(columns)
-    along = by_view(ray, towards) + row * by_view(part.v, towards) + column * by_view(part.u, towards)
-    squared = by_view(ray, ray) + row * (row * by_view(part.v, part.v) + 2 * by_view(ray, part.v))
-    squared = squared + column * (column * by_view(part.u, part.u) + 2 * by_view(ray, part.u))
-    squared = squared + 2 * row * column * by_view(part.u, part.v)
-    return there(scale) * along * squared.rsqrt()
+    return weights
