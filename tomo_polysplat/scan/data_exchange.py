@@ -89,16 +89,9 @@ def scan_from_hdf5(path: Path, options: ReadOptions, part: Part = _ALL) -> Scan:
         wanted = StoredPart(data, now)
         stay = 4 * prod(wanted.shape) >= _STAYS and find_array(file, "polysplat/valid") is None
         views_of = StoredViews(path, now) if stay else lambda: nullcontext(wanted.block)
-        projections: np.ndarray | Counts
-        valid: np.ndarray | Marks
         counts, notes = _counts(views_of, exchange, data, wanted, options)
-        if stay:
-            notes["rays"] = looked_through(counts, options.progress)
-            logger.info("The projections stay in the file: %s as float32.", in_gigabytes(counts.nbytes))
-            projections, valid = counts, counts.marks
-            left_out = sum(notes["rays"].values())
-        else:
-            projections, valid, left_out = _line_integrals(counts, file, wanted, options, notes)
+        made = _left_there(counts, options, notes) if stay else _read(counts, file, wanted, options, notes)
+        projections, valid, left_out = made
         _report_defects(notes["rays"], left_out, counts.size)
         views, rows, columns = data.shape
         whole = _geometry(file, (rows, views, columns), (projections, valid, wanted), options, notes)
@@ -130,10 +123,17 @@ def _in_two(part: Part, file: h5py.File, options: ReadOptions) -> tuple[Part, Pa
     return now, Part(columns=None if known else part.columns, binning=part.binning)
 
 
-def _line_integrals(
+def _left_there(counts: Counts, options: ReadOptions, notes: dict[str, Any]) -> tuple[Counts, Marks, int]:
+    """Projections and validity that stay where they are, and how many rays are not valid; `notes` gets counts of these."""
+    notes["rays"] = looked_through(counts, options.progress)
+    logger.info("The projections stay in the file: %s as float32.", in_gigabytes(counts.nbytes))
+    return counts, counts.marks, sum(notes["rays"].values())
+
+
+def _read(
     counts: Counts, file: h5py.File, wanted: StoredPart, options: ReadOptions, notes: dict[str, Any]
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Projections and validity (rows, views, columns), and how many rays are not; counts of these go into `notes`."""
+    """The same read as a whole."""
     projections, valid, notes["rays"] = line_integrals(counts, options.progress)
     if find_array(file, "polysplat/valid") is not None:
         stored = wanted.of_views(read_numbers(file, "polysplat/valid", wanted.whole_shape).astype(bool))
