@@ -124,7 +124,7 @@ def _in_two(part: Part, file: h5py.File, options: ReadOptions) -> tuple[Part, Pa
 
 
 def _left_there(counts: Counts, options: ReadOptions, notes: dict[str, Any]) -> tuple[Counts, Marks, int]:
-    """Projections and validity that stay where they are, and how many rays are not valid; `notes` gets counts of these."""
+    """Projections and validity that stay in the file, and how many rays are not valid, of which `notes` gets counts."""
     notes["rays"] = looked_through(counts, options.progress)
     logger.info("The projections stay in the file: %s as float32.", in_gigabytes(counts.nbytes))
     return counts, counts.marks, sum(notes["rays"].values())
