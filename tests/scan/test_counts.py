@@ -163,3 +163,17 @@ def test_an_array_of_counts(tmp_path):
         tps.Counts.of(mapped, dark, white)
     with pytest.raises(ValueError, match="counts: expected some views"):
         tps.Counts.of(counts[:0], white, dark)
+
+
+def test_chunks_that_are_unpacked_many_times_are_told(exchange, monkeypatch, caplog):
+    """One view a chunk is read once, and so is anything that is read in one block."""
+    counts, white, dark = counted()
+    path, _ = exchange(data=None, data_white=white, data_dark=dark)
+    for views, block, told in ((91, 4, True), (91, 91, False), (1, 4, False)):
+        with h5py.File(path, "r+") as file:
+            file.pop("exchange/data", None)
+            file.create_dataset("exchange/data", data=counts, chunks=(views, 1, 16), compression="gzip")
+        monkeypatch.setattr("tomo_polysplat.scan.counts._BLOCK", block * ROWS * COLUMNS)
+        caplog.clear()
+        tps.load_scan(path, **KNOWN)
+        assert (f"h5repack -l /exchange/data:CHUNK=1x{ROWS}x{COLUMNS} {path}" in caplog.text) == told

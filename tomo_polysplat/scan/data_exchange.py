@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tomo_polysplat.checks import fail, require_choice
+from tomo_polysplat.checks import fail, require_choice, visible
 from tomo_polysplat.free_memory import in_gigabytes
 from tomo_polysplat.scan.counts import Counts, Marks, Read
 from tomo_polysplat.scan.data_exchange_parallel import parallel_told
@@ -72,6 +72,8 @@ _PER_VECTOR, _MOST_COEFFICIENTS = 13, 100
 _MOST_FRAMES = 1000
 # Bytes of the projections as float32 from which they stay in the file.
 _STAYS = 1 << 30
+# How often a chunk is unpacked without a word.
+_MOST_TIMES = 3
 _ALL = Part()
 
 
@@ -90,6 +92,7 @@ def scan_from_hdf5(path: Path, options: ReadOptions, part: Part = _ALL) -> Scan:
         stay = 4 * prod(wanted.shape) >= _STAYS and find_array(file, "polysplat/valid") is None
         views_of = StoredViews(path, now) if stay else lambda: nullcontext(wanted.block)
         counts, notes = _counts(views_of, exchange, data, wanted, options)
+        _tell_of_chunks(data, counts.at_once, path)
         made = _left_there(counts, options, notes) if stay else _read(counts, file, wanted, options, notes)
         projections, valid, left_out = made
         _report_defects(notes["rays"], left_out, counts.size)
@@ -121,6 +124,21 @@ def _in_two(part: Part, file: h5py.File, options: ReadOptions) -> tuple[Part, Pa
     known = options.proj_geom is not None or group is not None or options.centre is not None
     now = Part(part.rows, part.columns if known else None, part.views)
     return now, Part(columns=None if known else part.columns, binning=part.binning)
+
+
+def _tell_of_chunks(data: StoredArray, at_once: int, path: Path) -> None:
+    """Say what mends chunks that are unpacked again and again, as they hold many views and little of each."""
+    if not data.filters:
+        return
+    # Of so many views, of which some are read at a time.
+    times = 1 + (data.dataset.chunks[0] - 1) / min(at_once, data.shape[0])
+    if times > _MOST_TIMES:
+        one = "x".join(map(str, (1, *data.shape[1:])))
+        logger.warning(
+            "The chunks of %s are unpacked %.0f times over, as each has %d views: h5repack -l %s:CHUNK=%s %s new.h5 "
+            "makes a file that is read faster.",
+            *(data.name, times, data.dataset.chunks[0], data.name, one, visible(path)),
+        )
 
 
 def _left_there(counts: Counts, options: ReadOptions, notes: dict[str, Any]) -> tuple[Counts, Marks, int]:
