@@ -115,6 +115,11 @@ class Counts(_MadeWhenLookedAt):
     shape : (views, rows, columns)
     kind, flat, dark, saturation
         See `tomo_polysplat.scan.defects.attenuation`.
+
+    Attributes
+    ----------
+    found : dict or None
+        How many rays of each kind were not measured properly; None before all were looked through.
     """
 
     # What the numbers are, a word each.
@@ -131,6 +136,7 @@ class Counts(_MadeWhenLookedAt):
         super().__init__((rows, views, columns), np.float32)
         self._opened = opened
         self._kind, self._flat, self._dark, self._saturation = kind, flat, dark, saturation
+        self.found: dict[str, int] | None = None
 
     @classmethod
     def of(cls, counts: Any, white: Any, dark: Any = None, *, saturation: float | None = None) -> Counts:
@@ -243,7 +249,9 @@ class Marks(_MadeWhenLookedAt):
         self.counts, self.lightless = counts, lightless
 
     def _made(self, rows: np.ndarray, views: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        made = np.empty((len(rows), len(views), len(columns)), bool)
+        made = np.ones((len(rows), len(views), len(columns)), bool)
+        if self.counts.found is not None and not any(self.counts.found.values()):
+            return made
         for part, values, usable in self.counts.some(rows, views, columns):
             if self.lightless:
                 usable |= np.isposinf(values)

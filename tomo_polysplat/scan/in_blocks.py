@@ -53,7 +53,8 @@ def line_integrals(
 
 def looked_through(counts: Counts, progress: Progress = None) -> dict[str, int]:
     """How many rays of each kind were found, without keeping any: a damaged file is refused at once."""
-    return _read(counts, progress)
+    counts.found = _read(counts, progress)
+    return counts.found
 
 
 def _read(

@@ -64,13 +64,18 @@ class Measured:
     @cached_property
     def good(self) -> np.ndarray:
         """Which rays of :attr:`filled` were measured."""
-        values, valid = self.scan.projections[self.chosen_rows], self.valid[self.chosen_rows]
+        values, valid = self._values, self.valid[self.chosen_rows]
         return valid & ~dropped_rays(np.where(valid, values, np.nan))
 
     @cached_property
     def filled(self) -> np.ndarray:
         """The chosen rows of the projections, with bad rays interpolated, (rows, views, columns)."""
-        return fill_invalid(self.scan.projections[self.chosen_rows], self.good)
+        return fill_invalid(self._values, self.good)
+
+    @cached_property
+    def _values(self) -> np.ndarray:
+        # Once: a file may have to be read for them.
+        return self.scan.projections[self.chosen_rows]
 
     @cached_property
     def level(self) -> float:
