@@ -143,7 +143,7 @@ def test_projections_on_the_host_give_the_same_steps():
 
 @pytest.mark.gpu
 def test_another_number_of_views_or_gaussians_compiles_nothing(monkeypatch):
-    """Which would take longer than many a pass over the views."""
+    """Which would take longer than many a pass over the views. (One view alone has registers of its own.)"""
     import triton
 
     compiled = []
@@ -160,7 +160,7 @@ def test_another_number_of_views_or_gaussians_compiles_nothing(monkeypatch):
             if isinstance(kernel, triton.runtime.JITFunction):
                 kernel.device_caches.clear()
     found = []
-    for count, batch in ((17, 2), (16, 1), (33, 3)):
+    for count, batch in ((17, 2), (16, 4), (33, 3)):
         compiled.clear()
         problem = fit_problem("cone", True, "cuda", "triton", count=count)
         step = graph_step(*problem, batch)
