@@ -50,8 +50,8 @@ _LARGEST_SLAB = 1 << 26
 # Copies of the projections that the first reconstruction makes: water equivalents, the filtered ones, ASTRA's.
 _COPIES = 4
 # Bytes of the host that a ray takes besides what a scan holds: in the fit's order, whether it is good, and what is made
-# of that in passing; on a CPU also what the start makes of it (20.5 for each more, of 2e7 and 6e7 rays). An energy, whose
-# ray is traced through so many paths and kept three times (runs of 3000 and 12 000 energies); and a voxel of a result.
+# of that in passing; on a CPU also what the start makes of it (20.5 more from 2e7 to 6e7 rays). An energy, whose ray
+# is traced through so many paths and kept three times (runs of 3000 and 12 000 energies); and a voxel of a result.
 _RAY, _ENERGY, _RESULT = {"cpu": 21, "cuda": 8}, 3 * 8 * 2048, 24
 # Of what is free: the rest is the driver's, other programs', and lost between blocks.
 _SHARE = 0.9
