@@ -159,7 +159,7 @@ class _Levels:
         """Seeds of the start volume that the told geometry gives of projections as it would have seen them."""
         told = problem
         if any(bool(value.any()) for value in self.alignment.values.values()):
-            whole = torch.from_numpy(self.problem.projections)
+            whole = torch.from_numpy(np.asarray(self.problem.projections))
             seen = seen_as_told(whole, self.alignment.scanner, self.alignment.values).numpy()
             rows = min(factor, self.problem.geometry.rows)
             told = replace(problem, projections=joined_pixels(seen, rows, factor))

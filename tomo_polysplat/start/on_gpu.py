@@ -9,8 +9,8 @@ from tomo_polysplat.start.orbit import find_orbit
 
 __all__ = ["fdk_on_gpu", "fill_rows"]
 
-# Pixels filled at once: the intermediate results are several times as large.
-_AT_ONCE = 1 << 24
+# Pixels filled at once, on a device: the intermediate results are a dozen times as large.
+_AT_ONCE = {"cuda": 1 << 24, "cpu": 1 << 20}
 
 
 def fdk_on_gpu(
@@ -53,7 +53,8 @@ def fill_rows(projections: torch.Tensor) -> torch.Tensor:
     if not len(spoiled):
         return projections
     filled = projections.clone()
-    for views in spoiled.split(max(1, _AT_ONCE // projections[0].numel())):
+    at_once = max(1, _AT_ONCE[projections.device.type] // projections[0].numel())
+    for views in spoiled.split(at_once):
         filled[views] = _filled(projections[views])
     return filled
 
