@@ -58,9 +58,7 @@ def _sums(rays: OppositeRays, axis: AxisOffset) -> tuple[np.ndarray, np.ndarray,
     best = int(np.argmin(np.where(many >= _ENOUGH * many.max(), mismatch, np.inf)))
     weight, sides = compared[best].weight, (compared[best].own, compared[best].opposite)
     total = max(float(weight.sum()), 1e-300)
-    squares = sum(
-        (weight * (side - (weight * side).sum() / total) ** 2).sum(axis=(1, 2)) for side in sides
-    )
+    squares = sum((weight * (side - (weight * side).sum() / total) ** 2).sum(axis=(1, 2)) for side in sides)
     return (weight * (sides[0] - sides[1]) ** 2).sum(axis=(1, 2)), squares, int(many[best])
 
 
