@@ -17,8 +17,6 @@ __all__ = ["drift_of_views", "gains_of_pixels", "less_rings"]
 _AROUND = 7
 # Deviation, in waves per detector, over which the power of waves is averaged.
 _WAVES = 3.0
-# Share of what opposite pixels have in common that is taken for gains (docs/gains.md).
-_OF_RINGS = 0.5
 # What lies beyond so many deviations of the most is one pixel's fault and does not count for all.
 _FAR = 4.0
 # The median of an exponential distribution in its means; a normal deviation in median absolute ones.
@@ -57,22 +55,42 @@ def gains_of_pixels(weight: np.ndarray, total: np.ndarray) -> np.ndarray:
 
 
 def less_rings(gains: np.ndarray, axis: float) -> np.ndarray:
-    """Gains, (rows, columns), less a part of what the object can show as rings.
+    """Gains, (rows, columns), less what the object is likely to have as rings.
 
-    Pixels as far from the axis of rotation, on both sides, see the same ring: what they have in common is as well the
-    object's, and the residual of it as well an error of the fit.
+    Pixels as far from the axis of rotation, on both sides, see the same ring: what they have in common may be the
+    object's, what differs between them is not. Gains of pixels have nothing to do with each other, so both parts of
+    them are as strong. What the common part has beyond that is left to the object (Wiener's filter).
 
     Parameters
     ----------
     gains : (rows, columns) array
     axis : float
-        Column of the axis of rotation. A pixel without another on the other side has all in common with itself.
+        Column of the axis of rotation. A pixel without another on the other side keeps what it has as far as it is no
+        stronger than gains of other pixels; where there are no pairs at all, nothing tells and all stays.
     """
     columns = np.arange(gains.shape[1])
     others = np.rint(2 * axis - columns).astype(int)
-    others = np.where((others >= 0) & (others < len(columns)), others, columns)
-    common = 0.5 * (gains + gains[:, others])
-    return gains - (1 - _OF_RINGS) * common
+    paired = (others >= 0) & (others < len(columns)) & (others != columns)
+    if not paired.any():
+        return gains
+    others = np.where(paired, others, columns)
+    common, apart = 0.5 * (gains + gains[:, others]), 0.5 * (gains - gains[:, others])
+    told = _strength(apart[:, paired])
+    shares = np.where(paired, _share(told, common[:, paired]), _share(2 * told, common[:, ~paired]))
+    return apart + shares * common
+
+
+def _share(strength: float, values: np.ndarray) -> float:
+    """How much of the values is told by gains of this mean square."""
+    return min(1.0, strength / max(_strength(values), 1e-300))
+
+
+def _strength(values: np.ndarray) -> float:
+    """Mean square, 0 of none; of the most, where a few pixels are far off."""
+    if not values.size:
+        return 0.0
+    usual = _FAR * _NORMAL * float(np.median(np.abs(values)))
+    return float(np.mean(np.clip(values, -usual, usual) ** 2))
 
 
 def _means(weight: np.ndarray, total: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -6,15 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tomo_polysplat.scan.opposite_geometry import opposite_rays_of
 from tomo_polysplat.scan.opposite_rays import OppositeRays
 from tomo_polysplat.scan.view_geometry import Geometry
 
-__all__ = ["AxisOffset", "axis_offset"]
+__all__ = ["LARGEST_SHARE", "AxisOffset", "axis_offset", "offset_of", "spread"]
 
 # Half the range that is searched, as a share of the columns, and columns of the detector that it is searched on.
-_RANGE, _COARSE = 0.12, 96
-# Views, columns and rows that are compared, and values that are looked at.
-_VIEWS, _COLUMNS, _ROWS, _VALUES = 128, 512, 32, 2_000_000
+LARGEST_SHARE, _COARSE = 0.12, 96
+# Views and columns that are compared, and of the coarse search.
+_VIEWS, _COLUMNS = 128, 512
 _COARSE_VIEWS, _COARSE_ROWS = 60, 8
 # Share of the most pairs of any place that a place must have.
 _ENOUGH = 0.2
@@ -28,16 +29,11 @@ _STEPS, _LONGEST, _SETTLED = 12, 0.5, 1e-3
 _APART = 0.25
 # Groups of lines and of columns, each left out once; fewer lines than these are cut by rows instead.
 _LINE_GROUPS, _COLUMN_GROUPS, _FEWEST_LINES, _FEWEST_GROUPS = 16, 12, 8, 4
-_FEWEST_VIEWS, _FEWEST_COLUMNS = 12, 12
 # Standard errors by which slopes along columns and of opposite rays must be correlated, and pairs that noise makes
 # alike: neighbours, by smoothing, and each pair is there twice.
 _CORRELATED, _ALIKE = 4.0, 6.0
 # Places between other views at which the rule of the seam is tried.
 _SEAMS = 24
-# Relative change of the source's distance from the axis, and of its height, that still is a circle.
-_ROUND = 0.02
-# Columns by which the axis may wander on the detector, and rows.
-_STEADY, _LEVEL = 0.05, 1.0
 
 
 @dataclass(frozen=True)
@@ -59,7 +55,7 @@ class AxisOffset:
     doubt: str = ""
 
 
-def axis_offset(projections: np.ndarray, geometry: Geometry) -> AxisOffset:
+def axis_offset(projections: np.ndarray, geometry: Geometry, valid: np.ndarray | None = None) -> AxisOffset:
     """Tell by how many columns the detector was off, from opposite rays.
 
     Parameters
@@ -68,6 +64,8 @@ def axis_offset(projections: np.ndarray, geometry: Geometry) -> AxisOffset:
         -log(I/I0); NaN for rays that are not to be used.
     geometry : Geometry
         As told.
+    valid : (views, rows, columns) bool array, optional
+        Rays to use, of those that are finite.
 
     Returns
     -------
@@ -88,9 +86,16 @@ def axis_offset(projections: np.ndarray, geometry: Geometry) -> AxisOffset:
     neighbouring views, where it is known.
     """
     try:
-        rays = _rays(projections, geometry)
+        return offset_of(opposite_rays_of(projections, geometry, valid))
+    except ValueError as why:
+        return AxisOffset(0.0, np.inf, str(why))
+
+
+def offset_of(rays: OppositeRays) -> AxisOffset:
+    """What `axis_offset` tells, of rays that are put together."""
+    try:
         found, step = _rough(rays)
-        limit = _RANGE * geometry.columns
+        limit = LARGEST_SHARE * rays.values.shape[1]
         while True:
             found, error = _refined(rays.joined(step), found / step, limit / step)
             found *= step
@@ -106,86 +111,14 @@ def axis_offset(projections: np.ndarray, geometry: Geometry) -> AxisOffset:
     return AxisOffset(-found, error)
 
 
-def _rays(projections: np.ndarray, geometry: Geometry) -> OppositeRays:
-    """The rays that are compared, by rising azimuth, the largest gap at the end.
-
-    Raises
-    ------
-    ValueError
-        Where the geometry has no opposite rays.
-    """
-    if geometry.views < _FEWEST_VIEWS or geometry.columns < _FEWEST_COLUMNS:
-        raise ValueError(f"fewer than {_FEWEST_VIEWS} views or {_FEWEST_COLUMNS} columns do not tell")
-    azimuth, axis, slope, rows = (_of_parallel if geometry.beam == "parallel" else _of_cone)(geometry)
-    order = np.argsort(azimuth, kind="stable")
-    azimuth = azimuth[order]
-    last = int(np.argmax(np.diff(azimuth, append=azimuth[0] + 2 * np.pi)))
-    order, azimuth = np.roll(order, -last - 1), np.roll(azimuth, -last - 1)
-    azimuth = np.where(azimuth < azimuth[0], azimuth + 2 * np.pi, azimuth)
-    values = sum(share * np.asarray(projections[:, some], np.float64).swapaxes(1, 2) for share, some in rows)
-    return OppositeRays(np.where(np.isfinite(values), values, np.nan)[order], azimuth, axis, slope)
-
-
-def _of_parallel(geometry: Geometry) -> tuple[np.ndarray, float, float, list[tuple[float, np.ndarray]]]:
-    """Azimuth, column of the axis, slope and rows with their weights of a parallel beam."""
-    inverse, reference = geometry.projection_matrices()
-    # Points along z stay in their row's height on all views, and in their column.
-    along = inverse[:, :2, 2]
-    if np.abs(geometry.origin[:, 2]).max() > 1e-6 * np.linalg.norm(geometry.origin, axis=1).min():
-        raise ValueError("the beam is inclined to the axis")
-    if np.abs(along[:, 0]).max() * geometry.rows > _STEADY * np.abs(along[:, 1]).min():
-        raise ValueError("the axis leans on the detector")
-    foot = -np.einsum("vkl,vl->vk", inverse[:, :2], reference)
-    # Where the axis runs: the point of the plane whose column stays.
-    system = np.column_stack([inverse[:, 0, :2], -np.ones(geometry.views)])
-    solution, _, rank, _ = np.linalg.lstsq(system, -foot[:, 0], rcond=1e-9)
-    if rank < 3 or np.abs(system @ solution + foot[:, 0]).max() > _STEADY:
-        raise ValueError("the axis moves on the detector")
-    if np.ptp(foot[:, 1]) > _LEVEL:
-        raise ValueError("the object moves along the axis")
-    most = max(1, min(geometry.rows, _ROWS, _VALUES // (geometry.views * geometry.columns)))
-    rows = np.unique(((np.arange(most) + 0.5) * geometry.rows / most).astype(int))
-    return np.arctan2(geometry.origin[:, 1], geometry.origin[:, 0]), float(solution[2]), 0.0, [(1.0, rows)]
-
-
-def _of_cone(geometry: Geometry) -> tuple[np.ndarray, float, float, list[tuple[float, np.ndarray]]]:
-    """The same of a fan or cone beam: the plane of the orbit lies between two rows."""
-    # |p|^2 = 2 c.p + (r^2 - |c|^2), in coordinates about the mean.
-    mean = geometry.origin.mean(axis=0)
-    local = (geometry.origin - mean)[:, :2]
-    system = np.column_stack([2 * local, np.ones(len(local))])
-    centre = np.linalg.lstsq(system, (local**2).sum(axis=1), rcond=None)[0][:2]
-    arm = local - centre
-    distance = np.hypot(*arm.T)
-    if max(np.ptp(distance), np.ptp(geometry.origin[:, 2])) > _ROUND * distance.mean():
-        raise ValueError("the source does not go round on a circle")
-    inverse, _ = geometry.projection_matrices()
-    ahead = np.column_stack([-arm, np.zeros(len(arm))]) / distance[:, None]
-    foot = np.einsum("vkl,vl->vk", inverse, ahead)
-    foot = foot[:, :2] / foot[:, 2:]
-    if np.ptp(foot[:, 0]) > _STEADY or np.ptp(foot[:, 1]) > _LEVEL:
-        raise ValueError("the detector moves against the source")
-    axis, row = np.median(foot, axis=0)
-    if not -0.5 <= row <= geometry.rows - 0.5:
-        raise ValueError("the plane of the orbit is not on the detector")
-    left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
-    depth = np.einsum("vk,vk->v", geometry.corner + axis * geometry.u - geometry.origin, ahead)
-    slope = np.median(np.einsum("vk,vk->v", geometry.u[:, :2], left) / depth)
-    low = int(np.clip(row, 0, geometry.rows - 1))
-    share = float(np.clip(row - low, 0, 1))
-    both = [(1 - share, np.array([low])), (share, np.array([min(low + 1, geometry.rows - 1)]))]
-    azimuth = np.arctan2(arm[:, 1], arm[:, 0])
-    return azimuth, float(axis), float(slope), [part for part in both if part[0] > 1e-3]
-
-
 def _rough(rays: OppositeRays) -> tuple[float, int]:
     """The place where opposite rays agree best, in columns, and how many columns were joined to find it."""
     columns = rays.values.shape[1]
     factor = max(1, columns // _COARSE)
     some = np.unique(np.linspace(0, rays.values.shape[2] - 1, _COARSE_ROWS).astype(int))
     coarse = OppositeRays(rays.values[..., some], rays.azimuth, rays.axis, rays.slope).joined(factor)
-    lines, columns = _spread(coarse, _COARSE_VIEWS)
-    reach = np.ceil(_RANGE * len(columns))
+    lines, columns = spread(coarse, _COARSE_VIEWS)
+    reach = np.ceil(LARGEST_SHARE * len(columns))
     places = np.arange(-reach, reach + 0.25, 0.5)
     compared = [coarse.pairs(place, lines, columns) for place in places]
     many = np.array([np.count_nonzero(pairs.weight) for pairs in compared])
@@ -202,7 +135,7 @@ def _rough(rays: OppositeRays) -> tuple[float, int]:
     return float(places[best] * factor), factor
 
 
-def _spread(rays: OppositeRays, most: int) -> tuple[np.ndarray, np.ndarray]:
+def spread(rays: OppositeRays, most: int) -> tuple[np.ndarray, np.ndarray]:
     """Views and columns that are compared."""
     views, columns, _ = rays.values.shape
     return (
@@ -217,7 +150,7 @@ def _refined(rays: OppositeRays, place: float, limit: float, varying: bool = Fal
     Only what is ``varying`` with the views may be compared, in which gains of pixels have no part. Else what is linear
     in the column has none: light that drifts, and a flat field that slopes from side to side, make that.
     """
-    lines, columns = _spread(rays, _VIEWS)
+    lines, columns = spread(rays, _VIEWS)
     away = columns - rays.axis - place
 
     def told(values: np.ndarray, weight: np.ndarray) -> np.ndarray:

@@ -23,8 +23,9 @@ def photons_per_ray(
 
     Counts that are Poisson distributed give ``-log(I/I0)`` a variance ``exp(P) / I0``. The variance is taken
     from second differences along detector rows, ``p[j-1] - 2 p[j] + p[j+1]``, whose variance is six times
-    that of a pixel. It is estimated by the median absolute deviation, which edges disturb little. Structure can only
-    add to the variance, so the quietest bins of P give the noise.
+    that of a pixel. What all views have in common at a pixel is left out of them: a detector whose gains differ by
+    3 % has no more noise. It is estimated by the median absolute deviation, which edges disturb little. Structure can
+    only add to the variance, so the quietest bins of P give the noise.
 
     Parameters
     ----------
@@ -44,7 +45,7 @@ def photons_per_ray(
     rows = max(1, -(-math.prod(some.shape) // _MOST))
     some = some[:, ::rows]
     some = torch.from_numpy(some.astype(np.float64)) if isinstance(some, np.ndarray) else some.double()
-    difference = (some[..., 3:-1] - 2 * some[..., 2:-2] + some[..., 1:-3]).abs()
+    difference = _of_views(some[..., 3:-1] - 2 * some[..., 2:-2] + some[..., 1:-3]).abs()
     if dimmed is not None:
         # As if the pixels had the whole beam: what bins go by is the object alone.
         difference *= torch.exp(-0.5 * torch.as_tensor(dimmed)[::rows, 2:-2].to(difference))
@@ -63,6 +64,17 @@ def photons_per_ray(
         rates.append(deviation**2 / math.exp(level))
     variance = sorted(rates)[_BINS // 8]
     return max(1.0, 1 / variance) if variance > 0 else float("inf")
+
+
+def _of_views(values: torch.Tensor) -> torch.Tensor:
+    """(views, rows, columns) less each pixel's mean over the views, of the same noise; NaN where there is one view."""
+    if len(values) < 2:
+        return values
+    good = torch.isfinite(values)
+    count = good.sum(dim=0)
+    mean = torch.where(good, values, torch.zeros_like(values)).sum(dim=0) / count
+    # As many as the mean takes of the variance are missing (Bessel).
+    return (values - mean) * torch.sqrt(count / (count - 1))
 
 
 def _median(ordered: torch.Tensor) -> float:

@@ -8,11 +8,13 @@ image of the object, which agrees as well as the object itself.
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
 
+from tomo_polysplat.scan.axis_offset import LARGEST_SHARE, AxisOffset, axis_offset, offset_of
 from tomo_polysplat.scan.centre import find_centre
-from tomo_polysplat.scan.evidence import RULED_OUT, Located
-from tomo_polysplat.scan.probes.fan import Fan
+from tomo_polysplat.scan.evidence import RULED_OUT
+from tomo_polysplat.scan.opposite_geometry import opposite_rays_of
+from tomo_polysplat.scan.probes.direction import direction_doubt, turned_round
 from tomo_polysplat.scan.probes.finding import DEFECT, OK, UNKNOWN, Finding
 from tomo_polysplat.scan.probes.measured import Measured
 
@@ -29,25 +31,27 @@ _NEEDS = "a calibration of the scanner, or an object with detail where rays were
 
 def probe_centre_and_direction(measured: Measured) -> list[Finding]:
     """Compare rays with those that ran the same way backwards."""
+    views = measured.scan.projections.swapaxes(0, 1), measured.geometry, measured.valid.swapaxes(0, 1)
     if measured.geometry.beam == "parallel":
         text = "a parallel beam cannot tell: turned angles give the mirror image of the object"
-        return [_parallel_centre(measured), Finding(DIRECTION, UNKNOWN, text, "an object that is known")]
+        found = axis_offset(*views)
+        found = _or_far_off(measured, found) if found.doubt else found
+        return [_centre(found), Finding(DIRECTION, UNKNOWN, text, "an object that is known")]
     try:
-        fan = Fan(measured)
-        told, turned = fan.locate(+1), fan.locate(-1)
+        rays = opposite_rays_of(*views)
     except ValueError as error:
         return [Finding(name, UNKNOWN, str(error), _NEEDS) for name in (CENTRE, DIRECTION)]
-    doubt = fan.direction_doubt(told.place, turned.place)
-    ratio = told.mismatch / turned.mismatch
+    told, turned = offset_of(rays), offset_of(turned_round(rays))
+    doubt, ratio = direction_doubt(rays, told, turned)
     numbers = {"ratio": ratio, "standard errors": abs(doubt)}
     if doubt < -RULED_OUT and ratio > _MUCH_BETTER and not turned.doubt:
         text = f"opposite rays agree {ratio:.1f} times better with the angles turned round"
-        found = Finding(DIRECTION, DEFECT, text, "take the angles times -1 (or reverse the views)", numbers)
-        return [_centre(turned, 0.0), found]
-    return [_centre(told, 0.0), _direction(told, doubt, numbers)]
+        turn = Finding(DIRECTION, DEFECT, text, "take the angles times -1 (or reverse the views)", numbers)
+        return [_centre(turned), turn]
+    return [_centre(told), _direction(told, doubt, numbers)]
 
 
-def _direction(told: Located, doubt: float, numbers: dict[str, float]) -> Finding:
+def _direction(told: AxisOffset, doubt: float, numbers: dict[str, float]) -> Finding:
     better = f"{1 / numbers['ratio']:.1f} times better than turned"
     if doubt > RULED_OUT and not told.doubt:
         return Finding(DIRECTION, OK, f"opposite rays agree {better}", "", numbers)
@@ -55,31 +59,29 @@ def _direction(told: Located, doubt: float, numbers: dict[str, float]) -> Findin
     return Finding(DIRECTION, UNKNOWN, text, _NEEDS, numbers)
 
 
-def _parallel_centre(measured: Measured) -> Finding:
+def _or_far_off(measured: Measured, unknown: AxisOffset) -> AxisOffset:
+    """An axis of a parallel beam that is farther off than `axis_offset` looks: told by it from near there."""
+    views, valid = measured.scan.projections.swapaxes(0, 1), measured.valid.swapaxes(0, 1)
     geometry = measured.geometry
-    lean = np.abs(geometry.origin[:, 2]) / np.linalg.norm(geometry.origin, axis=1)
-    width, height = measured.grid.extent.max(), geometry.pixel_size_at(measured.grid.centre)[1]
-    if lean.max() * width > height:
-        return Finding(CENTRE, UNKNOWN, "the beam is inclined to the axis", _NEEDS)
-    ends = measured.grid.extent[2] * np.array([[0, 0, -0.5], [0, 0, 0.5]]) * (geometry.rows > 1)
-    axis = geometry.project_points(ends)
-    if np.ptp(axis[..., 0]) > _TOLERATED or np.ptp(axis[..., 1], axis=0).max() > 1:
-        return Finding(CENTRE, UNKNOWN, "the axis moves or leans on the detector", _NEEDS)
-    stated = float(np.median(axis[..., 0])) + 0.5
     try:
-        found = find_centre(measured.filled, measured.azimuth, measured.good)
-    except ValueError as error:
-        return Finding(CENTRE, UNKNOWN, str(error), _NEEDS)
-    return _centre(found, stated)
+        stated = opposite_rays_of(views, geometry, valid).axis + 0.5
+        rough = find_centre(measured.filled, measured.azimuth, measured.good)
+    except ValueError:
+        return unknown
+    far = rough.place - stated
+    if rough.doubt or abs(far) <= LARGEST_SHARE * geometry.columns:
+        return unknown
+    near = axis_offset(views, replace(geometry, corner=geometry.corner - far * geometry.u), valid)
+    return near if near.doubt else AxisOffset(near.columns - far, near.error)
 
 
-def _centre(found: Located, stated: float) -> Finding:
-    """The finding on an axis in the data, where the geometry has it at `stated`, in columns."""
-    offset = found.place - stated
-    numbers = {"offset": offset, "stated": stated, "found": found.place, "mismatch": found.mismatch}
+def _centre(found: AxisOffset) -> Finding:
+    """The finding on an axis in the data."""
     if found.doubt:
-        return Finding(CENTRE, UNKNOWN, found.doubt, _NEEDS, numbers)
-    error = found.uncertainty
+        return Finding(CENTRE, UNKNOWN, found.doubt, _NEEDS)
+    # The axis is above where it was told if the detector stood below.
+    offset, error = -found.columns, found.error
+    numbers = {"offset": offset}
     size = f"{abs(offset):.2f} columns (standard error {error:.2g})"
     if abs(offset) > _TOLERATED + RULED_OUT * error:
         side = "above" if offset > 0 else "below"
@@ -87,7 +89,6 @@ def _centre(found: Located, stated: float) -> Finding:
         remedy = f"move the detector: astra.geom_postalignment(proj_geom, ({-offset:.2f}, 0.0))"
         return Finding(CENTRE, DEFECT, text, remedy, numbers, error)
     if error > _TELLING:
-        return Finding(
-            CENTRE, UNKNOWN, f"the axis is known to {error:.2g} columns only", _NEEDS, numbers, error
-        )
+        text = f"the axis is known to {error:.2g} columns only"
+        return Finding(CENTRE, UNKNOWN, text, _NEEDS, numbers, error)
     return Finding(CENTRE, OK, f"within {size} of where the geometry has it", "", numbers, error)
