@@ -42,13 +42,13 @@ def told(path, rays):
 scan_side = 40
 told(written(sys.argv[1] + "/few.h5", 20, scan_side), 20 * 1600)
 scan_side = 320
-print(*told(written(sys.argv[1] + "/many.h5", 200, scan_side), 200 * 320**2))
+print(*told(written(sys.argv[1] + "/many.h5", 120, scan_side), 120 * 320**2))
 """
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="ru_maxrss in kilobytes is Linux's")
 def test_counts_take_nothing_and_the_rays_of_a_fit_five_bytes(tmp_path):
-    """2e7 rays: loading takes a block; then there are a float32 and a mark for each, and at most two bytes in passing.
+    """1.2e7 rays: loading takes a block; then there are a float32 and a mark for each, and at most two bytes in passing.
 
     As arrays a scan takes 5 bytes a ray, and what is made of it 12 besides.
     """
