@@ -16,7 +16,7 @@ from scipy import ndimage
 from tomo_polysplat.parallel import run_tasks
 from tomo_polysplat.scan.shadows import moving_shadows
 
-__all__ = ["fill_opaque"]
+__all__ = ["fill_opaque", "is_dark"]
 
 # Photons of an opaque ray. dB without metal / everywhere with 0.1, with 0.5, and with opaque rays left out:
 # jaw with amalgam 39.9 / 35.3, 39.8 / 32.9, 37.4 / 35.1; two hips 29.0 / 35.4, 28.1 / 34.0, 28.6 / 30.6;
@@ -30,6 +30,11 @@ _DARK, _QUARTILE = 0.45, 0.75
 _DEAD, _OPAQUE = 0.9, 0.5
 _AROUND = np.ones((3, 3))
 _STEPS = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
+
+
+def is_dark(value: float, photons: float) -> bool:
+    """Whether a ray with this -log(I/I0) is as dark as those beside opaque rays; never where noise is not known."""
+    return 1 < photons < math.inf and value >= _DARK * math.log(photons)
 
 
 def fill_opaque(values: np.ndarray, photons: float) -> int:

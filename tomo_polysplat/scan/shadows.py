@@ -11,9 +11,9 @@ from scipy import ndimage, sparse
 
 __all__ = ["moving_shadows"]
 
-# A shadow passes over this many times the pixels that it covers in any one view. Pixels that fail now and then
-# pass over no more than all of them, of which more than half fail at once where they fail more often than not.
-_MOVED = 2
+# A shadow passes over this many times the pixels that it covers in any one view. Pixels that fail now and then pass
+# over no more than all of them, of which two thirds fail at once in some view where they fail as often as not.
+_MOVED = 1.5
 # Views that it must last: of rays that fail at random, one in ten, some 1e-4 make a chain so long.
 _LASTS = 5
 _AROUND = np.ones((3, 3))

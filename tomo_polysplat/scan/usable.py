@@ -17,6 +17,7 @@ from tomo_polysplat.scan.geometry import is_planar_geometry, projections_from_as
 from tomo_polysplat.scan.line_integrals import require_line_integrals
 from tomo_polysplat.scan.noise import photons_per_ray
 from tomo_polysplat.scan.opaque import fill_opaque
+from tomo_polysplat.scan.scale_end import fill_dark_end
 from tomo_polysplat.scan.stuck import stuck_pixels
 
 __all__ = ["usable_rays"]
@@ -68,10 +69,13 @@ def usable_rays(
     if proj_geom.get("type") == "cyl_cone_vec":
         # After resampling, a ray that uses any ray without light is infinite.
         values[np.isposinf(values)] = np.nan
-    lightless = any(np.isposinf(view).any() for view in values) if counts["rays_not_finite"] else False
-    counts["rays_opaque"] = fill_opaque(values, photons_per_ray(values)) if lightless else 0
-    counts["rays_not_finite"] -= counts["rays_opaque"]
-    used += counts["rays_opaque"]
+    if any(np.isposinf(view).any() for view in values) if counts["rays_not_finite"] else False:
+        counts["rays_opaque"] = fill_opaque(values, photons_per_ray(values))
+        counts["rays_not_finite"] -= counts["rays_opaque"]
+        used += counts["rays_opaque"]
+    else:
+        # A scale that goes to infinity has no end before.
+        counts["rays_opaque"] = fill_dark_end(values)
     if used < (1 - _MOST_LEFT_OUT) * values.size:
         _tell_left_out({name: n for name, n in counts.items() if name != "rays_opaque"}, used)
     if counts["rays_opaque"]:

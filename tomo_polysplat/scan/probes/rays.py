@@ -9,6 +9,7 @@ import numpy as np
 from tomo_polysplat.scan.dropouts import dropped_rays
 from tomo_polysplat.scan.probes.finding import DEFECT, OK, Finding
 from tomo_polysplat.scan.probes.measured import Measured
+from tomo_polysplat.scan.scale_end import fill_dark_end
 from tomo_polysplat.scan.stuck import stuck_pixels
 
 __all__ = ["DEAD", "RAYS", "bad_rays", "probe_rays"]
@@ -39,7 +40,7 @@ def bad_rays(measured: Measured) -> dict[str, np.ndarray]:
     """Bad rays by kind, each ray under one kind, as masks (rows, some of the views, columns)."""
     views = _some_views(measured)
     valid, projections = measured.valid[:, views], measured.scan.projections[:, views]
-    starved = _starved(projections, valid, measured.level)
+    starved = _starved(projections, valid, measured.level) | _dark_end(projections, valid)
     zero = dropped_rays(np.where(valid, projections, np.nan))
     # Few photons make few values, and that of air is one of them.
     zero &= _stands_out_as_value(projections[valid], 0.0)
@@ -51,7 +52,7 @@ def bad_rays(measured: Measured) -> dict[str, np.ndarray]:
         DEAD: dead,
         ZERO: zero & ~dead,
         MARKED: ~valid & ~starved & ~dead,
-        "at the limit of the scale": _at_a_limit(projections, valid) & ~dead,
+        "at the limit of the scale": _at_a_limit(projections, valid) & ~dead & ~starved,
         STARVED: starved,
     }
 
@@ -89,6 +90,14 @@ def _starved(projections: np.ndarray, valid: np.ndarray, level: float) -> np.nda
     alone = ~np.isfinite(around)
     lit = np.asarray(valid.any(axis=1))[:, None]
     return ~valid & ((around > _OPAQUE * level) | alone & lit)
+
+
+def _dark_end(projections: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Rays clipped to one value that a reconstruction takes for opaque."""
+    values = np.where(valid, projections, np.nan).astype(np.float32).swapaxes(0, 1)
+    filled = values.copy()
+    fill_dark_end(filled)
+    return valid & (filled != values).swapaxes(0, 1)
 
 
 def _dead_pixels(projections: np.ndarray, valid: np.ndarray, level: float) -> np.ndarray:

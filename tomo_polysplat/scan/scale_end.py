@@ -1,0 +1,74 @@
+"""Rays at the upper end of the scale: a program has replaced what is darker by one value.
+
+Counts are often clipped before the logarithm, as by ``numpy.clip(transmission, 1e-4, None)``. The value of such a ray
+is no measurement, but a bound.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from tomo_polysplat.scan.noise import photons_per_ray
+from tomo_polysplat.scan.opaque import fill_opaque, is_dark
+
+__all__ = ["fill_dark_end"]
+
+# Noise and detail repeat no value exactly: rays at the end are so many, this share of all at least, and this many
+# times as many as those of any other value among some of the largest. Counts of few photons do repeat.
+_FEWEST, _SHARE, _OFTEN = 10, 2e-4, 3
+_LOOKED_AT = 1 << 18
+# Of counts, one photon is a measurement, and the next darkest ray has two.
+_ONE_PHOTON = 1e-4
+
+
+def fill_dark_end(values: np.ndarray) -> int:
+    """Give rays at the upper end of the scale that of opaque ones, in place, where no light can have come.
+
+    Parameters
+    ----------
+    values : (views, rows, columns) float32 array
+        -log(I/I0); NaN where a ray is not to be used.
+
+    Returns
+    -------
+    int
+        How many there were; others at the end stay as they are.
+    """
+    ended, end = _at_the_end(values)
+    if ended is None:
+        return 0
+    clipped = np.where(ended, np.float32(np.inf), values)
+    # Without the rays at the end, which all have the same value, and so no noise.
+    photons = photons_per_ray(clipped)
+    if not is_dark(end, photons):
+        return 0
+    fill_opaque(clipped, photons)
+    opaque = ended & np.isfinite(clipped)
+    values[opaque] = clipped[opaque]
+    return int(np.count_nonzero(opaque))
+
+
+def _at_the_end(values: np.ndarray) -> tuple[np.ndarray | None, float]:
+    """Which rays have the largest value, where that is the end of the scale (None otherwise), and that value."""
+    end = _largest(values)
+    if not end > 0:
+        return None, end
+    number = sum(int(np.count_nonzero(view == end)) for view in values)
+    if number <= max(_FEWEST, _SHARE * values.size):
+        return None, end
+    if abs(end - _largest(values, below=end) - math.log(2)) < _ONE_PHOTON:
+        return None, end
+    step = -(-values.size // _LOOKED_AT)
+    some = values.reshape(-1)[::step]
+    others = some[np.isfinite(some) & (some != end)]
+    often = np.unique(others, return_counts=True)[1].max(initial=0)
+    if number <= _OFTEN * step * often and np.count_nonzero(some == end) <= _OFTEN * often:
+        return None, end
+    return values == end, end
+
+
+def _largest(values: np.ndarray, below: float = np.inf) -> float:
+    """The largest value below another one, finite; view by view, so that nothing large is made."""
+    return max((float(view.max(initial=-np.inf, where=view < below)) for view in values), default=-np.inf)
