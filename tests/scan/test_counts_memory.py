@@ -48,9 +48,9 @@ print(*told(written(sys.argv[1] + "/many.h5", 120, scan_side), 120 * 320**2))
 
 @pytest.mark.skipif(sys.platform != "linux", reason="ru_maxrss in kilobytes is Linux's")
 def test_counts_take_nothing_and_the_rays_of_a_fit_five_bytes(tmp_path):
-    """1.2e7 rays: loading takes a block; then there are a float32 and a mark for each, and at most two bytes in passing.
+    """1.2e7 rays: loading takes a block; then there are a float32 and a mark for each, and two bytes in passing.
 
-    As arrays a scan takes 5 bytes a ray, and what is made of it 12 besides.
+    As arrays a scan takes 5 bytes a ray, and what is made of it 7 besides.
     """
     environment = os.environ | {"OMP_NUM_THREADS": "2"}
     made = subprocess.run(
