@@ -71,7 +71,7 @@ def _of_views(values: torch.Tensor) -> torch.Tensor:
     if len(values) < 2:
         return values
     good = torch.isfinite(values)
-    count = good.sum(dim=0)
+    count = good.sum(dim=0, dtype=values.dtype)
     mean = torch.where(good, values, torch.zeros_like(values)).sum(dim=0) / count
     # As many as the mean takes of the variance are missing (Bessel).
     return (values - mean) * torch.sqrt(count / (count - 1))
