@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tomo_polysplat.scan.axis_offset import LARGEST_SHARE, AxisOffset, offset_of, spread
+from tomo_polysplat.scan.axis_offset import LARGEST_SHARE, AxisOffset, spread
 from tomo_polysplat.scan.evidence import compare
 from tomo_polysplat.scan.opposite_rays import OppositeRays
 
