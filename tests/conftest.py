@@ -4,16 +4,14 @@ import os
 import signal
 
 import pytest
-
-if "PYTEST_XDIST_WORKER" in os.environ:
-    # Workers share the cores; threads of one would wait for those of the other. Read when torch is imported.
-    cores = (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
-    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, cores)))
-
-import torch  # noqa: E402
+import torch
 
 
-def pytest_configure():
+def pytest_configure(config):
+    if workers := getattr(config.option, "numprocesses", None):
+        # Workers share the cores; threads of one would wait for those of the other. They are told before they begin:
+        # numpy and torch read it when they are imported, and another package's plugin may import numpy first.
+        os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // workers)))
     # A background job of a shell inherits an ignored Ctrl-C, which tests of interruptions would wait for in vain.
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)

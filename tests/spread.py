@@ -9,16 +9,20 @@ from xdist.scheduler import LoadFileScheduling
 SPLIT = ("tests/test_notebooks.py",)
 # Files that take longest, the longest first; the order of the others does not matter.
 LONGEST = (
-    "tests/kernels/test_triton_steps.py",
     "tests/bench/test_bench_hard.py",
     "tests/plan/test_tv_factor.py",
     "tests/plan/test_scatter_search.py",
-    "tests/test_reconstruct_fat.py",
-    "tests/kernels/test_triton.py",
-    "tests/test_reconstruct.py",
-    "tests/plan/test_light.py",
+    "tests/test_several_devices.py",
+    "tests/bench/test_bench_physics.py",
+    "tests/kernels/test_triton_steps.py",
     "tests/plan/test_pixel_rays.py",
     "tests/scan/test_check.py",
+    "tests/test_reconstruct.py",
+    "tests/plan/test_light.py",
+    "tests/kernels/test_triton.py",
+    "tests/test_reconstruct_fat.py",
+    "tests/test_threads.py",
+    "tests/test_readme.py",
     "tests/test_notebooks.py",
 )
 

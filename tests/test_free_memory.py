@@ -151,6 +151,18 @@ def test_a_volume_that_a_gpu_cannot_hold_is_refused_at_once(monkeypatch):
         memory.require_machine(10**10, 256**3, 100, device)
 
 
+def test_rays_and_volume_are_not_on_the_host_together_where_a_gpu_takes_the_rays(monkeypatch):
+    device = torch.device("cuda", 0)
+    monkeypatch.setattr(free_memory, "available_memory", lambda: int(30e9))
+    monkeypatch.setattr(memory, "free_bytes", lambda device: int(80e9))
+    memory.require_machine(3 * 10**9, 10**9, 100, device)
+    with pytest.raises(MemoryError, match="projections"):
+        memory.require_machine(4 * 10**9, 10**6, 100, device)
+    monkeypatch.setattr(memory, "free_bytes", lambda device: int(20e9))
+    with pytest.raises(MemoryError, match="projections"):
+        memory.require_machine(3 * 10**9, 10**9, 100, device)
+
+
 def test_a_mask_takes_no_copies_of_the_size_of_the_projections():
     scan = cone(24, 40)
     mask = np.ones(scan.projections.shape, bool)

@@ -10,7 +10,7 @@ from small_scans import QUICK, fan, reconstruct
 
 import tomo_polysplat as tps
 from tomo_polysplat.progress import TimeLeft, progress_reports
-from tomo_polysplat.scan import in_blocks
+from tomo_polysplat.scan import counts
 from tomo_polysplat.simulate.folders.scene import marked_scan
 from tomo_polysplat.simulate.folders.write import write_folder
 
@@ -119,7 +119,7 @@ def test_reading_is_shown_while_it_goes_on(kind, tmp_path, monkeypatch, capsys):
         tps.save_scan(scan, path := tmp_path / "scan.h5")
     for blocks, shares in ((None, [1.0]), (2, [1 / 3, 2 / 3, 1.0])):
         if blocks is not None:
-            monkeypatch.setattr(in_blocks, "_BLOCK_BYTES", blocks * 9 * 9 * 8)
+            monkeypatch.setattr(counts, "_BLOCK", blocks * 9 * 9)
         told = []
         tps.load_scan(path, progress=lambda share, words, told=told: told.append((share, words)))
         assert [share for share, _ in told] == pytest.approx(shares)

@@ -14,6 +14,7 @@ from tomo_polysplat.quiet_imports import leaving_no_trace
 __version__ = "0.1.0"
 
 _PUBLIC = {
+    "Counts": "tomo_polysplat.scan.counts",
     "Detector": "tomo_polysplat.physics.detector",
     "Materials": "tomo_polysplat.physics.base_materials",
     "Result": "tomo_polysplat.result.result",

@@ -126,9 +126,7 @@ def require_array(argument: str, value: Any, ndim: int | None = None, remedy: st
     return array
 
 
-def require_shape(
-    argument: str, array: np.ndarray, shape: tuple[int, ...], meaning: str, remedy: str = ""
-) -> None:
+def require_shape(argument: str, array: Any, shape: tuple[int, ...], meaning: str, remedy: str = "") -> None:
     """An exact shape; ``meaning`` names its axes, such as ``"(rows, views, columns)"``."""
     if tuple(array.shape) != tuple(shape):
         raise fail(argument, f"shape {tuple(shape)} {meaning}", f"{tuple(array.shape)}", remedy)

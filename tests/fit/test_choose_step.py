@@ -63,13 +63,13 @@ FULL = torch.cuda.OutOfMemoryError("CUDA out of memory")
 def test_no_room_for_a_graph_is_none_for_single_operations(problem, graphs, problems):
     graphs.GraphStep = failing(*problems)
     with pytest.raises(NoRoom) as told:
-        own_step(*problem, BATCH)
+        own_step(problem, BATCH)
     assert told.value.__context__ is None, "which would hold all that was made"
 
 
 def test_what_else_a_graph_fails_of_is_no_lack_of_memory(problem, graphs):
     graphs.GraphStep = failing(RuntimeError("no graphs here"))
-    assert isinstance(own_step(*problem, BATCH), EagerStep)
+    assert isinstance(own_step(problem, BATCH), EagerStep)
 
 
 @pytest.mark.parametrize("mine", [Recorded, failing(FULL)])
@@ -79,7 +79,7 @@ def test_ranks_go_without_a_step_together(problem, graphs, mine):
     ranks = Ranks(0, 2)
     ranks.total = lambda *numbers: [1.0]
     with pytest.raises(NoRoom):
-        own_step(*problem, BATCH, ranks)
+        own_step(problem, BATCH, ranks)
 
 
 class Told(Ranks):
@@ -101,11 +101,11 @@ def test_after_a_step_that_has_no_room_ranks_make_others(problem):
             raise NoRoom("full")
         return Recorded(*parts)
 
-    first = LedStep(make, *problem, BATCH, ranks)
+    first = LedStep(make, problem, BATCH, ranks)
     with pytest.raises(torch.cuda.OutOfMemoryError, match="full"):
-        LedStep(make, *problem, BATCH, ranks, first)
+        LedStep(make, problem, BATCH, ranks, first)
     assert ranks.usable
-    LedStep(make, *problem, BATCH, ranks)
+    LedStep(make, problem, BATCH, ranks)
     number = first._number
     made = [parts[-1]["beside"] for what, *parts in ranks.messages if what == "make"]
     assert made == [0, number, 0]

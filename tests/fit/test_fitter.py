@@ -26,8 +26,7 @@ class ShortClock(Clock):
 
 
 def fitter_of(steps):
-    gaussians, spacing, rays, scene, settings = fit_problem("cone", True, "cpu", "numba")
-    return Fitter(gaussians, spacing, rays, scene, settings, Batches(1, steps, np.random.default_rng(1)))
+    return Fitter(fit_problem("cone", True, "cpu", "numba"), Batches(1, steps, np.random.default_rng(1)))
 
 
 def rates(fitter):
@@ -75,9 +74,9 @@ def test_a_cloud_grows_after_its_old_step_has_gone(monkeypatch):
 
 
 def test_a_branch_without_room_leaves_no_trace(monkeypatch):
-    def full(gaussians, *_, **__):
+    def full(setup, **_):
         # As the trial of a step would.
-        gaussians.position.fill_(torch.nan)
+        setup.gaussians.position.fill_(torch.nan)
         raise torch.cuda.OutOfMemoryError("full")
 
     ends = []

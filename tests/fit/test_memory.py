@@ -117,7 +117,7 @@ def test_a_gpu_that_is_full_all_the_same_is_told_with_a_remedy(monkeypatch):
     monkeypatch.setattr("tomo_polysplat.fit.fitter.make_step", full)
     course = Course(views_per_step=2, rng=np.random.default_rng(0), started=0.0, volume=lambda _: None)
     with pytest.raises(MemoryError, match="2.00 GiB.*max_gaussians.*settings=.*memory"):
-        fit(*problem, course)
+        fit(problem, course)
 
 
 def test_what_recorded_graphs_keep_is_no_room_for_a_volume(monkeypatch):

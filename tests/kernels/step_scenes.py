@@ -6,6 +6,7 @@ from splat_scenes import cone_views, gaussians, parallel_views, planar_views
 
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.fit.step import EagerStep, step_rates
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model.gaussians import Gaussians
@@ -18,7 +19,7 @@ CURVES = torch.tensor([[1.0, 2.1, 6.0], [0.8, 1.5, 3.5]])
 
 
 def fit_problem(kind, polychromatic, device, kernel, count=17, **changes):
-    """Gaussians, spacing, rays, scene and settings of a fit that has far to go."""
+    """What a fit is made of that has far to go."""
     views, planar = {
         "cone": (cone_views, False),
         "parallel": (parallel_views, False),
@@ -65,7 +66,7 @@ def fit_problem(kind, polychromatic, device, kernel, count=17, **changes):
         pixel_rays,
         behind=behind if polychromatic else None,
     )
-    return _gaussians(count, planar, device), 0.2, rays, scene, settings
+    return FitSetup(_gaussians(count, planar, device), 0.2, rays, scene, settings)
 
 
 def _gaussians(count, planar, device):
@@ -93,12 +94,12 @@ def compare_steps(make, device, truth, kind="cone", polychromatic=True, **change
     for form, where, kernel in ((make, device, "triton"), (EagerStep, *truth)):
         # Few: Triton's interpreter takes a tenth of a second for each.
         problem = fit_problem(kind, polychromatic, where, kernel, count=9, **changes)
-        gaussians = problem[0]
+        gaussians = problem.gaussians
         before = gaussians.copy()
-        step = form(*problem) if form is EagerStep else form(*problem, BATCH)
+        step = form(problem) if form is EagerStep else form(problem, BATCH)
         for k in range(STEPS - steps, STEPS):
             if k == STEPS - 1 and faster != 1:
-                rates = step_rates(problem[4], problem[1])
+                rates = step_rates(problem.settings, problem.spacing)
                 step.set_rates({name: faster * rate for name, rate in rates.items()})
             step(np.array([k, 4 - k]), k / STEPS)
         read = step.read()

@@ -53,9 +53,30 @@ def patch_once() -> None:
     interpreter._patch_lang = replace_once
 
 
+def hurry() -> None:
+    """Let the interpreter know numpy's types by name, and sort as numpy does: a third of its time.
+
+    It makes a table of all types for every operation, and sorts by a network of hundreds of operations.
+    """
+    import triton.language as tl
+    from triton.runtime import interpreter
+
+    look_up, known = interpreter._get_np_dtype, {}
+
+    def numpy_type(of):
+        name = of.scalar.name
+        if name not in known:
+            known[name] = look_up(of)
+        return known[name]
+
+    interpreter._get_np_dtype = numpy_type
+    tl.sort = lambda of: tl.tensor(interpreter.TensorHandle(np.sort(of.handle.data), of.dtype), of.type)
+
+
 def main() -> None:
     poison()
     patch_once()
+    hurry()
     np.seterr(all="ignore")  # the interpreter computes masked lanes too
     problems = {}
     for name in sys.argv[1:]:

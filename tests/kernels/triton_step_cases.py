@@ -14,10 +14,10 @@ from tomo_polysplat.kernels import portions
 from tomo_polysplat.ranks import ALONE, Ranks
 
 
-def _fused(*problem):
+def _fused(problem, batch):
     from tomo_polysplat.fit.fused_step import FusedStep
 
-    return FusedStep(*problem)
+    return FusedStep(problem, batch)
 
 
 @functools.cache
@@ -111,12 +111,12 @@ def the_slope_by_the_blur_behind_much_matter(device):
     slopes = []
     for where, kernel, form in (
         (device, "triton", _fused),
-        ("cpu", "reference", lambda *p: EagerStep(*p[:-1])),
+        ("cpu", "reference", lambda problem, _: EagerStep(problem)),
     ):
         problem = fit_problem("cone", True, where, kernel, held_out=0.0, loss="l1")
-        problem[0].blur.zero_()
-        problem[0].attenuation.mul_(60.0)
-        step = form(*problem, BATCH)
+        problem.gaussians.blur.zero_()
+        problem.gaussians.attenuation.mul_(60.0)
+        step = form(problem, BATCH)
         step(np.array([0, 3]), 0.0)
         slopes.append(10 * float(step.moments["blur"][0]))
     assert abs(slopes[0] / slopes[1] - 1) < 1e-3 and abs(slopes[1]) > 0.1, slopes
@@ -129,8 +129,8 @@ def what_is_not_a_number_shows_in_the_misfit(device):
         problem = fit_problem(
             "cone", True, device, "triton", 9, blurring=blurring, pixel_rays=rays, held_out=0.0
         )
-        step = _fused(*problem, BATCH)
-        problem[0].attenuation[3] = float("nan")
+        step = _fused(problem, BATCH)
+        problem.gaussians.attenuation[3] = float("nan")
         step(np.array([0, 3]), 0.0)
         assert np.isnan(step.read()[0]), (blurring, rays)
 
@@ -150,7 +150,7 @@ def another_number_of_views_or_gaussians_is_no_other_kernel(device):
             before = set(found)
             for pixel_rays in (1, 2):
                 problem = fit_problem("cone", True, device, "triton", count=count, pixel_rays=pixel_rays)
-                _fused(*problem, batch)(np.arange(batch), 0.0)
+                _fused(problem, batch)(np.arange(batch), 0.0)
             assert not before or found == before, found - before
     assert len(found) > 10
 
@@ -191,7 +191,7 @@ def _made(kind, device, ranks, changes):
     from tomo_polysplat.fit.fused_step import FusedStep
 
     problem = fit_problem(kind, True, device, "triton", count=9, **changes)
-    step = FusedStep(*problem, BATCH, ranks)
+    step = FusedStep(problem, BATCH, ranks)
     step._control.copy_(torch.from_numpy(step._next(np.array([3, 1]), 0.0)))
     return step, step._gradients(0.3)
 

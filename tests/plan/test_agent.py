@@ -94,8 +94,8 @@ def test_the_run_takes_for_metal_what_the_seeds_did(monkeypatch):
     """Below the usual level of metal an agent is, to the run, soft matter with something dense in it."""
     scan, used = fan(), []
 
-    def fit(gaussians, spacing, rays, scene, settings, course):
-        used.append(settings)
+    def fit(setup, course):
+        used.append(setup.settings)
         raise Begun
 
     monkeypatch.setattr(solver, "fit", fit)

@@ -199,9 +199,10 @@ def test_a_cloud_without_dense_matter_that_grows_is_smoothed_less(times, curves,
     "device, kernel", [("cpu", "numba"), pytest.param("cuda", "triton", marks=pytest.mark.gpu)]
 )
 def test_the_optimiser_remembers_those_that_are_not_split(device, kernel):
-    gaussians, spacing, rays, scene, settings = fit_problem("cone", True, device, kernel)
-    growing = replace(settings, growth=2.0, relocate_until=1.0, bone_level=DENSE)
-    fitter = Fitter(gaussians, spacing, rays, scene, growing, Batches(1, 100, np.random.default_rng(1)))
+    setup = fit_problem("cone", True, device, kernel)
+    growing = replace(setup.settings, growth=2.0, relocate_until=1.0, bone_level=DENSE)
+    fitter = Fitter(setup._replace(settings=growing), Batches(1, 100, np.random.default_rng(1)))
+    gaussians = setup.gaussians
     count, clock = len(gaussians), Clock(100, None)
     light = int((gaussians.group <= 0).sum())
     assert 1 < light < count and fitter.most == count + light

@@ -77,7 +77,7 @@ def without_dxchange(monkeypatch, action):
 
 
 def test_reading_gives_the_same_arrays(host, raw, monkeypatch):
-    monkeypatch.setattr("tomo_polysplat.scan.in_blocks._BLOCK_BYTES", 4 * 3 * 20 * 8)
+    monkeypatch.setattr("tomo_polysplat.scan.counts._BLOCK", 4 * 3 * 20)
     with_it = load_scan(raw)
     assert len(host) >= 3 + 3, "data in three blocks, white, dark and theta"
     number = len(host)

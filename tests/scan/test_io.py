@@ -83,7 +83,7 @@ def test_data_exchange_counts(exchange):
 
 def test_data_exchange_reads_in_blocks(exchange, monkeypatch):
     path, lines = exchange()
-    monkeypatch.setattr("tomo_polysplat.scan.in_blocks._BLOCK_BYTES", 7 * ROWS * COLUMNS * 8)
+    monkeypatch.setattr("tomo_polysplat.scan.counts._BLOCK", 7 * ROWS * COLUMNS)
     np.testing.assert_allclose(load_scan(path).projections, lines.transpose(1, 0, 2), atol=1e-5)
 
 

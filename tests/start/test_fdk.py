@@ -5,11 +5,11 @@ import pytest
 from start_phantoms import SPHERES, chords, distance, relative_error
 
 from tomo_polysplat.scan.geometry import from_astra, to_astra
-from tomo_polysplat.start.astra_fdk import _in_short
+from tomo_polysplat.start.astra_fdk import weights_on
 from tomo_polysplat.start.fdk import fdk, fits_fdk
 from tomo_polysplat.start.filters import FILTERS
 from tomo_polysplat.start.orbit import find_orbit
-from tomo_polysplat.start.weights import ray_arcs
+from tomo_polysplat.start.weights import pixel_weights, ray_arcs
 
 astra = pytest.importorskip("astra")
 
@@ -242,36 +242,63 @@ def test_wrong_arguments_are_named():
         fdk(np.zeros(geometry.shape, np.float32), geometry, grid, filter_name="sharp")
 
 
+# Every kind of scan that filtered backprojection fits.
+_KINDS = {
+    "cone": cone(),
+    "cone of an odd width": cone(columns=101),
+    "oblong pixels": cone(rows=80, columns=110, pixel=(1.3, 2.0)),
+    "backwards, in any order": cone(np.random.default_rng(1).permutation(-TURN)),
+    "uneven steps": cone(TURN + 0.02 * np.sin(5 * TURN)),
+    "axis off": cone(offset=(1.7, -2.2)),
+    "half fan": cone(columns=60, offset=(14.0, 0.0)),
+    "short scan": cone(np.linspace(0.3, 0.3 + np.deg2rad(212), 120)),
+    "parallel": parallel(),
+    "half-width parallel": parallel(TURN, columns=50, offset=14.3),
+}
+
+
+@pytest.mark.parametrize("kind", _KINDS)
+def test_weights_by_polynomials_are_those_of_rays(kind):
+    import torch
+
+    geometry, grid = from_astra(_KINDS[kind], VOLUME)
+    orbit, _ = find_orbit(geometry)
+    arcs, some = ray_arcs(geometry, orbit, grid), slice(3, 9)
+    found = weights_on(torch.device("cpu"), geometry, orbit, arcs)(some).numpy()
+    expected = pixel_weights(geometry, orbit, arcs, some)
+    assert expected.max() > 0
+    np.testing.assert_allclose(np.broadcast_to(found, expected.shape), expected, rtol=2e-6)
+
+
 @pytest.mark.gpu
-def test_astras_fdk_on_a_gpu_agrees(monkeypatch):
+@pytest.mark.parametrize("kind", _KINDS)
+def test_a_gpu_makes_the_same_volume(kind):
     import os
 
     import torch
 
     from tomo_polysplat.start.astra_fdk import fdk_cuda, suits_fdk_cuda
 
-    geometry, grid = from_astra(cone(), VOLUME)
-    orbit, _ = find_orbit(geometry)
+    geometry, grid = from_astra(_KINDS[kind], VOLUME)
     if not torch.cuda.is_available():
-        assert not suits_fdk_cuda(geometry, grid, orbit)[0]
+        assert not suits_fdk_cuda(geometry)[0]
         assert os.environ.get("POLYSPLAT_REQUIRE_GPU") != "1", "no GPU to test on"
         pytest.skip("no GPU")
-    assert suits_fdk_cuda(geometry, grid, orbit)[0]
+    assert suits_fdk_cuda(geometry)[0]
+    # Away from the origin, and voxels that are no cubes.
     shift = np.array([5.0, -3.0, 2.0])
-    # ASTRA weights 32 columns at once, whether there are as many or not.
-    odd, _ = from_astra(cone(columns=101), VOLUME)
-    scans = ((geometry, grid), (geometry.shifted(shift), grid.shifted(shift)), (odd, grid))
-    for scanner, voxels in scans:
-        spheres = [(np.add(c, voxels.centre - grid.centre), r, m) for c, r, m in SPHERES]
+    moved = geometry.shifted(shift)
+    _, oblong = from_astra(cone(), astra.create_vol_geom(50, 64, 40, -32, 32, -32, 32, -32, 32))
+    for scanner, voxels in ((geometry, grid), (moved, grid.shifted(shift)), (geometry, oblong)):
+        spheres = [(np.add(c, voxels.centre), r, m) for c, r, m in SPHERES]
         projections = chords(scanner, spheres)
         orbit, _ = find_orbit(scanner)
         expected = fdk(projections, scanner, voxels)
         volume = fdk_cuda(projections, scanner, voxels, orbit)
-        assert relative_error(volume, expected, distance(voxels, voxels.centre) < 26) < 0.01
+        within = distance(voxels, voxels.centre) < 26
+        # Textures interpolate by weights of 8 bits.
+        assert relative_error(volume, expected, within) < 0.002
         np.testing.assert_array_equal(fdk_cuda(projections, scanner, voxels, orbit), volume)
-    for other in (cone(columns=60, offset=(14.0, 0.0)), cone(np.linspace(0, 4, 90)), parallel()):
-        scanner, voxels = from_astra(other, VOLUME)
-        assert not suits_fdk_cuda(scanner, voxels, find_orbit(scanner)[0])[0]
 
 
 @pytest.mark.gpu
@@ -294,26 +321,8 @@ def test_rows_are_filtered_as_astra_filters_them(filter_name):
     astra.algorithm.delete(algorithm)
     astra.data3d.delete(data)
     volume = fdk_cuda(projections, geometry, grid, find_orbit(geometry)[0], filter_name=filter_name)
-    assert np.abs(volume - expected).max() < 1e-4 * np.abs(expected).max()
-
-
-@pytest.mark.parametrize(
-    ("scanner", "kind"),
-    [
-        (cone(), "cone"),
-        (cone(-TURN[::-1], rows=31, pixel=(1.3, 1.7)), "cone"),
-        (cone(offset=(0.001, 0.0)), "cone_vec"),
-        (cone(offset=(0.0, 0.5)), "cone_vec"),
-    ],
-)
-def test_an_even_orbit_is_told_by_its_angles(scanner, kind):
-    geometry, grid = from_astra(scanner, VOLUME)
-    short, vol_geom = _in_short(geometry, grid)
-    assert short["type"] == kind
-    again, voxels = from_astra(short, vol_geom)
-    for name in ("origin", "corner", "u", "v"):
-        np.testing.assert_allclose(getattr(again, name), getattr(geometry, name), atol=1e-10)
-    np.testing.assert_array_equal(voxels.lower, grid.lower)
+    within = distance(grid, grid.centre) < 30
+    assert np.abs(volume - expected)[within].max() < 1e-3 * np.abs(expected).max()
 
 
 def test_our_geometry_in_astras_terms_reconstructs_the_same():

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 NAME = "check"
 HELP = "say what is in a scan and what is wrong with it, and how to mend that"
 DEFECT_STATUS = 3
+# Rays of a large file that the range of line integrals is told of.
+_LOOKED_AT = 1 << 27
 SIGNS = {"ok": "ok", "defect": "MEND", "unknown": "?"}
 
 
@@ -58,13 +60,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _described(scan: Scan) -> dict[str, str]:
     """What the file holds, a line each."""
-    import numpy as np
 
     from tomo_polysplat.scan.geometry import from_astra
 
     geometry, grid = from_astra(scan.proj_geom, scan.vol_geom)
-    values = scan.projections if scan.valid is None else scan.projections[scan.valid]
-    lost = 0 if scan.valid is None else int(np.count_nonzero(~scan.valid))
+    lost, values = _good_values(scan)
     size = " x ".join(f"{length:.4g}" for length in grid.voxel_size)
     lines = {
         "scan": repr(scan),
@@ -73,9 +73,7 @@ def _described(scan: Scan) -> dict[str, str]:
         "spectrum": "unknown: pass --kvp or --spectrum to recon"
         if scan.spectrum is None
         else repr(scan.spectrum),
-        "line integrals": f"{values.min():.3g} to {values.max():.3g}, median {np.median(values):.3g}"
-        if values.size
-        else "none that is good",
+        "line integrals": values,
         "rays left out": f"{lost} of {scan.projections.size}",
         "truth": "none" if scan.truth is None else f"largest value {scan.truth.max():.3g} 1/{scan.unit}",
     }
@@ -83,6 +81,28 @@ def _described(scan: Scan) -> dict[str, str]:
         how = "estimated from opposite views" if scan.notes["centre_estimated"] else "as given"
         lines["rotation axis"] = f"column {scan.notes['centre']:.2f}, {how}"
     return lines
+
+
+def _good_values(scan: Scan) -> tuple[int, str]:
+    """How many rays are not good, and the range and the median of the others; that of some views of a large file."""
+    import numpy as np
+
+    from tomo_polysplat.scan.counts import Counts
+
+    some = slice(None)
+    if isinstance(scan.projections, Counts):
+        some = slice(None, None, -(-scan.views // max(1, _LOOKED_AT // (scan.rows * scan.columns))))
+    values = scan.projections[:, some]
+    lost = 0
+    if scan.valid is not None:
+        good = scan.valid[:, some]
+        lost, values = int(np.count_nonzero(~good)), values[good]
+    if isinstance(scan.projections, Counts) and scan.projections.found is not None:
+        lost = sum(scan.projections.found.values())
+    of = "" if some.step in (None, 1) else f" (every {some.step}th view)"
+    if not values.size:
+        return lost, "none that is good"
+    return lost, f"{values.min():.3g} to {values.max():.3g}, median {np.median(values):.3g}{of}"
 
 
 def _summary(defects: int, unknown: int) -> str:

@@ -7,10 +7,9 @@ import logging
 import torch
 
 from tomo_polysplat.fit.led_step import LedStep
-from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.fit.step import EagerStep, Step
-from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.ranks import ALONE, Ranks, current_ranks
 from tomo_polysplat.settings import Settings
 
@@ -32,21 +31,12 @@ def why_eager(scene: FitScene, settings: Settings) -> str:
     return ""
 
 
-# All that a fit is made of, and the run beside it.
-def make_step(
-    gaussians: Gaussians,
-    spacing: float,
-    rays: Rays,
-    scene: FitScene,
-    settings: Settings,
-    *,
-    batch: int,
-    beside: Step | None = None,
-) -> Step:
+def make_step(setup: FitSetup, *, batch: int, beside: Step | None = None) -> Step:
     """A CUDA graph where there can be one, else operation by operation; shared out over ranks, if there are several.
 
     Parameters
     ----------
+    setup : FitSetup
     batch : int
         Views of a step.
     beside : Step, optional
@@ -58,34 +48,24 @@ def make_step(
         Where a GPU has no room for the graph: operation by operation would need more.
     """
     ranks = current_ranks()
-    if ranks.count == 1 or settings.ssim_weight:
+    if ranks.count == 1 or setup.settings.ssim_weight:
         if ranks.count > 1:
             logger.warning("One device makes the steps: structural similarity is of whole steps.")
-        return own_step(gaussians, spacing, rays, scene, settings, batch, beside=beside)
+        return own_step(setup, batch, beside=beside)
     led = beside if isinstance(beside, LedStep) else None
-    return LedStep(own_step, gaussians, spacing, rays, scene, settings, batch, ranks, led)
+    return LedStep(own_step, setup, batch, ranks, led)
 
 
-# What a step needs, and whom it shares it with.
-def own_step(
-    gaussians: Gaussians,
-    spacing: float,
-    rays: Rays,
-    scene: FitScene,
-    settings: Settings,
-    batch: int,
-    ranks: Ranks = ALONE,
-    beside: Step | None = None,
-) -> Step:
+def own_step(setup: FitSetup, batch: int, ranks: Ranks = ALONE, beside: Step | None = None) -> Step:
     """This process's step, or its part of that of ``ranks``, which all make theirs; see `make_step`."""
-    reason, full = why_eager(scene, settings), ""
+    reason, full = why_eager(setup.scene, setup.settings), ""
     graph: Step | None = None
     if not reason:
         from tomo_polysplat.fit.graph_step import GraphStep
 
         try:
             shared = beside if isinstance(beside, GraphStep) else None
-            graph = GraphStep(gaussians, spacing, rays, scene, settings, batch, ranks, shared)
+            graph = GraphStep(setup, batch, ranks, shared)
         # Of compiler or driver, of any kind: the slower way gives the same result.
         except Exception as problem:
             logger.debug("no CUDA graph", exc_info=True)
@@ -102,7 +82,7 @@ def own_step(
     # What the two forms add up over ranks is not the same.
     if ranks.same(graph is not None) and graph is not None:
         return graph
-    return EagerStep(gaussians, spacing, rays, scene, settings, ranks)
+    return EagerStep(setup, ranks)
 
 
 def _of_memory(problem: BaseException | None) -> bool:

@@ -17,7 +17,7 @@ from tomo_polysplat.fit.learning_rates import hurried
 from tomo_polysplat.fit.light_matter import tell_light
 from tomo_polysplat.fit.metal_numbers import number_metals
 from tomo_polysplat.fit.rays import Rays
-from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.fit.snapshot import Snapshot
 from tomo_polysplat.fit.soft_matter import flatten
 from tomo_polysplat.fit.step import Step, step_rates
@@ -26,7 +26,6 @@ from tomo_polysplat.kernels.compile_time import working_time
 from tomo_polysplat.kernels.spatial_order import spatial_order
 from tomo_polysplat.model.density_control import grow, relocate, splittable
 from tomo_polysplat.model.gaussians import OF_ALL, Gaussians
-from tomo_polysplat.settings import Settings
 
 __all__ = ["Batches", "Fitter", "next_views", "views_of_a_pass"]
 
@@ -51,34 +50,20 @@ class Fitter:
 
     Parameters
     ----------
-    gaussians : Gaussians
-        Changed in place.
-    spacing : float
-        Of the seeds.
-    rays : Rays
-    scene : FitScene
-    settings : Settings
+    setup : FitSetup
+        Its settings as they are for any number of steps.
     batches : Batches
     beside : Fitter, optional
         Another run on the same rays that never steps at the same time: both use the same memory on the way.
     """
 
-    # All that a fit is made of, and the run beside it.
-    def __init__(
-        self,
-        gaussians: Gaussians,
-        spacing: float,
-        rays: Rays,
-        scene: FitScene,
-        settings: Settings,
-        batches: Batches,
-        beside: Fitter | None = None,
-    ) -> None:
+    def __init__(self, setup: FitSetup, batches: Batches, beside: Fitter | None = None) -> None:
         batch, steps, self.rng = batches
-        self.gaussians, self.rays, self.scene, self.settings = gaussians, rays, scene, settings
+        gaussians, self.spacing, rays, self.scene, settings = setup
+        self.gaussians, self.rays, self.settings = gaussians, rays, settings
         hurry, shared = hurried(settings, steps), None if beside is None else beside.step
-        self.step: Step = make_step(gaussians, spacing, rays, scene, hurry, batch=batch, beside=shared)
-        self.spacing, self.batch, self.order = spacing, batch, np.empty(0, int)
+        self.step: Step = make_step(setup._replace(settings=hurry), batch=batch, beside=shared)
+        self.batch, self.order = batch, np.empty(0, int)
         self.steps = steps
         self.steps_of_a_pass = max(1, round(views_of_a_pass(rays) / batch))
         self.relocated = 0
@@ -128,8 +113,8 @@ class Fitter:
     def branch(self, **changes: Any) -> Fitter:
         """The same run from here on, with changes to its scene by name, on Gaussians of its own."""
         scene, rng = replace(self.scene, **changes), copy.deepcopy(self.rng)
-        gaussians, batches = self.gaussians.copy(), Batches(self.batch, self.steps, rng)
-        other = Fitter(gaussians, self.spacing, self.rays, scene, self.settings, batches, beside=self)
+        setup = FitSetup(self.gaussians.copy(), self.spacing, self.rays, scene, self.settings)
+        other = Fitter(setup, Batches(self.batch, self.steps, rng), beside=self)
         other.restore(self.snapshot(None, {}))
         return other
 
@@ -213,7 +198,8 @@ class Fitter:
         hurry = hurried(self.settings, self.steps)
         # What the old step holds on its way is as much again, and too small for the new one.
         del old, self.step
-        self.step = make_step(self.gaussians, self.spacing, self.rays, self.scene, hurry, batch=self.batch)
+        setup = FitSetup(self.gaussians, self.spacing, self.rays, self.scene, hurry)
+        self.step = make_step(setup, batch=self.batch)
         for name, moments in self.step.moments.items():
             for moment, kept in zip(moments, moments_before[name]):
                 if name in OF_ALL:

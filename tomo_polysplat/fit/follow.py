@@ -15,6 +15,7 @@ import torch.distributed as dist
 from tomo_polysplat.fit.choose_step import NoRoom, own_step
 from tomo_polysplat.fit.led_step import fingerprint, state_of
 from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.fit.step import Step
 from tomo_polysplat.kernels.device import one_torch_thread, pick_device, usual_modes
 from tomo_polysplat.kernels.views import DetectorViews
@@ -43,8 +44,8 @@ class _Followed:
         photons, model_error, held_out, dimmed = parts["rays"]
         views = DetectorViews(*parts["views"])
         self.rays = Rays(projections, views, photons, model_error, held_out, streamed, dimmed)
-        about = (parts["spacing"], self.rays, parts["scene"], parts["settings"], parts["batch"])
-        self.step: Step = own_step(self.gaussians, *about, ranks, beside)
+        setup = FitSetup(self.gaussians, parts["spacing"], self.rays, parts["scene"], parts["settings"])
+        self.step: Step = own_step(setup, parts["batch"], ranks, beside)
 
     @torch.no_grad()
     def restore(self, state: list[torch.Tensor], done: int, rates: Any) -> None:

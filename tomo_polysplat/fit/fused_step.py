@@ -15,8 +15,7 @@ import torch
 
 from tomo_polysplat.fit.adam import EPSILON, new_moments
 from tomo_polysplat.fit.feed import feed
-from tomo_polysplat.fit.rays import Rays
-from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.fit.step import (
     held_out_mean,
     log_scale_bounds,
@@ -38,12 +37,10 @@ from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.kernels.voxelise import triton_backward as box_backward
 from tomo_polysplat.kernels.voxelise import triton_forward as box_forward
 from tomo_polysplat.kernels.voxelise.triton_setup import box_table, ellipsoids
-from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.detector_blur import LARGEST_BLUR
 from tomo_polysplat.physics.transmission import nodes_on
 from tomo_polysplat.ranks import ALONE, Ranks
 from tomo_polysplat.render.renderer import VOXEL_CUTOFF
-from tomo_polysplat.settings import Settings
 
 __all__ = ["FusedStep", "Gradients"]
 
@@ -68,13 +65,7 @@ class FusedStep:
 
     Parameters
     ----------
-    gaussians : Gaussians
-        Changed in place; its tensors must keep their addresses.
-    spacing : float
-        Of the seeds.
-    rays : Rays
-    scene : FitScene
-    settings : Settings
+    setup : FitSetup
     batch : int
         Views of a step.
     ranks : Ranks
@@ -82,16 +73,8 @@ class FusedStep:
     """
 
     # What differs between scenes is set up once, for kernels that are given addresses.
-    def __init__(
-        self,
-        gaussians: Gaussians,
-        spacing: float,
-        rays: Rays,
-        scene: FitScene,
-        settings: Settings,
-        batch: int,
-        ranks: Ranks = ALONE,
-    ) -> None:
+    def __init__(self, setup: FitSetup, batch: int, ranks: Ranks = ALONE) -> None:
+        gaussians, spacing, rays, scene, settings = setup
         self.gaussians, self.rays, self.scene, self.settings = gaussians, rays, scene, settings
         self.done, self._unread, self.ranks = 0, 0, ranks
         self._batch, self._mine = batch, ranks.mine(batch)

@@ -10,13 +10,11 @@ import numpy as np
 import torch
 
 from tomo_polysplat.fit.fused_step import FusedStep, Gradients
-from tomo_polysplat.fit.rays import Rays
-from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.fit.step import smoothing
 from tomo_polysplat.free_memory import give_back, recording
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.ranks import ALONE, Ranks
-from tomo_polysplat.settings import Settings
 
 __all__ = ["GraphStep"]
 
@@ -51,28 +49,20 @@ class GraphStep(FusedStep):
 
     Parameters
     ----------
-    gaussians, spacing, rays, scene, settings, batch
+    setup, batch, ranks
         As for `FusedStep`.
     beside : GraphStep, optional
         One of the same run, never replayed at the same time: both use the same memory for what a step makes on its way.
     """
 
-    # The parameters of `FusedStep`, and the run beside it.
     def __init__(
-        self,
-        gaussians: Gaussians,
-        spacing: float,
-        rays: Rays,
-        scene: FitScene,
-        settings: Settings,
-        batch: int,
-        ranks: Ranks = ALONE,
-        beside: GraphStep | None = None,
+        self, setup: FitSetup, batch: int, ranks: Ranks = ALONE, beside: GraphStep | None = None
     ) -> None:
-        super().__init__(gaussians, spacing, rays, scene, settings, batch, ranks)
+        super().__init__(setup, batch, ranks)
         self._recording = True
-        self._side, self._forked = torch.cuda.Stream(gaussians.position.device), False
-        with torch.cuda.device(gaussians.position.device):
+        device = setup.gaussians.position.device
+        self._side, self._forked = torch.cuda.Stream(device), False
+        with torch.cuda.device(device):
             self._pool: Any = torch.cuda.graph_pool_handle() if beside is None else beside._pool
         self._waiting = [
             torch.zeros(len(self._control), dtype=torch.float64).pin_memory() for _ in range(_AHEAD)

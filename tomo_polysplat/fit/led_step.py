@@ -10,12 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.rays import Rays
-from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.fit.step import Moments, Step
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.ranks import Ranks
-from tomo_polysplat.settings import Settings
 
 __all__ = ["LedStep", "fingerprint", "state_of"]
 
@@ -33,7 +31,7 @@ class LedStep:
     ----------
     make : callable
         Makes this rank's own step.
-    gaussians, spacing, rays, scene, settings, batch
+    setup, batch
         See `fit.choose_step.make_step`.
     ranks : Ranks
     beside : LedStep, optional
@@ -45,19 +43,15 @@ class LedStep:
         Where the device of a rank has no room for its part; more can be made together all the same.
     """
 
-    # As many parameters as a step has, and who makes it.
     def __init__(
         self,
         make: Callable[..., Step],
-        gaussians: Gaussians,
-        spacing: float,
-        rays: Rays,
-        scene: FitScene,
-        settings: Settings,
+        setup: FitSetup,
         batch: int,
         ranks: Ranks,
         beside: LedStep | None = None,
     ) -> None:
+        gaussians, spacing, rays, scene, settings = setup
         self._ranks, self._gaussians, self._projections = ranks, gaussians, rays.projections
         self._number = ranks.number()
         weakref.finalize(self, ranks.let_go, self._number).atexit = False
@@ -79,7 +73,7 @@ class LedStep:
             ranks.tell("make", self._number, _lent(self._projections, ranks), parts)
             shared: Step | None = None if beside is None else beside._own
             try:
-                self._own = make(gaussians, spacing, rays, scene, settings, batch, ranks, shared)
+                self._own = make(setup, batch, ranks, shared)
             except torch.cuda.OutOfMemoryError as problem:
                 full = str(problem) or "no room"
         if full:

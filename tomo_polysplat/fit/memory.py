@@ -49,10 +49,10 @@ _WINDOW, _WINDOWED = 1 << 25, 22
 _LARGEST_SLAB = 1 << 26
 # Copies of the projections that the first reconstruction makes: water equivalents, the filtered ones, ASTRA's.
 _COPIES = 4
-# Bytes of the host that a ray takes: as measured, in the fit's order, and whether it is good; on a CPU also what the
-# start makes of it (peaks of runs of 1e7 rays). An energy, whose ray is traced through so many paths and kept three
-# times (runs of 3000 and 12 000 energies); and a voxel of a result.
-_RAY, _ENERGY, _RESULT = {"cpu": 30, "cuda": 14}, 3 * 8 * 2048, 24
+# Bytes of the host that a ray takes besides what a scan holds: in the fit's order, whether it is good, and what is made
+# of that in passing; on a CPU also what the start makes of it (20.5 more from 2e7 to 6e7 rays). An energy, whose ray
+# is traced through so many paths and kept three times (runs of 3000 and 12 000 energies); and a voxel of a result.
+_RAY, _ENERGY, _RESULT = {"cpu": 21, "cuda": 8}, 3 * 8 * 2048, 24
 # Of what is free: the rest is the driver's, other programs', and lost between blocks.
 _SHARE = 0.9
 
@@ -104,7 +104,8 @@ def require_machine(rays: int, voxels: int, energies: int, device: torch.device)
         "spectrum": "rebin the spectrum: some hundreds of energies are as good",
     }
     # A GPU that has no room for the projections leaves them, and what the start makes of them, to the host.
-    a_ray = _RAY["cuda" if device.type == "cuda" and projections_stay(4 * rays, device) else "cpu"]
+    leave = device.type == "cuda" and projections_stay(4 * rays, device)
+    a_ray = _RAY["cuda" if leave else "cpu"]
     a_voxel = _SMOOTHED["cpu"] if device.type == "cpu" else _RESULT
     of_voxels = voxels * a_voxel
     if not start_stays(voxels, device):
@@ -114,6 +115,10 @@ def require_machine(rays: int, voxels: int, energies: int, device: torch.device)
         "vol_geom": (f"{voxels} voxels", float(of_voxels)),
         "spectrum": (f"{energies} energies", float(energies * _ENERGY)),
     }
+    if leave:
+        # Where a GPU takes them they have left the host when it gets a volume.
+        require_memory({name: need for name, need in needed.items() if name != "vol_geom"}, remedies)
+        del needed["projections"]
     require_memory(needed, remedies)
     smoothed = voxels * _SMOOTHED["cuda"]
     if device.type == "cuda" and smoothed > _SHARE * free_bytes(device):

@@ -13,8 +13,7 @@ import torch
 
 from tomo_polysplat.fit.fitter import Batches, Fitter, views_of_a_pass
 from tomo_polysplat.fit.memory import told_of_lack
-from tomo_polysplat.fit.rays import Rays
-from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.fit.snapshot import Keeps
 from tomo_polysplat.fit.stopping import (
     Clock,
@@ -29,7 +28,6 @@ from tomo_polysplat.fit.stopping import (
 )
 from tomo_polysplat.kernels.compile_time import working_time
 from tomo_polysplat.model.gaussians import Gaussians
-from tomo_polysplat.settings import Settings
 
 __all__ = ["Between", "Course", "FitOutcome", "FitState", "Made", "Run", "fit"]
 
@@ -224,20 +222,19 @@ class Course:
 
 
 @told_of_lack()
-def fit(
-    gaussians: Gaussians, spacing: float, rays: Rays, scene: FitScene, settings: Settings, course: Course
-) -> FitOutcome:
+def fit(setup: FitSetup, course: Course) -> FitOutcome:
     """Fit Gaussians to rays.
 
     Stops after ``settings.passes`` over the views, at the deadline, when the held-out rays have not improved for
     ``settings.patience`` passes (`usual_patience`), when a callback returns True, or on KeyboardInterrupt. Returns the
-    Gaussians that `Watch` holds for the best. Where the checkpoint holds a snapshot, ``gaussians`` are its own.
+    Gaussians that `Watch` holds for the best. Where the checkpoint holds a snapshot, the Gaussians are its own.
 
     Raises
     ------
     MemoryError
         If a GPU is full all the same; with what to do.
     """
+    gaussians, rays, settings = setup.gaussians, setup.rays, setup.settings
     if not len(gaussians):
         logger.warning("The start volume is empty: no Gaussians, a volume of zeros.")
         words = "nothing to fit: the start volume is empty"
@@ -249,7 +246,7 @@ def fit(
     watch: Watch[Gaussians] = Watch(settings.patience or usual_patience(passes))
     # Nobody else holds the fitter, which makes room for another one where a question is answered by that.
     run = _Keeper(
-        Fitter(gaussians, spacing, rays, scene, settings, Batches(batch, steps, course.rng)),
+        Fitter(setup, Batches(batch, steps, course.rng)),
         # From now on: what compiling or recording the step took is no part of the run that the learning rates follow.
         clock := Clock(steps, course.deadline, course.pace, course.tick, course.timed),
         outcome=outcome,

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.checks import require_choice
+from tomo_polysplat.fit.host_rays import HostRays
 from tomo_polysplat.fit.inside import matter_is_inside
 from tomo_polysplat.fit.memory import projections_stay
 from tomo_polysplat.fit.surroundings import widened_grid
@@ -28,7 +29,6 @@ from tomo_polysplat.scan.noise import photons_per_ray
 from tomo_polysplat.scan.snapped import snapped_geometry, snapped_grid
 from tomo_polysplat.scan.view_order import sorted_in_place, view_order
 from tomo_polysplat.start.agreement import halves_agree
-from tomo_polysplat.transfer import to_device
 from tomo_polysplat.units import LENGTH_UNITS, cm_per
 
 __all__ = ["OPAQUE", "Problem"]
@@ -59,7 +59,7 @@ class Problem:
 
     Parameters
     ----------
-    projections : (views, rows, columns) float32 array
+    projections : (views, rows, columns) float32 array, or HostRays
         -log(I/I0); NaN for rays that are not to be used.
     geometry, grid : Geometry, VolumeGrid
         In the solver's coordinates.
@@ -89,7 +89,7 @@ class Problem:
         Which of the caller's views each one is; None where they are as the caller has them.
     """
 
-    projections: np.ndarray
+    projections: np.ndarray | HostRays
     geometry: Geometry
     grid: VolumeGrid
     centre: np.ndarray
@@ -123,7 +123,7 @@ class Problem:
         """The problem of a scan in the caller's unit, its views sorted; one energy makes it monochromatic.
 
         The grid may be wider by as much as the share ``surroundings`` on every side, which a ``device`` finds out. The
-        projections of a caller who gives them up (``own``) are sorted in place.
+        projections of a caller who gives them up (``own``) are sorted in place, and leave the host for a GPU with room.
         """
         require_choice("unit", unit, LENGTH_UNITS)
         if spectrum is not None and spectrum.is_monochromatic:
@@ -144,8 +144,9 @@ class Problem:
         elif mixed:
             projections = projections[order]
         outside = outside.select(order) if mixed else outside
+        rays = HostRays(projections) if own and device.type == "cuda" else projections
         return cls(
-            projections, outside, inside, grid.centre, length, depth, planar, spectrum, curves,
+            rays, outside, inside, grid.centre, length, depth, planar, spectrum, curves,
             margin=margin, surroundings=why, order=order if mixed else None,
         )  # fmt: skip
 
@@ -253,10 +254,11 @@ class Problem:
         self._known.level.clear()
 
     def _copied(self, device: torch.device) -> torch.Tensor:
-        copies = self._known.copies
+        copies, rays = self._known.copies, self.projections
         if device not in copies:
-            stay = projections_stay(self.projections.nbytes, device)
-            copies[device] = to_device(self.projections, device if stay else torch.device("cpu"))
+            # An array that a caller keeps is shared, where it is not copied.
+            rays = rays if isinstance(rays, HostRays) else HostRays(rays)
+            copies[device] = rays.on(device)
         return copies[device]
 
     def agreement(self, bodies: Sequence[torch.Tensor]) -> list[float | None]:

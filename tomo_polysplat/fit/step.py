@@ -11,11 +11,10 @@ import torch
 
 from tomo_polysplat.fit.adam import Adam, Moments
 from tomo_polysplat.fit.loss import misfit, roughness
-from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.fit.similarity import dissimilarity
 from tomo_polysplat.kernels.views import DetectorViews
-from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.detector_blur import LARGEST_BLUR
 from tomo_polysplat.ranks import ALONE, Ranks
 from tomo_polysplat.settings import Settings
@@ -113,16 +112,9 @@ class EagerStep:
     Of several ``ranks`` each takes its part of the views and of the volume; they add up their gradients.
     """
 
-    def __init__(
-        self,
-        gaussians: Gaussians,
-        spacing: float,
-        rays: Rays,
-        scene: FitScene,
-        settings: Settings,
-        ranks: Ranks = ALONE,
-    ) -> None:
-        self.gaussians, self.rays, self.scene, self.settings = gaussians, rays, scene, settings
+    def __init__(self, setup: FitSetup, ranks: Ranks = ALONE) -> None:
+        gaussians, spacing, self.rays, scene, settings = setup
+        self.gaussians, self.scene, self.settings = gaussians, scene, settings
         self.ranks = ranks
         self.bounds = log_scale_bounds(scene, spacing, gaussians.planar, settings)
         self.pull = torch.zeros_like(gaussians.attenuation)

@@ -13,6 +13,7 @@ from tomo_polysplat.parallel import run_tasks, split_range
 from tomo_polysplat.physics.beer_lambert import shares
 from tomo_polysplat.physics.materials import MaterialLike, mass_attenuation
 from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.physics.typical import typical_value
 
 __all__ = ["areal_density", "transmitted_energy", "water_linearised"]
 
@@ -125,11 +126,9 @@ def transmitted_energy(projections: Any, spectrum: Spectrum) -> float:
     """
     if not isinstance(projections, torch.Tensor):
         projections = torch.from_numpy(np.ascontiguousarray(require_array("projections", projections)))
-    values = projections[torch.isfinite(projections)]
-    inside = values[values > 0.1 * values.max().clamp(min=0)] if values.numel() else values
-    if not inside.numel():
+    value = typical_value(projections)
+    if value is None:
         return spectrum.effective_energy
-    value = max(float(inside.median()), 0.0)
     # Of a range too short, rounding would decide which of two values is the larger.
     path = _path_of(spectrum, max(value, 1.0), "water")[0](value)
     log_weights, energies, curve = _curve(spectrum, "water")

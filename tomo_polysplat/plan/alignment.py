@@ -19,11 +19,9 @@ import torch
 from tomo_polysplat.checks import fail, require_choice
 from tomo_polysplat.fit.fitter import next_views
 from tomo_polysplat.fit.problem import Problem
-from tomo_polysplat.fit.rays import Rays
-from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.fit.step import EagerStep
 from tomo_polysplat.kernels.views import DetectorViews
-from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.nuisances.alignment import Alignment
 from tomo_polysplat.nuisances.alignment_search import levels, schedule, search
 from tomo_polysplat.plan.answer import Answer, Status
@@ -36,7 +34,6 @@ from tomo_polysplat.plan.model import rays_of, scene_of
 from tomo_polysplat.plan.order import plan_from_start
 from tomo_polysplat.scan.as_told import seen_as_told
 from tomo_polysplat.scan.moves import MOVES
-from tomo_polysplat.settings import Settings
 
 __all__ = ["align", "moves_of"]
 
@@ -136,11 +133,11 @@ class _Levels:
         """Fit Gaussians anew to pixels of which ``factor`` are joined while these moves go on; see `search`."""
         self.report(0.0, f"alignment, {factor} pixels joined" if factor > 1 else "alignment")
         problem, rows = coarse_problem(self.problem, factor)
-        gaussians, spacing, scene, rays, settings = self._seeded(problem, factor)
+        setup = self._seeded(problem, factor)
         held = tuple(name for name in self.alignment.names if name not in names)
-        step = _AligningStep(gaussians, spacing, rays, scene, settings)
+        step = _AligningStep(setup)
         step.alignment, step.joined = self.alignment, (factor, rows)
-        rng, views = np.random.default_rng(self.means.seed), len(rays.views)
+        rng, views = np.random.default_rng(self.means.seed), len(setup.rays.views)
         batch = min(_VIEWS, views)
         steps_of_a_pass = max(1, round(views / batch))
         steps, pace, errors = _PASSES * steps_of_a_pass, schedule(level, factor), []
@@ -152,17 +149,17 @@ class _Levels:
                 step.move(chosen, pace.rate(number / steps, factor), held)
             if (number + 1) % steps_of_a_pass == 0:
                 with torch.no_grad():
-                    scene.keep_within(gaussians)
+                    setup.scene.keep_within(setup.gaussians)
                 self.alignment.hold_gauge(held)
                 fitted, held_out, _ = step.read()
                 errors.append(fitted if math.isnan(held_out) else held_out)
         return float(np.mean(errors[-2:]))
 
-    def _seeded(self, problem: Problem, factor: int) -> tuple[Gaussians, float, FitScene, Rays, Settings]:
+    def _seeded(self, problem: Problem, factor: int) -> FitSetup:
         """Seeds of the start volume that the told geometry gives of projections as it would have seen them."""
         told = problem
         if any(bool(value.any()) for value in self.alignment.values.values()):
-            whole = torch.from_numpy(self.problem.projections)
+            whole = torch.from_numpy(np.asarray(self.problem.projections))
             seen = seen_as_told(whole, self.alignment.scanner, self.alignment.values).numpy()
             rows = min(factor, self.problem.geometry.rows)
             told = replace(problem, projections=joined_pixels(seen, rows, factor))
@@ -172,7 +169,7 @@ class _Levels:
         gaussians, _ = first_gaussians(start, plan, told, settings, self.means.device)
         scene = scene_of(problem, plan, settings, self.means.device)
         rays = rays_of(problem, plan, settings, self.means.device)
-        return gaussians, plan.spacing * problem.voxel, scene, rays, plan.adapted(settings)
+        return FitSetup(gaussians, plan.spacing * problem.voxel, rays, scene, plan.adapted(settings))
 
 
 class _AligningStep(EagerStep):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -111,7 +111,8 @@ def _moved_by(found: AxisOffset) -> str:
 def _told_by_rays(problem: Problem) -> AxisOffset:
     """What opposite rays tell: nothing where their comparison fails, for the run does not need it."""
     try:
-        return axis_offset(problem.projections, problem.geometry)
+        # Of rays that are on a device the rows that tell are fetched alone.
+        return axis_offset(cast("np.ndarray", problem.projections), problem.geometry)
     except Exception as error:
         logger.warning("Comparing opposite rays failed, so the axis stays as told: %r", error)
         return AxisOffset(0.0, np.inf, f"comparing them failed: {error!r}")

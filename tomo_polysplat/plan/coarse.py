@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
+from tomo_polysplat.fit.host_rays import HostRays
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.settings import Settings
@@ -14,6 +16,8 @@ __all__ = ["coarse_problem", "coarse_settings", "joined_pixels"]
 
 # Voxels of the coarsest volume along its edges, and the share of rays that is held out of a fit.
 _FEWEST_VOXELS, _HELD_OUT = 8, 0.1
+# Rays that are joined at once.
+_AT_ONCE = 1 << 22
 
 
 def coarse_problem(problem: Problem, factor: int) -> tuple[Problem, int]:
@@ -41,13 +45,18 @@ def coarse_settings(settings: Settings) -> Settings:
     return replace(settings, pixel_rays=1, growth=1.0, edges="blurred", soft_gain=0.0, held_out=held_out)
 
 
-def joined_pixels(values: np.ndarray, rows: int, columns: int) -> np.ndarray:
+def joined_pixels(values: np.ndarray | HostRays, rows: int, columns: int) -> np.ndarray:
     """Means of so many rows and columns together, of those that are no NaN; the rest at the far ends is dropped."""
     if rows == columns == 1:
-        return values
+        return np.asarray(values)
     views, height, width = len(values), values.shape[1] // rows, values.shape[2] // columns
-    parts = values[:, : height * rows, : width * columns].reshape(views, height, rows, width, columns)
-    good = np.isfinite(parts)
-    sums = np.where(good, parts, 0).sum(axis=(2, 4), dtype=np.float64)
-    counts = good.sum(axis=(2, 4))
-    return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan).astype(np.float32)
+    joined = np.empty((views, height, width), np.float32)
+    at_once = max(1, _AT_ONCE // math.prod(values.shape[1:]))
+    for first in range(0, views, at_once):
+        some = values[first : first + at_once, : height * rows, : width * columns]
+        parts = some.reshape(len(some), height, rows, width, columns)
+        good = np.isfinite(parts)
+        sums = np.where(good, parts, 0).sum(axis=(2, 4), dtype=np.float64)
+        counts = good.sum(axis=(2, 4))
+        joined[first : first + len(some)] = np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
+    return joined

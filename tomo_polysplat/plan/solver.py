@@ -13,6 +13,7 @@ import torch
 from tomo_polysplat.fit.optimise import Course, FitOutcome, Run, fit
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.fit.stopping import Clock, FitState, Stop, StopReason
 from tomo_polysplat.fit.surroundings import cut_out
 from tomo_polysplat.kernels.compile_time import compiled_seconds, working_time
@@ -177,7 +178,8 @@ class Solver:
             timed=lambda clock, a_step: self._tell_expected(prepared, clock, a_step),
         )
         settings = replace(settings, passes=plan.passes)
-        return fit(prepared.gaussians, plan.spacing * problem.voxel, prepared.rays, scene, settings, course)
+        spacing = plan.spacing * problem.voxel
+        return fit(FitSetup(prepared.gaussians, spacing, prepared.rays, scene, settings), course)
 
     def _tell_expected(self, prepared: PreparedFit, clock: Clock, a_step: float) -> None:
         """Say what the run will take, once some steps have been timed."""

@@ -14,6 +14,7 @@ from tomo_polysplat.physics.material_range import LEAST_U, least_material_number
 from tomo_polysplat.physics.quadrature import Quadrature, fit_quadrature
 from tomo_polysplat.physics.scatter import add_scatter
 from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.physics.typical import largest_finite
 from tomo_polysplat.physics.water import transmitted_energy
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.settings import Settings
@@ -47,7 +48,7 @@ def spectral_model(
     if spectrum is None or materials is None:
         return None, None, None, LEAST_U
     primary = problem.primary(device)
-    most = float(primary.nan_to_num(nan=-math.inf).max())
+    most = float(largest_finite(primary))
     # Mixtures of three curves are told apart by more than what thin rays use of them.
     largest = max(most, 1.0 if plan.curves > 1 else _LEAST_PROJECTION)
     rounded = _RANGE_STEP ** math.ceil(math.log(largest, _RANGE_STEP))

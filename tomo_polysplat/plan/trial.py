@@ -10,6 +10,7 @@ from tomo_polysplat.fit.optimise import Course, FitOutcome, fit
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.fit.stopping import StopReason
 from tomo_polysplat.kernels.compile_time import working_time
 from tomo_polysplat.model.gaussians import Gaussians
@@ -46,11 +47,7 @@ def fitted_shortly(
     """
     started = working_time()
     outcome = fit(
-        seeds,
-        plan.spacing * problem.voxel,
-        rays,
-        scene,
-        replace(means.settings, growth=1.0),
+        FitSetup(seeds, plan.spacing * problem.voxel, rays, scene, replace(means.settings, growth=1.0)),
         Course(
             views_per_step=views_of_short_steps(plan, problem),
             rng=np.random.default_rng(means.seed),

@@ -8,6 +8,7 @@ import math
 import numpy as np
 
 from tomo_polysplat.checks import fail
+from tomo_polysplat.fit.host_rays import HostRays
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.plan.answer import Answer
 from tomo_polysplat.units import CM_PER_UNIT, Doubt, density_in_doubt
@@ -58,7 +59,7 @@ def refuse_lengths(doubt: Doubt) -> Exception:
     return fail("unit", "lengths that make possible matter of the object", doubt.words, remedy)
 
 
-def _attenuates(projections: np.ndarray) -> bool:
+def _attenuates(projections: np.ndarray | HostRays) -> bool:
     """Whether rays lose light, which those through next to nothing do not."""
     some = projections[:: -(-len(projections) // _VIEWS)]
     finite = some[np.isfinite(some)]

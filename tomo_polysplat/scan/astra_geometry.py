@@ -21,6 +21,7 @@ __all__ = [
     "geometry_from_astra",
     "is_planar_geometry",
     "projections_from_astra",
+    "require_projections",
     "to_astra",
     "volume_from_astra",
     "volume_to_astra",
@@ -137,18 +138,25 @@ def projections_from_astra(projections: Any, proj_geom: Mapping[str, Any]) -> np
         If the shape is not that of the geometry; the message names the order that was probably given.
     """
     array = require_array("projections", projections)
-    views = _number_of_views(proj_geom)
+    require_projections(array, proj_geom)
     if is_planar_geometry(proj_geom):
-        columns = require_count("DetectorCount", _entry(proj_geom, "DetectorCount"))
-        _require_order(array, {"views": views, "columns": columns})
         return np.ascontiguousarray(array[:, None, :], dtype=np.float32)
-    rows = require_count("DetectorRowCount", _entry(proj_geom, "DetectorRowCount"))
-    columns = require_count("DetectorColCount", _entry(proj_geom, "DetectorColCount"))
-    _require_order(array, {"rows": rows, "views": views, "columns": columns})
     ordered = contiguous(array.swapaxes(0, 1), np.float32)
     if _type_of(proj_geom) != "cyl_cone_vec":
         return ordered
     return flatten_projections(ordered, _checked_vectors(proj_geom, "cyl_cone_vec"))
+
+
+def require_projections(array: Any, proj_geom: Mapping[str, Any]) -> None:
+    """Refuse what has not the shape that a geometry tells; the message names the order that was probably given."""
+    views = _number_of_views(proj_geom)
+    if is_planar_geometry(proj_geom):
+        columns = require_count("DetectorCount", _entry(proj_geom, "DetectorCount"))
+        _require_order(array, {"views": views, "columns": columns})
+        return
+    rows = require_count("DetectorRowCount", _entry(proj_geom, "DetectorRowCount"))
+    columns = require_count("DetectorColCount", _entry(proj_geom, "DetectorColCount"))
+    _require_order(array, {"rows": rows, "views": views, "columns": columns})
 
 
 def volume_from_astra(volume: Any, vol_geom: Mapping[str, Any]) -> np.ndarray:
@@ -270,7 +278,7 @@ def _check_source(geometry: Geometry, grid: VolumeGrid) -> None:
         _log.warning("The source lies in a corner of the volume window in %d views.", int(reached.sum()))
 
 
-def _require_order(array: np.ndarray, axes: dict[str, int]) -> None:
+def _require_order(array: Any, axes: dict[str, int]) -> None:
     """Refuse a wrong shape, naming the order of axes that would explain it."""
     shape = tuple(axes.values())
     if array.shape == shape:

@@ -11,7 +11,7 @@ from tomo_polysplat.checks import fail, require_array, require_shape
 from tomo_polysplat.parallel import run_tasks
 from tomo_polysplat.scan.evidence import Located, compare, locate
 
-__all__ = ["estimate_centre", "find_centre"]
+__all__ = ["chosen_rows", "estimate_centre", "find_centre"]
 
 logger = logging.getLogger(__name__)
 
@@ -71,7 +71,7 @@ def find_centre(projections: np.ndarray, angles: np.ndarray, valid: np.ndarray |
     if valid is not None:
         require_shape("valid", valid, projections.shape, "(rows, views, columns)")
     rows, _, columns = projections.shape
-    chosen = np.unique(np.linspace(0, rows - 1, min(rows, _MOST_ROWS)).round().astype(int))
+    chosen = chosen_rows(rows)
     pairs = _opposite_views(angles, max(_PARTS, _MOST_LINES // len(chosen) // 16))
     smallest = max(3, int(SMALLEST_OVERLAP * columns))
     sums = np.arange(smallest - 1, 2 * columns - 1 - smallest)
@@ -82,6 +82,11 @@ def find_centre(projections: np.ndarray, angles: np.ndarray, valid: np.ndarray |
             "projections", "an object in the beam", "views without contrast", "give centre= in columns"
         )
     return locate(found, (sums + 1) / 2)
+
+
+def chosen_rows(rows: int) -> np.ndarray:
+    """Those of so many rows that `find_centre` looks at."""
+    return np.unique(np.linspace(0, rows - 1, min(rows, _MOST_ROWS)).round().astype(int))
 
 
 class _Pairs(NamedTuple):

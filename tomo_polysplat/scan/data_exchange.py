@@ -18,12 +18,17 @@ The attribute ``input`` of ``/exchange/data`` tells counts, transmission and att
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tomo_polysplat.checks import fail, require_choice
+from tomo_polysplat.checks import fail, require_choice, visible
+from tomo_polysplat.free_memory import in_gigabytes
+from tomo_polysplat.scan.counts import Counts, Marks, Read
 from tomo_polysplat.scan.data_exchange_parallel import parallel_told
 from tomo_polysplat.scan.defects import flat_and_dark
 from tomo_polysplat.scan.dxchange_host import read_block
@@ -39,7 +44,7 @@ from tomo_polysplat.scan.hdf5 import (
     read_text,
     text_attribute,
 )
-from tomo_polysplat.scan.in_blocks import line_integrals
+from tomo_polysplat.scan.in_blocks import line_integrals, looked_through
 from tomo_polysplat.scan.layout import (
     spatial_geometry,
     vector_geometry,
@@ -50,6 +55,7 @@ from tomo_polysplat.scan.readers.scan_part import scan_part
 from tomo_polysplat.scan.reading import INPUT_KINDS, ReadOptions
 from tomo_polysplat.scan.scan import Scan
 from tomo_polysplat.scan.stored_part import StoredPart
+from tomo_polysplat.scan.stored_views import StoredViews
 
 if TYPE_CHECKING:
     import h5py
@@ -64,6 +70,10 @@ logger = logging.getLogger(__name__)
 _PER_VECTOR, _MOST_COEFFICIENTS = 13, 100
 # Open-beam or dark images beside fewer views than that.
 _MOST_FRAMES = 1000
+# Bytes of the projections as float32 from which they stay in the file.
+_STAYS = 1 << 30
+# How often a chunk is unpacked without a word.
+_MOST_TIMES = 3
 _ALL = Part()
 
 
@@ -79,11 +89,13 @@ def scan_from_hdf5(path: Path, options: ReadOptions, part: Part = _ALL) -> Scan:
             raise fail("path", "a dataset /exchange/data of shape (views, rows, columns)", f"{got} in {path}")
         now, later = _in_two(part, file, options)
         wanted = StoredPart(data, now)
-        projections, valid, notes = _line_integrals(exchange, data, wanted, options)
-        if find_array(file, "polysplat/valid") is not None:
-            stored = wanted.of_views(read_numbers(file, "polysplat/valid", data.shape).astype(bool))
-            valid &= wanted.of_pixels(stored).transpose(1, 0, 2)
-        _report_defects(notes["rays"], valid)
+        stay = 4 * prod(wanted.shape) >= _STAYS and find_array(file, "polysplat/valid") is None
+        views_of = StoredViews(path, now) if stay else lambda: nullcontext(wanted.block)
+        counts, notes = _counts(views_of, exchange, data, wanted, options)
+        _tell_of_chunks(data, counts.at_once, path)
+        made = _left_there(counts, options, notes) if stay else _read(counts, file, wanted, options, notes)
+        projections, valid, left_out = made
+        _report_defects(notes["rays"], left_out, counts.size)
         views, rows, columns = data.shape
         whole = _geometry(file, (rows, views, columns), (projections, valid, wanted), options, notes)
         geometry, same = wanted.geometries(whole)
@@ -94,7 +106,7 @@ def scan_from_hdf5(path: Path, options: ReadOptions, part: Part = _ALL) -> Scan:
             notes["scanner"] = scanner
         scan = Scan(
             projections=projections,
-            valid=None if valid.all() else valid,
+            valid=valid if left_out else None,
             name=read_text(file, "measurement/sample/name") or path.stem,
             notes=notes,
             **geometry,
@@ -114,10 +126,47 @@ def _in_two(part: Part, file: h5py.File, options: ReadOptions) -> tuple[Part, Pa
     return now, Part(columns=None if known else part.columns, binning=part.binning)
 
 
-def _line_integrals(
-    exchange: h5py.Group, data: StoredArray, wanted: StoredPart, options: ReadOptions
-) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
-    """Projections and validity in the order (rows, views, columns), read a block of views at a time."""
+def _tell_of_chunks(data: StoredArray, at_once: int, path: Path) -> None:
+    """Say what mends chunks that are unpacked again and again, as they hold many views and little of each."""
+    if not data.filters:
+        return
+    # Of so many views, of which some are read at a time.
+    times = 1 + (data.dataset.chunks[0] - 1) / min(at_once, data.shape[0])
+    if times > _MOST_TIMES:
+        one = "x".join(map(str, (1, *data.shape[1:])))
+        logger.warning(
+            "The chunks of %s are unpacked %.0f times over, as each has %d views: h5repack -l %s:CHUNK=%s %s new.h5 "
+            "makes a file that is read faster.",
+            *(data.name, times, data.dataset.chunks[0], data.name, one, visible(path)),
+        )
+
+
+def _left_there(counts: Counts, options: ReadOptions, notes: dict[str, Any]) -> tuple[Counts, Marks, int]:
+    """Projections and validity that stay in the file, and how many rays are not valid, of which `notes` gets counts."""
+    notes["rays"] = looked_through(counts, options.progress)
+    logger.info("The projections stay in the file: %s as float32.", in_gigabytes(counts.nbytes))
+    return counts, counts.marks, sum(notes["rays"].values())
+
+
+def _read(
+    counts: Counts, file: h5py.File, wanted: StoredPart, options: ReadOptions, notes: dict[str, Any]
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """The same read as a whole."""
+    projections, valid, notes["rays"] = line_integrals(counts, options.progress)
+    if find_array(file, "polysplat/valid") is not None:
+        stored = wanted.of_views(read_numbers(file, "polysplat/valid", wanted.whole_shape).astype(bool))
+        valid &= wanted.of_pixels(stored).transpose(1, 0, 2)
+    return projections, valid, valid.size - int(np.count_nonzero(valid))
+
+
+def _counts(
+    views: Callable[[], AbstractContextManager[Read]],
+    exchange: h5py.Group,
+    data: StoredArray,
+    wanted: StoredPart,
+    options: ReadOptions,
+) -> tuple[Counts, dict[str, Any]]:
+    """What is stored, with what is needed to make line integrals of it, and notes of what that is."""
     rows, columns = data.shape[1:]
     white, dark = find_array(exchange, "data_white"), find_array(exchange, "data_dark")
     kind = _input_kind(data, white is not None, options.input)
@@ -139,16 +188,8 @@ def _line_integrals(
         means = {"white_frames": _frame_means(open_beam), "dark_frames": _frame_means(no_light)}
     else:
         means = {}
-    projections, valid, rays = line_integrals(
-        wanted.block,
-        wanted.shape,
-        kind,
-        flat,
-        background,
-        options.saturation,
-        options.progress,
-    )
-    return projections, valid, {"input": kind, "rays": rays} | means
+    counts = Counts(views, wanted.shape, kind, flat, background, options.saturation)
+    return counts, {"input": kind} | means
 
 
 def _frame_means(frames: np.ndarray | None) -> list[float]:
@@ -192,17 +233,16 @@ def _input_kind(data: StoredArray, has_white: bool, stated: str | None) -> str:
     return kind
 
 
-def _report_defects(rays: dict[str, int], valid: np.ndarray) -> None:
-    lost = valid.size - np.count_nonzero(valid)
+def _report_defects(rays: dict[str, int], lost: int, size: int) -> None:
     if lost:
         kinds = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in rays.items() if count)
-        logger.warning("%d of %d rays are left out (%s)", lost, valid.size, kinds or "marked in the file")
+        logger.warning("%d of %d rays are left out (%s)", lost, size, kinds or "marked in the file")
 
 
 def _geometry(
     file: h5py.File,
     shape: tuple[int, int, int],
-    seen: tuple[np.ndarray, np.ndarray, StoredPart],
+    seen: tuple[np.ndarray | Counts, np.ndarray | Marks, StoredPart],
     options: ReadOptions,
     notes: dict[str, Any],
 ) -> dict[str, Any]:

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tomo_polysplat.checks import fail, require_array, require_number, require_shape
-from tomo_polysplat.scan.centre import estimate_centre
+from tomo_polysplat.scan.centre import chosen_rows, estimate_centre
 from tomo_polysplat.scan.circular import parallel_geometry
+from tomo_polysplat.scan.counts import Counts, Marks
 from tomo_polysplat.scan.dxchange_host import read_block
 from tomo_polysplat.scan.hdf5 import find_array, text_attribute
 from tomo_polysplat.scan.reading import ReadOptions
@@ -33,7 +34,7 @@ LENGTH_NAMES |= dict.fromkeys(("micron", "microns", "micrometers"), "um")
 def parallel_told(
     file: h5py.File,
     shape: tuple[int, int, int],
-    seen: tuple[np.ndarray, np.ndarray, StoredPart],
+    seen: tuple[np.ndarray | Counts, np.ndarray | Marks, StoredPart],
     options: ReadOptions,
     notes: dict[str, Any],
 ) -> dict[str, Any]:
@@ -46,7 +47,11 @@ def parallel_told(
     theta = _angles(file, views, options.theta, centre)
     if centre is None:
         projections, valid, wanted = seen
-        centre = estimate_centre(projections, wanted.of_views(theta), valid)
+        if isinstance(projections, Counts):
+            # The rows that tell, read once.
+            rows_told = chosen_rows(projections.shape[0])
+            projections, valid = projections[rows_told], valid[rows_told]
+        centre = estimate_centre(projections, wanted.of_views(theta), np.asarray(valid))
     notes |= {"centre": float(centre), "centre_estimated": options.centre is None}
     pixel_size, unit = _pixel_size(file, options)
     remedy = "in columns from the edge"

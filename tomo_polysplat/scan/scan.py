@@ -15,6 +15,7 @@ import numpy as np
 from tomo_polysplat.checks import fail, require_array, require_choice, require_shape
 from tomo_polysplat.physics.filter_map import require_filter_map
 from tomo_polysplat.physics.water_correction import require_water_correction
+from tomo_polysplat.scan.counts import Counts, Marks
 from tomo_polysplat.units import LENGTH_UNITS
 
 if TYPE_CHECKING:
@@ -29,8 +30,9 @@ class Scan:
 
     Parameters
     ----------
-    projections : array, shape (rows, views, columns)
-        Line integrals -log(I/I0), stored as float32. Values of invalid rays are not used, except that infinity
+    projections : array, or Counts, shape (rows, views, columns)
+        Line integrals -log(I/I0), stored as float32, or made of `Counts` that stay where they are.
+        Values of invalid rays are not used, except that infinity
         means that no light was seen (:attr:`usable`).
     proj_geom, vol_geom : dict
         ASTRA geometries of three-dimensional type (``parallel3d``, ``parallel3d_vec``, ``cone``,
@@ -59,7 +61,7 @@ class Scan:
         Counts and choices made while reading, such as the number of rays without light.
     """
 
-    projections: np.ndarray
+    projections: np.ndarray | Counts
     proj_geom: dict[str, Any]
     vol_geom: dict[str, Any]
     unit: str = "cm"
@@ -68,20 +70,22 @@ class Scan:
     metal_mask: np.ndarray | None = None
     truth_energy_kev: float | None = None
     name: str = "scan"
-    valid: np.ndarray | None = None
+    valid: np.ndarray | Marks | None = None
     water_correction: tuple[float, ...] | None = None
     filter_map: tuple[Any, ...] | None = None
     notes: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        projections = require_array("projections", self.projections, 3)
-        self.projections = np.ascontiguousarray(projections, np.float32)
+        if not isinstance(self.projections, Counts):
+            projections = require_array("projections", self.projections, 3)
+            self.projections = np.ascontiguousarray(projections, np.float32)
         if "type" not in self.proj_geom or "GridRowCount" not in self.vol_geom:
             raise fail("proj_geom, vol_geom", "ASTRA geometries", "dicts without 'type' or 'GridRowCount'")
         require_choice("unit", self.unit, LENGTH_UNITS)
         self._check_shape()
         if self.valid is not None:
-            self.valid = np.ascontiguousarray(self.valid, bool)
+            if not isinstance(self.valid, Marks):
+                self.valid = np.ascontiguousarray(self.valid, bool)
             require_shape("valid", self.valid, self.projections.shape, "(rows, views, columns)")
         if self.filter_map is not None:
             self.filter_map = require_filter_map(self.filter_map)
@@ -104,11 +108,13 @@ class Scan:
         require_shape("projections", self.projections, told, "(rows, views, columns)", "as proj_geom says")
 
     @property
-    def usable(self) -> np.ndarray | None:
+    def usable(self) -> np.ndarray | Marks | None:
         """Rays to pass as ``valid`` to `tomo_polysplat.reconstruct`: those of :attr:`valid`, and those without light.
 
         `reconstruct` tells rays without light from dead pixels. Add your own mask with ``scan.usable & mask``.
         """
+        if isinstance(self.valid, Marks):
+            return Marks(self.valid.counts, lightless=True)
         return None if self.valid is None else self.valid | np.isposinf(self.projections)
 
     @property

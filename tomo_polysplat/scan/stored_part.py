@@ -29,12 +29,12 @@ class StoredPart:
 
     Attributes
     ----------
-    shape : (views, rows, columns)
-        Of what is read.
+    shape, whole_shape : (views, rows, columns)
+        Of what is read, and of the dataset.
     """
 
     def __init__(self, data: StoredArray, part: Part) -> None:
-        self._data, self.part = data, part
+        self._data, self.part, self.whole_shape = data, part, data.shape
         self._views = part.chosen_views(data.shape[0])
         self._spans = part.row_span(data.shape[1]), part.column_span(data.shape[2])
         high, wide = (end - first for first, end in self._spans)

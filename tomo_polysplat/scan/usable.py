@@ -12,7 +12,8 @@ from tomo_polysplat.checks import fail, require_array, require_shape
 from tomo_polysplat.parallel import run_tasks, split_range
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.water_correction import undo_water_correction
-from tomo_polysplat.scan.geometry import is_planar_geometry, projections_from_astra
+from tomo_polysplat.scan.counts import Counts, Marks
+from tomo_polysplat.scan.geometry import is_planar_geometry, projections_from_astra, require_projections
 from tomo_polysplat.scan.line_integrals import require_line_integrals
 from tomo_polysplat.scan.noise import photons_per_ray
 from tomo_polysplat.scan.opaque import fill_opaque
@@ -26,6 +27,8 @@ logger = logging.getLogger(__name__)
 _LARGEST_LOGARITHM = 745.0
 # Warn if more than this share of the rays is left out: the mask may be inverted.
 _MOST_LEFT_OUT = 0.2
+# Rays looked at by one thread.
+_AT_ONCE = 1 << 20
 
 
 def usable_rays(
@@ -40,19 +43,16 @@ def usable_rays(
     A water correction is undone, and opaque rays have a value (`scan.opaque`). Parameters and errors are those of
     :func:`tomo_polysplat.reconstruct`.
     """
-    projections, valid = _on_host(projections), _on_host(valid)
-    if isinstance(projections, np.ma.MaskedArray):
-        valid = ~np.ma.getmaskarray(projections) & (
-            True if valid is None else require_array("valid", valid) > 0
-        )
-    # Values beyond float32 become infinite, and are counted as infinite.
-    with np.errstate(over="ignore"):
-        values = projections_from_astra(projections, proj_geom)
-    if np.may_share_memory(values, np.asarray(projections)):
-        values = values.copy()
-    marked = None if valid is None else _marked(valid, np.shape(projections), proj_geom)
+    if isinstance(projections, Counts) and proj_geom.get("type") != "cyl_cone_vec":
+        values, marked = _of_counts(projections, valid, proj_geom)
+    else:
+        values, marked = _of_array(projections, valid, proj_geom)
     require_line_integrals(values, marked)
-    parts = [(values[a:b], None if marked is None else marked[a:b]) for a, b in split_range(len(values), 64)]
+    # So many that little is there besides while it is looked at.
+    many = max(64, values.size // _AT_ONCE)
+    parts = [
+        (values[a:b], None if marked is None else marked[a:b]) for a, b in split_range(len(values), many)
+    ]
     found = run_tasks(_take_out, parts)
     counts = {"rays": values.size} | {name: sum(part[name] for part in found) for name in found[0]}
     stuck = stuck_pixels(values)
@@ -68,7 +68,7 @@ def usable_rays(
     if proj_geom.get("type") == "cyl_cone_vec":
         # After resampling, a ray that uses any ray without light is infinite.
         values[np.isposinf(values)] = np.nan
-    lightless = np.isposinf(values).any() if counts["rays_not_finite"] else False
+    lightless = any(np.isposinf(view).any() for view in values) if counts["rays_not_finite"] else False
     counts["rays_opaque"] = fill_opaque(values, photons_per_ray(values)) if lightless else 0
     counts["rays_not_finite"] -= counts["rays_opaque"]
     used += counts["rays_opaque"]
@@ -79,6 +79,49 @@ def usable_rays(
             "Rays that no light came through, opaque by what is around them: %d.", counts["rays_opaque"]
         )
     return values, counts
+
+
+def _of_array(
+    projections: Any, valid: Any, proj_geom: Mapping[str, Any]
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Projections (views, rows, columns) that may be changed, and rays that are not to be used."""
+    projections, valid = _on_host(projections), _on_host(valid)
+    if isinstance(projections, np.ma.MaskedArray):
+        valid = ~np.ma.getmaskarray(projections) & (
+            True if valid is None else require_array("valid", valid) > 0
+        )
+    # Values beyond float32 become infinite, and are counted as infinite.
+    with np.errstate(over="ignore"):
+        values = projections_from_astra(projections, proj_geom)
+    if np.may_share_memory(values, np.asarray(projections)):
+        values = values.copy()
+    marked = None if valid is None else _marked(valid, np.shape(projections), proj_geom)
+    return values, marked
+
+
+def _of_counts(
+    counts: Counts, valid: Any, proj_geom: Mapping[str, Any]
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """The same of counts, some views at a time: nothing else is ever there as a whole.
+
+    A ray that was not measured properly is not used, whatever a mask says.
+    """
+    require_projections(counts, proj_geom)
+    rows, views, columns = counts.shape
+    values = np.empty((views, rows, columns), np.float32)
+    own = valid is None or _is_own(valid, counts)
+    marked = None if own else _marked(_on_host(valid), counts.shape, proj_geom)
+    for block in counts.blocks():
+        values[block.views] = block.values
+        if not block.usable.all():
+            marked = np.zeros(values.shape, bool) if marked is None else marked
+            marked[block.views] |= block.marked
+    return values, marked
+
+
+def _is_own(valid: Any, counts: Counts) -> bool:
+    """Whether a mask is what the counts themselves tell."""
+    return isinstance(valid, Marks) and valid.counts is counts and valid.lightless
 
 
 def _marked(valid: Any, shape: tuple[int, ...], proj_geom: Mapping[str, Any]) -> np.ndarray:

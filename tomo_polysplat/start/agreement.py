@@ -20,8 +20,6 @@ __all__ = ["halves_agree", "places_of_views"]
 _FEWEST = 1000
 # Share of the mean step from view to view below which two views are from the same place.
 _SAME_PLACE = 0.1
-# Of an odd number of views one half has a gap of three steps among those of two, by which ASTRA errs little.
-_UNEVEN = 0.3
 # Voxels times views beyond which a CPU would spend longer on the two volumes than on much else.
 _MOST_ADDITIONS = 5e9
 
@@ -105,7 +103,7 @@ def _half(
         return None
     values = projections[torch.from_numpy(views).to(projections.device)]
     device = values.device if device is None else device
-    volume = fdk_on_gpu(values, some, grid, _UNEVEN, device) if device.type == "cuda" else None
+    volume = fdk_on_gpu(values, some, grid, device) if device.type == "cuda" else None
     if volume is None and math.prod(grid.shape) * geometry.views <= _MOST_ADDITIONS:
         array = values.cpu().numpy()
         filled = fill_invalid(array, np.isfinite(array))

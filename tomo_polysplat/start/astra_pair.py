@@ -8,7 +8,7 @@ from types import TracebackType
 import numpy as np
 import torch
 
-from tomo_polysplat.free_memory import give_back
+from tomo_polysplat.free_memory import free_bytes, give_back, in_gigabytes
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, to_astra
 
 __all__ = ["AstraPair", "astra_has_gpu", "gpu_index", "make_room"]
@@ -72,7 +72,7 @@ class AstraPair:
         volume = volume.contiguous()
         projections = self._unwritten(shape, volume)
         self._call(direct_FP3D, views, volume, projections)
-        return self._written(projections, "projection").transpose(0, 1)
+        return self._written(projections, volume, projections).transpose(0, 1)
 
     def adjoint(self, projections: torch.Tensor, views: np.ndarray) -> torch.Tensor:
         """(nz, ny, nx) backprojection of projections (views, rows, columns)."""
@@ -81,7 +81,7 @@ class AstraPair:
         ordered = projections.transpose(0, 1).contiguous()
         volume = self._unwritten(self.grid.shape, projections)
         self._call(direct_BP3D, views, volume, ordered)
-        return self._written(volume, "backprojection")
+        return self._written(volume, volume, ordered)
 
     def _call(
         self, run: Callable[..., None], views: np.ndarray, volume: torch.Tensor, projections: torch.Tensor
@@ -95,7 +95,7 @@ class AstraPair:
             run(projector, volume, projections)
         except AstraError as problem:
             # Other releases say nothing, and leave the tensor unwritten.
-            raise RuntimeError(f"ASTRA failed; is its GPU out of memory? It says: {problem}") from problem
+            raise RuntimeError(f"{_no_room(volume, projections)} ASTRA says: {problem}") from problem
 
     def _projector(self, views: np.ndarray) -> int:
         """ASTRA's projector of some views, made once; RuntimeError where it refuses them."""
@@ -123,8 +123,18 @@ class AstraPair:
         return tensor
 
     @staticmethod
-    def _written(tensor: torch.Tensor, name: str) -> torch.Tensor:
+    def _written(tensor: torch.Tensor, volume: torch.Tensor, projections: torch.Tensor) -> torch.Tensor:
         # One element tells, and costs no pass over the tensor.
         if bool(tensor.view(-1)[0].isnan()):
-            raise RuntimeError(f"ASTRA's {name} failed; is its GPU out of memory?")
+            raise RuntimeError(_no_room(volume, projections))
         return tensor
+
+
+def _no_room(volume: torch.Tensor, projections: torch.Tensor) -> str:
+    """What ASTRA needed and what there is, in words."""
+    of_rays, of_voxels = projections.nbytes, volume.nbytes
+    return (
+        f"ASTRA failed on {projections.device}: beside {in_gigabytes(of_rays)} of projections and"
+        f" {in_gigabytes(of_voxels)} of voxels it needs as much again as the larger of them, and"
+        f" {in_gigabytes(free_bytes(projections.device))} are free."
+    )

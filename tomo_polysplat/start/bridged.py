@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Iterator
 
 import numpy as np
 import torch
 
+from tomo_polysplat.physics.typical import largest_finite
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.astra_pair import astra_has_gpu
 from tomo_polysplat.start.initial import initial_volume_on
@@ -33,6 +35,8 @@ _MOST_OF_RAYS = 0.5
 _JUDGES = 24
 # Steps along all rays beyond which the two more projections would take minutes on two CPU cores.
 _MOST_STEPS = 1e10
+# Rays on the host that are looked at together.
+_AT_ONCE = 1 << 22
 
 
 def bridged_start(
@@ -101,12 +105,18 @@ def _better(
 ) -> tuple[torch.Tensor, str]:
     """The volume or the bridged one, whichever explains the rays beside metal, and words that say so."""
     # Half a voxel: less is the blur of the threshold's edge, and a wider trace loses more than it heals.
-    trace = pair.forward(mask.float(), np.arange(geometry.views)) > 0.5 * float(grid.voxel_size.min())
-    matter = values > THIN * float(values.nan_to_num(nan=-math.inf).max())
-    covered = float((trace & matter).sum()) / max(float(matter.sum()), 1.0)
+    wide, dense = 0.5 * float(grid.voxel_size.min()), mask.float()
+    least, beside = THIN * float(largest_finite(values)), values.clone()
+    through, rays = 0, 0
+    for some in _portions(values):
+        trace = pair.forward(dense, some) > wide
+        part = beside[some[0] : some[-1] + 1]
+        matter = part > least
+        through, rays = through + int((trace & matter).sum()), rays + int(matter.sum())
+        part.masked_fill_(trace, math.nan)
+    covered = through / max(rays, 1)
     if covered > _MOST_OF_RAYS:
         return volume, f"; metal not bridged: {covered:.0%} of the object's rays pass through it"
-    beside = values.masked_fill(trace, math.nan)
     bridged = torch.where(mask, volume, _made_without(beside, mask, geometry, grid, pair, metal))
     before, after = (_misfit(each, beside, pair) for each in (volume, bridged))
     words = f"misses the rays beside it by {after:.2g}, a start with all rays by {before:.2g}"
@@ -151,11 +161,24 @@ def _made_without(
     first, _ = initial_volume_on(beside, geometry, grid)
     main = mass_level(first[~mask])
     prior = pair.forward(normalising_volume(first, mask, main, metal), np.arange(geometry.views))
-    thick = prior > THIN * float(prior.max())
-    ratio = torch.where(thick, beside / prior.clamp(min=1e-12), 0.0)
-    bridged = torch.where(thick, fill_rows(ratio) * prior, fill_rows(beside))
-    second, _ = initial_volume_on(bridged, geometry, grid)
+    least = THIN * float(prior.max())
+    for some in _portions(beside):
+        whole = slice(some[0], some[-1] + 1)
+        part, known = prior[whole], beside[whole]
+        thick = part > least
+        ratio = torch.where(thick, known / part.clamp(min=1e-12), 0.0)
+        prior[whole] = torch.where(thick, fill_rows(ratio) * part, fill_rows(known))
+    # What was bridged, in the memory of the prior.
+    second, _ = initial_volume_on(prior, geometry, grid)
     return second
+
+
+def _portions(rays: torch.Tensor) -> Iterator[np.ndarray]:
+    """Views that are looked at together: all on a GPU, some on the host, whose memory is not to hold copies of all."""
+    views = len(rays)
+    at_once = views if rays.is_cuda else max(1, _AT_ONCE // rays[0].numel())
+    for first in range(0, views, at_once):
+        yield np.arange(first, min(first + at_once, views))
 
 
 def _misfit(volume: torch.Tensor, beside: torch.Tensor, pair: ProjectorPair) -> float:

@@ -10,6 +10,7 @@ from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.backproject import accumulate, voxel_maps
 from tomo_polysplat.start.filters import FILTERS, filter_rows
 from tomo_polysplat.start.orbit import Orbit, find_orbit
+from tomo_polysplat.start.shadow import corners_of, margins, slices_seen
 from tomo_polysplat.start.weights import object_fan, object_radius, pixel_weights, ray_arcs, ray_offsets
 
 __all__ = ["fdk", "fits_fdk"]
@@ -78,7 +79,7 @@ def fdk(
     filter_name : {"ram-lak", "shepp-logan", "cosine", "hamming", "hann"}
         Ramp filter, from sharp to smooth.
     device : {"cpu", "cuda"}
-        On ``"cuda"`` ASTRA does it where it can (`fdk_cuda`), else the CPU.
+        On ``"cuda"`` a 3D scan is done there (`fdk_cuda`), else on the CPU.
 
     Returns
     -------
@@ -100,7 +101,7 @@ def fdk(
     if device.startswith("cuda"):
         from tomo_polysplat.start.astra_fdk import fdk_cuda, suits_fdk_cuda
 
-        if suits_fdk_cuda(geometry, grid, orbit)[0]:
+        if suits_fdk_cuda(geometry)[0]:
             return fdk_cuda(projections, geometry, grid, orbit, filter_name=filter_name, device=device)
     return _fdk_cpu(projections, geometry, grid, orbit, filter_name)
 
@@ -109,7 +110,7 @@ def _fdk_cpu(
     projections: np.ndarray, geometry: Geometry, grid: VolumeGrid, orbit: Orbit, filter_name: str
 ) -> np.ndarray:
     arcs = ray_arcs(geometry, orbit, grid)
-    before, after = _shadow_margins(geometry, grid)
+    before, after = margins(geometry, corners_of(grid))
     maps = voxel_maps(geometry, grid)
     # Columns are counted from the first one kept, so that the map must move by as many.
     maps[:, 0] += before * maps[:, 2]
@@ -125,24 +126,5 @@ def _fdk_cpu(
         parts = split_range(chunk.stop - chunk.start, min(pixels // _FILTERED, _PARTS))
         filtered = run_tasks(prepare, [(start + a, start + b) for a, b in parts])
         accumulate(volume, np.concatenate(filtered), maps[chunk])
-    volume[~_slices_seen(geometry, grid, orbit)] = 0.0
+    volume[~slices_seen(geometry, grid, orbit)] = 0.0
     return volume
-
-
-def _shadow_margins(geometry: Geometry, grid: VolumeGrid) -> tuple[int, int]:
-    """Columns beyond either end of the detector on which the volume casts a shadow, at most its width."""
-    corners = np.stack(np.meshgrid(*zip(grid.lower, grid.upper), indexing="ij"), axis=-1).reshape(-1, 3)
-    columns = geometry.project_points(corners)[..., 0]
-    before, after = -np.nanmin(columns), np.nanmax(columns) - (geometry.columns - 1)
-    return tuple(int(np.clip(np.ceil(n), 0, geometry.columns)) for n in (before, after))  # type: ignore[return-value]
-
-
-def _slices_seen(geometry: Geometry, grid: VolumeGrid, orbit: Orbit) -> np.ndarray:
-    """Slices whose point on the axis falls on the detector in most views, (nz,) bool."""
-    z = grid.axes()[2]
-    points = np.column_stack([np.full_like(z, orbit.axis[0]), np.full_like(z, orbit.axis[1]), z])
-    row = geometry.project_points(points)[..., 1]
-    # A voxel counts as seen as soon as any of it is, so the margin is half a voxel and half a pixel.
-    margin = 0.5 + 0.5 * grid.voxel_size[2] / geometry.pixel_size_at(grid.centre)[1]
-    seen = (row > -margin) & (row < geometry.rows - 1 + margin)
-    return seen.mean(axis=0) >= 0.5

@@ -9,25 +9,22 @@ from tomo_polysplat.start.orbit import find_orbit
 
 __all__ = ["fdk_on_gpu", "fill_rows"]
 
-# Pixels filled at once: the intermediate results are several times as large.
-_AT_ONCE = 1 << 24
+# Pixels filled at once, on a device: the intermediate results are a dozen times as large.
+_AT_ONCE = {"cuda": 1 << 24, "cpu": 1 << 20}
 
 
 def fdk_on_gpu(
     projections: torch.Tensor,
     geometry: Geometry,
     grid: VolumeGrid,
-    uneven: float = 0.02,
     device: torch.device | None = None,
 ) -> torch.Tensor | None:
-    """Smooth filtered backprojection (nz, ny, nx), or None where ASTRA cannot do this scan on a GPU.
+    """Smooth filtered backprojection (nz, ny, nx), or None where that takes the CPU.
 
     Parameters
     ----------
     projections : (views, rows, columns) float32 tensor
         -log(I/I0) of a scan that `fits_fdk`; pixels that are not finite are interpolated from their row.
-    uneven : float
-        Largest difference between the steps from view to view, as a share of their mean.
     device : torch.device, optional
         The GPU; that of the projections by default.
 
@@ -40,7 +37,7 @@ def fdk_on_gpu(
     from tomo_polysplat.start.slabs import fdk_on_device
 
     orbit, _ = find_orbit(geometry)
-    if orbit is None or not suits_fdk_cuda(geometry, grid, orbit, uneven)[0]:
+    if orbit is None or not suits_fdk_cuda(geometry)[0]:
         return None
     # Smooth: the noise of a sharp filter would be seeded as if it were matter.
     device = projections.device if device is None else device
@@ -56,7 +53,8 @@ def fill_rows(projections: torch.Tensor) -> torch.Tensor:
     if not len(spoiled):
         return projections
     filled = projections.clone()
-    for views in spoiled.split(max(1, _AT_ONCE // projections[0].numel())):
+    at_once = max(1, _AT_ONCE[projections.device.type] // projections[0].numel())
+    for views in spoiled.split(at_once):
         filled[views] = _filled(projections[views])
     return filled
 

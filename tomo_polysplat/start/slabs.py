@@ -11,6 +11,7 @@ import numpy as np
 from tomo_polysplat.free_memory import free_bytes, give_back, in_gigabytes
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.orbit import Orbit
+from tomo_polysplat.start.shadow import corners_of, ellipse_of, margins
 
 if TYPE_CHECKING:
     import torch
@@ -44,8 +45,7 @@ def slab_of(grid: VolumeGrid, first: int, last: int) -> VolumeGrid:
 
 def rows_of(geometry: Geometry, grid: VolumeGrid) -> tuple[int, int]:
     """The first row of the detector that rays through a grid end in, and the one behind the last; two at least."""
-    corners = np.stack(np.meshgrid(*zip(grid.lower, grid.upper), indexing="ij"), axis=-1).reshape(-1, 3)
-    rows = geometry.project_points(corners)[..., 1]
+    rows = geometry.project_points(corners_of(grid))[..., 1]
     if not np.isfinite(rows).all():
         return 0, geometry.rows
     first = int(np.clip(np.floor(rows.min()) - _MARGIN, 0, max(geometry.rows - 2, 0)))
@@ -138,12 +138,13 @@ def fdk_on_device(
 def _depth(geometry: Geometry, grid: VolumeGrid, room: float, resident: bool) -> int:
     """Slices of a slab for which there is room."""
     nz, ny, nx = grid.shape
+    beyond = sum(margins(geometry, ellipse_of(grid)))
     # In the middle: nearest to the source's plane, where the cone is as wide as anywhere along the axis.
     depth = nz
     while depth > 1:
         first = (nz - depth) // 2
         low, high = rows_of(geometry, slab_of(grid, first, first + depth))
-        rays = (high - low) * geometry.views * geometry.columns
+        rays = (high - low) * geometry.views * (geometry.columns + beyond)
         of_ray = _OF_RAY - 4 if resident and depth == nz else _OF_RAY
         if of_ray * rays + _OF_VOXEL * depth * ny * nx + _FILTER <= room:
             break

@@ -59,19 +59,20 @@ def ray_arcs(geometry: Geometry, orbit: Orbit, grid: VolumeGrid) -> np.ndarray:
     of a turn in a cone beam takes Parker's weights (Med. Phys. 9, 254, 1982, doi:10.1118/1.595078) over all of the
     arc.
     """
-    offsets = ray_offsets(geometry, orbit)
-    steps = orbit.steps[:, None]
+    steps, every = orbit.steps[:, None], (geometry.views, geometry.columns)
     if orbit.full:
-        low, high = offsets.min(axis=1).max(), offsets.max(axis=1).min()
+        ends = ray_offsets(geometry, orbit, (0, geometry.columns - 1))
+        low, high = ends.min(axis=1).max(), ends.max(axis=1).min()
         overlap = min(-low, high)
         pitch = (high - low) / max(geometry.columns - 1, 1)
         if overlap >= object_radius(grid, orbit) or abs(high + low) < 2 * pitch:
-            return np.broadcast_to(0.5 * steps, offsets.shape)
+            return np.broadcast_to(0.5 * steps, every)
+        offsets = ray_offsets(geometry, orbit)
         side = 1.0 if high > -low else -1.0
         return steps * (0.5 + 0.5 * np.sin(0.5 * np.pi * np.clip(side * offsets / overlap, -1.0, 1.0)))
     if geometry.beam == "parallel":
-        return np.broadcast_to(steps, offsets.shape)
-    fan = np.arcsin(np.clip(offsets / orbit.radius, -1.0, 1.0))
+        return np.broadcast_to(steps, every)
+    fan = np.arcsin(np.clip(ray_offsets(geometry, orbit) / orbit.radius, -1.0, 1.0))
     return _parker(orbit, fan, min(float(np.abs(fan).max()), object_fan(grid, orbit)))
 
 

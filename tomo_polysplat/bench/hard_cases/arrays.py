@@ -18,7 +18,7 @@ __all__ = ["CASES"]
 def _as(change: Callable[[np.ndarray], np.ndarray], device: str) -> Findings:
     """The same numbers in another form, and untouched afterwards."""
     scan = mono_slice()
-    other = change(scan.projections)
+    other = change(np.asarray(scan.projections))
     before = other.tobytes()
     result = fit(scan, device, other)
     findings, easy = sound(result), fit(scan, device, np.ascontiguousarray(other, np.float32))

@@ -24,6 +24,7 @@ from tomo_polysplat.bench.hard_cases.same import relative_rms
 from tomo_polysplat.fit.optimise import Course
 from tomo_polysplat.fit.optimise import fit as optimise
 from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.quadrature import fit_quadrature
@@ -95,11 +96,7 @@ def _fit_in(scan: Scan, dtype: torch.dtype) -> np.ndarray:
     parts = {field.name: getattr(seeds, field.name) for field in fields(seeds)}
     seeds = Gaussians(**{k: t if k == "group" else t.to(dtype) for k, t in parts.items()})
     outcome = optimise(
-        seeds,
-        plan.spacing * problem.voxel,
-        rays,
-        scene,
-        settings,
+        FitSetup(seeds, plan.spacing * problem.voxel, rays, scene, settings),
         Course(
             views_per_step=plan.views_per_step,
             rng=np.random.default_rng(0),

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from tomo_polysplat.scan.counts import Counts, Marks
 from tomo_polysplat.scan.defects import fill_invalid
 from tomo_polysplat.scan.dropouts import dropped_rays
 from tomo_polysplat.scan.geometry import Geometry, from_astra
@@ -43,9 +44,11 @@ class Measured:
     @cached_property
     def valid(self) -> np.ndarray:
         """Rays that are marked good and finite, (rows, views, columns)."""
-        good = np.isfinite(self.scan.projections)
-        if self.scan.valid is not None:
-            good &= self.scan.valid
+        values, marked = self.scan.projections, self.scan.valid
+        # Counts are judged some views at a time.
+        good = np.asarray(values.marks) if isinstance(values, Counts) else np.isfinite(values)
+        if marked is not None and not isinstance(marked, Marks):
+            good &= marked
         if self.dead_pixels is not None:
             good &= ~self.dead_pixels[:, None]
         return good
@@ -61,13 +64,18 @@ class Measured:
     @cached_property
     def good(self) -> np.ndarray:
         """Which rays of :attr:`filled` were measured."""
-        values, valid = self.scan.projections[self.chosen_rows], self.valid[self.chosen_rows]
+        values, valid = self._values, self.valid[self.chosen_rows]
         return valid & ~dropped_rays(np.where(valid, values, np.nan))
 
     @cached_property
     def filled(self) -> np.ndarray:
         """The chosen rows of the projections, with bad rays interpolated, (rows, views, columns)."""
-        return fill_invalid(self.scan.projections[self.chosen_rows], self.good)
+        return fill_invalid(self._values, self.good)
+
+    @cached_property
+    def _values(self) -> np.ndarray:
+        # Once: a file may have to be read for them.
+        return self.scan.projections[self.chosen_rows]
 
     @cached_property
     def level(self) -> float:

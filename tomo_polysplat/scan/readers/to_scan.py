@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tomo_polysplat.checks import fail, visible
 from tomo_polysplat.scan.circular import volume_seen
+from tomo_polysplat.scan.counts import Counts
 from tomo_polysplat.scan.defects import flat_and_dark
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, to_astra
 from tomo_polysplat.scan.in_blocks import line_integrals
@@ -54,9 +56,8 @@ def scan_from_acquisition(told: Acquisition, options: ReadOptions, part: Part) -
     pictures = Upright(told, part, limit)
     geometry = _geometry(told)
     told, flat, dark = _open_beam(told, kind, pictures)
-    projections, valid, rays = line_integrals(
-        pictures.views, pictures.shape, kind, flat, dark, limit, options.progress
-    )
+    counts = Counts(lambda: nullcontext(pictures.views), pictures.shape, kind, flat, dark, limit)
+    projections, valid, rays = line_integrals(counts, options.progress)
     told, spectrum = _spectrum(told, options)
     seen = part.of(geometry, (pictures.rows, pictures.columns))
     _tell(told, rays, valid)

@@ -1,0 +1,284 @@
+"""Counts of a detector that stay where they are: their line integrals are made when they are looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from math import prod
+from typing import Any
+
+import numpy as np
+
+from tomo_polysplat.checks import fail, require_array, require_number
+from tomo_polysplat.parallel import run_tasks, split_range
+from tomo_polysplat.scan.defects import attenuation, flat_and_dark
+
+__all__ = ["Block", "Counts", "Marks"]
+
+# Rays of a block that is read at once, and of a part of it, whose logarithm is taken in float64 by one thread.
+_BLOCK, _PART = 1 << 24, 1 << 18
+
+Read = Callable[[slice], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Block:
+    """Views that were read together.
+
+    Attributes
+    ----------
+    views : slice
+    values : (views, rows, columns) float32 array
+        -log(I/I0), as `tomo_polysplat.scan.defects.attenuation` has it.
+    usable : bool array of that shape
+        Whether a ray was measured properly.
+    found : dict
+        How many rays of each kind were not.
+    """
+
+    views: slice
+    values: np.ndarray
+    usable: np.ndarray
+    found: dict[str, int]
+
+    @property
+    def marked(self) -> np.ndarray:
+        """Rays that are not to be used; of those without light `reconstruct` tells opaque ones itself."""
+        return ~(self.usable | np.isposinf(self.values))
+
+
+class _MadeWhenLookedAt(np.lib.mixins.NDArrayOperatorsMixin):
+    """An array (rows, views, columns) of which only what is looked at is ever made."""
+
+    ndim = 3
+
+    def __init__(self, shape: tuple[int, int, int], dtype: Any) -> None:
+        self.shape, self.dtype = shape, np.dtype(dtype)
+
+    @property
+    def size(self) -> int:
+        """How many rays there are."""
+        return prod(self.shape)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that all of it would take."""
+        return self.size * self.dtype.itemsize
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        if copy is False:
+            raise ValueError("what is made when it is looked at is always a copy")
+        return self[:, :, :].astype(self.dtype if dtype is None else dtype, copy=False)
+
+    def __getattr__(self, name: str) -> Any:
+        # What else an array has, of all of it.
+        if name.startswith("_") or not hasattr(np.ndarray, name):
+            raise AttributeError(f"{type(self).__name__} has no {name}")
+        return getattr(np.asarray(self), name)
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
+        arrays = [np.asarray(one) if isinstance(one, _MadeWhenLookedAt) else one for one in inputs]
+        return getattr(ufunc, method)(*arrays, **options)
+
+    def __getitem__(self, key: Any) -> np.ndarray:
+        """As of an array."""
+        keys = key if isinstance(key, tuple) else (key,)
+        if len(keys) > self.ndim or any(one is None or one is Ellipsis or np.ndim(one) > 2 for one in keys):
+            return np.asarray(self)[key]
+        keys += (slice(None),) * (self.ndim - len(keys))
+        needed = [_needed(one, length) for one, length in zip(keys, self.shape)]
+        (rows, of_rows), (views, of_views), (columns, of_columns) = needed
+        return self._made(rows, views, columns)[of_rows, of_views, of_columns]
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        remedy = "change numpy.asarray of it, or pass valid="
+        raise fail("projections", "no change of what stays where it is", "an assignment", remedy, TypeError)
+
+    def _made(self, rows: np.ndarray, views: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        raise NotImplementedError
+
+
+class Counts(_MadeWhenLookedAt):
+    """Line integrals -log(I/I0) of counts that stay in a file, or in an array of few bytes a ray.
+
+    To whoever reads it this is a float32 array (rows, views, columns), as `Scan` and `reconstruct` take one. What is
+    looked at is made anew each time, and ``numpy.asarray`` makes all of it.
+
+    Parameters
+    ----------
+    opened : callable
+        Gives a context in which a function of a slice of views reads them as (views, rows, columns).
+    shape : (views, rows, columns)
+    kind, flat, dark, saturation
+        See `tomo_polysplat.scan.defects.attenuation`.
+
+    Attributes
+    ----------
+    found : dict or None
+        How many rays of each kind were not measured properly; None before all were looked through.
+    """
+
+    # What the numbers are, a word each.
+    def __init__(
+        self,
+        opened: Callable[[], AbstractContextManager[Read]],
+        shape: tuple[int, int, int],
+        kind: str = "counts",
+        flat: np.ndarray | None = None,
+        dark: np.ndarray | None = None,
+        saturation: float | None = None,
+    ) -> None:
+        views, rows, columns = shape
+        super().__init__((rows, views, columns), np.float32)
+        self._opened = opened
+        self._kind, self._flat, self._dark, self._saturation = kind, flat, dark, saturation
+        self.found: dict[str, int] | None = None
+
+    @classmethod
+    def of(cls, counts: Any, white: Any, dark: Any = None, *, saturation: float | None = None) -> Counts:
+        """Those of an array, such as a ``numpy.memmap`` of a camera's file.
+
+        Parameters
+        ----------
+        counts : array, shape (views, rows, columns)
+            What the detector counted, of any type.
+        white, dark : array, shape (images, rows, columns) or (rows, columns)
+            Images without an object, and without light; no dark image means zero.
+        saturation : float or None
+            Counts at which the detector saturates; None takes the largest value of an integer type.
+
+        Raises
+        ------
+        ValueError
+            If the shapes do not fit, or the white images have no more light than the dark ones.
+        """
+        stored = require_array("counts", counts, 3, "(views, rows, columns)")
+        if not stored.size:
+            raise fail("counts", "some views", f"shape {stored.shape}")
+        if saturation is not None:
+            saturation = require_number("saturation", saturation)
+        views, rows, columns = stored.shape
+        flat, background = flat_and_dark(white, dark, (rows, columns))
+        shape = (views, rows, columns)
+        return cls(lambda: nullcontext(stored.__getitem__), shape, "counts", flat, background, saturation)
+
+    @property
+    def marks(self) -> Marks:
+        """Which rays were measured properly."""
+        return Marks(self, lightless=False)
+
+    @property
+    def at_once(self) -> int:
+        """Views that are read together."""
+        return max(1, _BLOCK // (self.shape[0] * self.shape[2]))
+
+    def blocks(self) -> Iterator[Block]:
+        """All views, some at a time, in their order."""
+        views = self.shape[1]
+        with self._opened() as read:
+            for first in range(0, views, self.at_once):
+                chosen = slice(first, min(first + self.at_once, views))
+                yield Block(chosen, *self._judged(read(chosen), self._flat, self._dark))
+
+    def some(
+        self, rows: np.ndarray, views: np.ndarray, columns: np.ndarray
+    ) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+        """Line integrals and whether they are usable, (views, rows, columns), for each run of neighbouring views.
+
+        Parameters
+        ----------
+        rows, views, columns : array of int
+            Which, rising.
+        """
+        pixels = np.ix_(rows, columns)
+        flat, dark = (None if image is None else image[pixels] for image in (self._flat, self._dark))
+        with self._opened() as read:
+            for begin, end in _runs(views, self.at_once):
+                stored = read(slice(int(views[begin]), int(views[end - 1]) + 1))
+                if len(rows) < stored.shape[1] or len(columns) < stored.shape[2]:
+                    stored = stored[:, rows[:, None], columns]
+                values, usable, _ = self._judged(stored, flat, dark)
+                yield slice(begin, end), values, usable
+
+    def _judged(
+        self, stored: np.ndarray, flat: np.ndarray | None, dark: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray, dict[str, int]]:
+        """What `attenuation` makes of some views, by several threads."""
+        values, usable = np.empty(stored.shape, np.float32), np.empty(stored.shape, bool)
+        # By rows, or by views where those are more.
+        by_rows = stored.shape[1] > len(stored)
+
+        def judge(a: int, b: int) -> dict[str, int]:
+            part = (slice(None), slice(a, b)) if by_rows else (slice(a, b),)
+            light, background = (image if image is None else image[part[1:]] for image in (flat, dark))
+            values[part], usable[part], found = attenuation(
+                stored[part], self._kind, light, background, self._saturation
+            )
+            return found
+
+        found = run_tasks(judge, split_range(stored.shape[int(by_rows)], -(-stored.size // _PART)))
+        return values, usable, {name: sum(part[name] for part in found) for name in found[0]}
+
+    def _made(self, rows: np.ndarray, views: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        made = np.empty((len(rows), len(views), len(columns)), np.float32)
+        for part, values, _ in self.some(rows, views, columns):
+            made[:, part] = values.transpose(1, 0, 2)
+        return made
+
+    def __repr__(self) -> str:
+        return f"Counts(rows, views, columns = {self.shape})"
+
+
+class Marks(_MadeWhenLookedAt):
+    """Which rays of `Counts` were measured properly, a bool array (rows, views, columns) to whoever reads it.
+
+    Parameters
+    ----------
+    counts : Counts
+    lightless : bool
+        Whether rays without light count as such; see `Scan.usable`.
+    """
+
+    def __init__(self, counts: Counts, *, lightless: bool) -> None:
+        rows, views, columns = counts.shape
+        super().__init__((rows, views, columns), bool)
+        self.counts, self.lightless = counts, lightless
+
+    def _made(self, rows: np.ndarray, views: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        made = np.ones((len(rows), len(views), len(columns)), bool)
+        if self.counts.found is not None and not any(self.counts.found.values()):
+            return made
+        for part, values, usable in self.counts.some(rows, views, columns):
+            if self.lightless:
+                usable |= np.isposinf(values)
+            made[:, part] = usable.transpose(1, 0, 2)
+        return made
+
+    def __repr__(self) -> str:
+        return f"Marks(rows, views, columns = {self.shape})"
+
+
+def _needed(key: Any, length: int) -> tuple[np.ndarray, Any]:
+    """Which of an axis are wanted, rising, and the key that takes them from these."""
+    wanted = np.arange(length)[key]
+    if wanted.ndim == 0:
+        return wanted[None], 0
+    if isinstance(key, slice) and key.step in (None, 1):
+        return wanted, slice(None)
+    if isinstance(key, slice):
+        return (wanted, slice(None)) if key.step > 0 else (wanted[::-1], slice(None, None, -1))
+    chosen, place = np.unique(wanted, return_inverse=True)
+    return chosen, place.reshape(wanted.shape)
+
+
+def _runs(views: np.ndarray, most: int) -> Iterator[tuple[int, int]]:
+    """Where runs of neighbours of at most so many begin and end."""
+    begin = 0
+    for end in range(1, len(views) + 1):
+        if end == len(views) or views[end] != views[end - 1] + 1 or end - begin == most:
+            yield begin, end
+            begin = end
