@@ -63,7 +63,8 @@ def usual_water_correction(spectrum: Spectrum, largest: float) -> tuple[float, .
     -------
     tuple of float
         ``c_0`` (0), ``c_1``, ...: within 0.01 of `water_linearised` for tubes of 60 to 140 kV behind 1 to 8 mm of
-        aluminium and values up to 12; it rises beyond ``largest``. Water of 1 g/cm3 gets its attenuation at the spectrum's effective energy.
+        aluminium and values up to 12. It rises beyond ``largest``. Water of 1 g/cm3 gets its attenuation at the
+        spectrum's effective energy.
 
     Raises
     ------

@@ -6,7 +6,7 @@ import logging
 import math
 from dataclasses import replace
 
-import numpy as np
+import torch
 
 from tomo_polysplat.fit.misses import misses
 from tomo_polysplat.fit.problem import Problem
@@ -44,7 +44,7 @@ def doubt_spectrum(problem: Problem, misfit: float, means: Means) -> Answer | No
     means : Means
         Of the fit to come.
     """
-    if (linear := _doubt_hardening(problem)) is not None:
+    if (linear := _doubt_hardening(problem, means.device)) is not None:
         return linear
     if not problem.polychromatic or math.prod(problem.grid.shape) > _MOST_VOXELS or misfit <= 0:
         return None
@@ -68,7 +68,7 @@ def doubt_spectrum(problem: Problem, misfit: float, means: Means) -> Answer | No
     return Answer("doubted", words, Status.FOUND, {"left by one energy": ratio})
 
 
-def _doubt_hardening(problem: Problem) -> Answer | None:
+def _doubt_hardening(problem: Problem, device: torch.device) -> Answer | None:
     """That the views add up to the same mass as they are, which rays of this spectrum do not; None for no doubt."""
     spectrum = problem.spectrum
     if spectrum is None or problem.filter_map is not None:
@@ -76,7 +76,7 @@ def _doubt_hardening(problem: Problem) -> Answer | None:
     shown = hardening_shown(problem.projections, problem.geometry, spectrum)
     if shown is None or not shown.none:
         return None
-    largest = float(np.nanmax(problem.projections))
+    largest = float(problem.measured(device).nan_to_num(nan=-math.inf).max())
     polynomial = ", ".join(f"{c:.6g}" for c in usual_water_correction(spectrum, largest))
     words = (
         f"all views see the same mass, which shows {shown.share:.2f} (standard error {shown.error:.2g}) of the"

@@ -8,7 +8,7 @@ Neither a volume nor a fit is needed, and an axis that is off changes nothing.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -49,13 +49,13 @@ class HardeningShown(NamedTuple):
         return abs(self.share) + 3.0 * self.error < 0.5
 
 
-def hardening_shown(values: np.ndarray, geometry: Geometry, spectrum: Spectrum) -> HardeningShown | None:
+def hardening_shown(values: Any, geometry: Geometry, spectrum: Spectrum) -> HardeningShown | None:
     """The share of a spectrum's hardening that makes all views see the same mass.
 
     Parameters
     ----------
     values : (views, rows, columns) array
-        -log(I/I0); NaN where a ray is not to be used.
+        -log(I/I0), of which some rows are read; NaN where a ray is not to be used.
     geometry : Geometry
     spectrum : Spectrum
 
@@ -68,7 +68,7 @@ def hardening_shown(values: np.ndarray, geometry: Geometry, spectrum: Spectrum) 
     if not _sees_slices(geometry):
         return None
     rows = np.unique(np.linspace(0, geometry.rows - 1, _ROWS).astype(int))
-    some = values[:, rows].astype(np.float64)
+    some = np.asarray(values[:, rows], dtype=np.float64).copy()
     flat = some.reshape(-1, geometry.columns)
     fill_rows_in_place(flat, np.isfinite(flat))
     edges = np.abs(np.median(some[:, :, [0, -1]], axis=0))
