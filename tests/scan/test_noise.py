@@ -38,7 +38,7 @@ def test_gains_of_pixels_are_no_noise():
     for photons in (1e3, 1e5):
         scan = poisson(disc(1.0), photons)
         gained = scan + np.random.default_rng(2).normal(0, 0.03, (1, *scan.shape[1:]))
-        assert photons_per_ray(gained) == pytest.approx(photons_per_ray(scan), rel=0.03)
+        assert photons_per_ray(gained) == pytest.approx(photons_per_ray(scan), rel=0.15)
 
 
 def test_an_order_of_magnitude_in_exposure_is_an_order_of_magnitude_found():
