@@ -17,7 +17,7 @@ from contextvars import ContextVar
 import numpy as np
 from numpy.typing import DTypeLike
 
-__all__ = ["contiguous", "copy_array", "cpu_threads", "kept_threads", "run_tasks", "split_range"]
+__all__ = ["contiguous", "copy_array", "cpu_threads", "kept_threads", "run_tasks", "shares", "split_range"]
 
 _COPIED_AT_ONCE = 1 << 21  # bytes of a task, so that the copy takes longer than to hand it to a thread
 # The process that keeps threads, and its threads.
@@ -47,6 +47,11 @@ def split_range(length: int, parts: int) -> list[tuple[int, int]]:
     parts = max(1, min(parts, length))
     bounds = [length * k // parts for k in range(parts + 1)]
     return [(a, b) for a, b in zip(bounds[:-1], bounds[1:]) if b > a]
+
+
+def shares(length: int, each: int, threads: int) -> list[tuple[int, int]]:
+    """Cut ``range(length)`` into ``each`` pieces a thread, so that none waits long; one thread needs one piece."""
+    return split_range(length, each * threads if threads > 1 else 1)
 
 
 @contextmanager

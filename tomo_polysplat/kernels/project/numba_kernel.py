@@ -24,7 +24,7 @@ from tomo_polysplat.kernels.project.numba_footprint import (
 )
 from tomo_polysplat.kernels.project.numba_group import GROUP, SIZE, add_where, matrix_of, put_group, three
 from tomo_polysplat.kernels.views import DetectorViews
-from tomo_polysplat.parallel import cpu_threads, run_tasks, split_range
+from tomo_polysplat.parallel import cpu_threads, run_tasks, shares, split_range
 
 __all__ = ["backward", "forward"]
 
@@ -245,7 +245,7 @@ def forward(position, scale, rotation, weight, views: DetectorViews, cutoff: flo
     span = np.empty((len(views), count, 4), np.int32)
     inverse = views.inverse
     scene = (position, scale, rotation, views.cone, views.planar, views.origin, inverse, views.matrix)
-    parts = split_range(count, 4 * cpu_threads())
+    parts = shares(count, 4, cpu_threads())
     skipped = sum(
         run_tasks(lambda a, b: set_up(a, b, *scene, cutoff, views.rows, views.columns, record, span), parts)
     )
@@ -274,6 +274,6 @@ def backward(
     rest = (*scene, cutoff, views.columns, record, span, padded, *grads, by_group)
     run_tasks(
         lambda a, b: _gather_range(a * GROUP, min(b * GROUP, len(position)), *rest),
-        split_range(groups, 16 * cpu_threads()),
+        shares(groups, 16, cpu_threads()),
     )
     return (*grads, by_group.sum(axis=0).reshape(-1, 4, 3)) if of_views else grads

@@ -13,7 +13,7 @@ from numba import njit
 from tomo_polysplat.kernels.gaussian_maths import FAST, gaussian, whitening, whitening_adjoint
 from tomo_polysplat.kernels.numba_lanes import LANES, add_product, add_scaled, lane_sums
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
-from tomo_polysplat.parallel import cpu_threads, run_tasks, split_range
+from tomo_polysplat.parallel import cpu_threads, run_tasks, shares
 
 __all__ = ["backward", "forward"]
 
@@ -215,9 +215,9 @@ def forward(position, scale, rotation, weight, box: VoxelBox, cutoff: float) -> 
     nz, ny, nx = box.shape
     record = np.empty((len(position), 9), np.float32)
     scene = (position, scale, rotation, box.first, box.spacing)
-    run_tasks(lambda a, b: _set_up(a, b, *scene, record), split_range(len(position), 4 * cpu_threads()))
+    run_tasks(lambda a, b: _set_up(a, b, *scene, record), shares(len(position), 4, cpu_threads()))
     volume = np.zeros((nz, ny, len(weight), nx + LANES), np.float32)
-    tasks = split_range(nz, 2 * cpu_threads())
+    tasks = shares(nz, 2, cpu_threads())
     run_tasks(lambda a, b: _fill(a, b, record, weight, cutoff, ny, nx, volume), tasks)
     return volume[..., :nx].transpose(2, 0, 1, 3)
 
@@ -229,7 +229,5 @@ def backward(position, scale, rotation, weight, box: VoxelBox, cutoff: float, gr
     padded[..., :nx] = grad_volume.transpose(1, 2, 0, 3)
     grads = tuple(np.zeros_like(a) for a in (position, scale, rotation, weight))
     scene = (position, scale, rotation, weight, box.first, box.spacing, cutoff, nx, padded)
-    run_tasks(
-        lambda a, b: _gather_range(a, b, *scene, *grads), split_range(len(position), 16 * cpu_threads())
-    )
+    run_tasks(lambda a, b: _gather_range(a, b, *scene, *grads), shares(len(position), 16, cpu_threads()))
     return grads
