@@ -113,6 +113,15 @@ def test_rays_that_are_not_explained_are_told(caplog):
     assert f"missed by {bad.plan['rays'].value:.2g} times their noise" in bad.plan["rays"].why
 
 
+def test_unexplained_rays_without_a_spectrum_ask_for_one(caplog, monkeypatch):
+    monkeypatch.setattr("tomo_polysplat.plan.never_worse._FAR", 0.0)
+    for spectrum, asked in ((None, "pass spectrum="), (fan().spectrum, "is the spectrum that of this scan")):
+        caplog.clear()
+        with caplog.at_level(logging.WARNING):
+            reconstruct(fan(), spectrum=spectrum, settings={"passes": 0.5})
+        assert asked in caplog.text
+
+
 @pytest.mark.parametrize("held_out", [0.05, 0.0])
 def test_the_truth_misses_its_rays_by_their_noise(held_out):
     scan = cone(metal=False)

@@ -33,6 +33,7 @@ _CHANCE = 3.0
 # Rays that are missed by so many times their noise and the model's allowed error together are told as a warning. Whole
 # runs of 26^3 and 32^3 come to 0.9 to 1.9, also with a spectrum that is wrong, and to 15 with an axis 2 pixels off.
 _FAR = 4.0
+_NO_SPECTRUM = "without a spectrum the model has one energy, which no tube has: pass spectrum= (--kvp, --filter, --detector)"
 
 
 def note_seeds(prepared: PreparedFit, problem: Problem, run_options: RunOptions) -> None:
@@ -65,10 +66,16 @@ def judge(outcome: FitOutcome, prepared: PreparedFit, problem: Problem, run_opti
     words = f"{found.describe()}, and {left:.2g} of the first Gaussians' misfit is left"
     if far := found.allowed > _FAR:
         words += f"; that is {found.allowed:.2g} times what noise and the model's usual error come to"
+        spectrum = (
+            _NO_SPECTRUM
+            if problem.spectrum is None
+            else "is the spectrum that of this scan, with its filters"
+        )
         logger.warning(
-            "The rays are not explained: %s. Ask `tomo-polysplat check` about axis and detector; is the spectrum that"
-            " of this scan, with its filters, and all of the object inside the volume?",
+            "The rays are not explained: %s. Ask `tomo-polysplat check` about axis and detector; %s,"
+            " and is all of the object inside the volume?",
             words,
+            spectrum,
         )
     evidence = {"allowed": found.allowed, "left": left if math.isfinite(left) else 0.0, "rays": found.rays}
     value = found.allowed if math.isinf(found.times) else found.times

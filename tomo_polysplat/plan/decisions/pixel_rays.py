@@ -60,6 +60,8 @@ class PixelRays(Decision):
     def why_not(self, known: Known, lab: Lab) -> str:
         """Why it is not asked, if so."""
         assert lab.gaussians is not None
+        if not lab.problem.polychromatic:
+            return "one energy tells no metal from other matter"
         if not bool((lab.gaussians.group > 0).any()):
             return "without metal it matters little"
         return why_no_fork(known[Passes], lab.problem.geometry.views)
