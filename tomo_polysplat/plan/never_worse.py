@@ -33,7 +33,9 @@ _CHANCE = 3.0
 # Rays that are missed by so many times their noise and the model's allowed error together are told as a warning. Whole
 # runs of 26^3 and 32^3 come to 0.9 to 1.9, also with a spectrum that is wrong, and to 15 with an axis 2 pixels off.
 _FAR = 4.0
-_NO_SPECTRUM = "without a spectrum the model has one energy, which no tube has: pass spectrum= (--kvp, --filter, --detector)"
+_NO_SPECTRUM = (
+    "no spectrum was given, so the model has one energy: pass spectrum= (--kvp, --filter, --detector)"
+)
 
 
 def note_seeds(prepared: PreparedFit, problem: Problem, run_options: RunOptions) -> None:
