@@ -23,8 +23,9 @@ from tomo_polysplat.scan.io import save_scan
 
 CPU = torch.device("cpu")
 TWO = ["cpu", "cpu"]
-# Of the norm of a volume. What is added up in another order differs by rounding, which grows with every step.
-SAME = 1e-4
+# What is added up in another order differs by rounding, which grows with every step. A Gaussian whose gradient is all
+# rounding may step either way: so much of nearly all voxels, in the largest one, and so much of the volume, in L2.
+SAME, NEARLY_ALL, OF_ALL = 3e-5, 0.95, 1e-3
 
 
 def children():
@@ -61,6 +62,12 @@ def relative(volume, reference):
     return float(np.linalg.norm(volume - reference) / np.linalg.norm(reference))
 
 
+def same(volume, reference):
+    """Whether two volumes differ by rounding alone."""
+    apart = np.abs(volume - reference)[reference > 0]
+    return np.quantile(apart, NEARLY_ALL) < SAME * reference.max() and relative(volume, reference) < OF_ALL
+
+
 @pytest.fixture(scope="class")
 def three():
     """Three processes that share out what is fitted while they live; they are started once."""
@@ -76,7 +83,7 @@ class TestThreeProcesses:
         shared, one = reconstruct(scan()), alone(scan())
         assert three.count == 3 and shared.plan["ranks"].value == 3 and "ranks" not in one.plan
         assert "returned" not in one.plan, "the start was better, so that nothing is compared"
-        assert relative(shared.volume, one.volume) < SAME
+        assert same(shared.volume, one.volume)
         for entry, other in zip(shared.history, one.history, strict=True):
             assert entry["loss"] == pytest.approx(other["loss"], rel=1e-4)
             assert entry["held_out"] == pytest.approx(other["held_out"], rel=1e-4)
@@ -84,7 +91,7 @@ class TestThreeProcesses:
     def test_may_be_more_than_the_views_of_a_step(self, three):
         settings = QUICK | {"views_per_step": 2, "passes": 0.5}
         shared, one = reconstruct(cone(), settings=settings), alone(cone(), settings=settings)
-        assert "returned" not in one.plan and relative(shared.volume, one.volume) < SAME
+        assert "returned" not in one.plan and same(shared.volume, one.volume)
 
     def test_all_see_rays_that_change_during_a_run(self, three, monkeypatch):
         """As those of which gains or drift are taken out between two passes."""
@@ -100,7 +107,7 @@ class TestThreeProcesses:
         before = alone(cone(), settings=settings)
         monkeypatch.setattr(Fitter, "_end_pass", less)
         shared, one = reconstruct(cone(), settings=settings), alone(cone(), settings=settings)
-        assert relative(shared.volume, one.volume) < SAME < relative(shared.volume, before.volume)
+        assert same(shared.volume, one.volume) and not same(shared.volume, before.volume)
 
     def test_stand_still_after_ctrl_c_within_a_step(self, three, monkeypatch):
         """The last thing that they do: the best state is returned, and nothing more is asked of them."""
@@ -133,7 +140,7 @@ def test_a_process_that_dies_ends_the_run_and_its_checkpoint_goes_on_in_one(tmp_
     assert len(killed) == 1 and time.monotonic() - killed[0] < 30 and not children()
     resumed, whole = reconstruct(cone(), resume=True, checkpoint=path), reconstruct(cone())
     assert len(resumed.history) == len(whole.history) == 2
-    assert relative(resumed.volume, whole.volume) < SAME
+    assert same(resumed.volume, whole.volume)
 
 
 def test_what_a_process_fails_of_is_told():
@@ -163,7 +170,7 @@ def test_torchrun_reconstructs_by_the_command_line(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=120)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("wrote volume.npy") == 1 and '"ranks"' in (tmp_path / "about.json").read_text()
-    assert relative(np.load(tmp_path / "volume.npy"), reconstruct(fan(metal=False)).volume) < SAME
+    assert same(np.load(tmp_path / "volume.npy"), reconstruct(fan(metal=False)).volume)
 
 
 @pytest.mark.parametrize("length", [0, 1, 2, 7, 12])

@@ -89,11 +89,41 @@ def test_only_what_explains_unseen_rays_beyond_chance_is_kept(kind):
     assert "1.00%" in kind.told({kind.name: 0.01})
 
 
-def test_a_ring_is_shared_with_the_object_and_what_no_ring_shows_is_not():
-    ring, other = np.zeros((1, 9)), np.zeros((1, 9))
-    ring[0, [1, 7]] = 0.02
-    other[0, 1], other[0, 7] = 0.02, -0.02
-    assert np.allclose(less_rings(ring, 4.0), 0.5 * ring)
-    assert np.allclose(less_rings(other, 4.0), other)
-    # The pixel that is opposite lies beside the detector.
-    assert np.allclose(less_rings(other, 0.0), 0.5 * other)
+def both_parts(gains):
+    """What opposite pixels have in common, and what they have not, of a detector whose axis is in the middle."""
+    return 0.5 * (gains + gains[:, ::-1]), 0.5 * (gains - gains[:, ::-1])
+
+
+def test_gains_are_as_strong_on_both_sides_and_stay_as_they_are():
+    kept = less_rings(GAINS, 0.5 * (COLUMNS - 1))
+    common, apart = both_parts(GAINS)
+    of_common, of_apart = both_parts(kept)
+    assert np.allclose(of_apart, apart) and np.std(of_common - common) < 0.2 * np.std(common)
+
+
+def test_rings_that_are_stronger_than_gains_are_left_to_the_object():
+    ring = 0.03 * np.random.default_rng(4).normal(size=(ROWS, COLUMNS))
+    ring = both_parts(ring)[0]
+    kept = less_rings(GAINS + ring, 0.5 * (COLUMNS - 1))
+    common, apart = both_parts(kept)
+    told = both_parts(GAINS)
+    assert np.allclose(apart, told[1])
+    # Wiener's filter leaves s^2 r^2 / (s^2 + r^2) of a strength s^2 among r^2.
+    s2, r2 = np.mean(told[0] ** 2), np.mean(ring**2)
+    assert np.mean((common - told[0]) ** 2) < 1.15 * s2 * r2 / (s2 + r2)
+
+
+def test_rings_alone_are_no_gains():
+    ring = both_parts(GAINS)[0]
+    assert not less_rings(ring, 0.5 * (COLUMNS - 1)).any()
+
+
+def test_a_pixel_without_another_one_keeps_what_is_no_stronger_than_gains():
+    # The axis lies near the edge: few pixels have another.
+    kept = less_rings(GAINS, 8.0)
+    assert np.std(kept - GAINS) < 0.2 * np.std(GAINS)
+    beside = GAINS.copy()
+    beside[:, 17:] *= 6
+    assert np.std(less_rings(beside, 8.0)[:, 17:]) < 0.4 * np.std(beside[:, 17:])
+    # Beyond the detector nothing tells.
+    assert np.array_equal(less_rings(GAINS, -20.0), GAINS)

@@ -52,7 +52,7 @@ def test_more_of_anything_takes_longer():
     base = {"steps": 100, "done": 4, "a_step": 0.1, "so_far": 3.0, "growth": 1.0, "memory": ""}
     least = expected(**base).seconds
     assert 12.6 < least < 16
-    for more in ({"steps": 200}, {"a_step": 0.2}, {"so_far": 6.0}, {"growth": 4.0}):
+    for more in ({"steps": 200}, {"a_step": 0.2}, {"so_far": 6.0}, {"growth": 4.0}, {"light_open": True}):
         assert expected(**(base | more)).seconds > least + 2.9
 
 

@@ -80,6 +80,18 @@ def test_an_offset_is_measured_and_the_remedy_mends_it(scan, offset):
     assert not defects(replace(moved, proj_geom=astra.geom_postalignment(moved.proj_geom, (shift, 0.0))))
 
 
+def test_an_axis_of_a_parallel_beam_far_off_is_found():
+    """Beyond what opposite rays are compared at: by a fifth of the columns."""
+    import astra
+
+    scan = simulate_scan("pancreas", SIZE, VIEWS, geometry="parallel", arc_degrees=360)
+    offset = 0.2 * scan.columns
+    found = verdict(
+        replace(scan, proj_geom=astra.geom_postalignment(scan.proj_geom, (offset, 0.0))), "centre"
+    )
+    assert found.verdict == "defect" and found.values["offset"] == pytest.approx(offset, abs=0.2)
+
+
 @pytest.mark.parametrize(
     ("change", "word"),
     [

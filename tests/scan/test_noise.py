@@ -34,6 +34,13 @@ def test_unusable_rays_do_not_matter():
     assert photons_per_ray(scan) == pytest.approx(1e4, rel=0.15)
 
 
+def test_gains_of_pixels_are_no_noise():
+    for photons in (1e3, 1e5):
+        scan = poisson(disc(1.0), photons)
+        gained = scan + np.random.default_rng(2).normal(0, 0.03, (1, *scan.shape[1:]))
+        assert photons_per_ray(gained) == pytest.approx(photons_per_ray(scan), rel=0.15)
+
+
 def test_an_order_of_magnitude_in_exposure_is_an_order_of_magnitude_found():
     low, high = (photons_per_ray(poisson(disc(1.0), n)) for n in (1e3, 1e4))
     assert high / low == pytest.approx(10, rel=0.2)

@@ -107,3 +107,41 @@ def test_opaque_metal_keeps_more_of_its_mass(beside):
     assert (
         tps.reconstruct(dead, geometry, volume, **about).counts["rays_opaque"] == told.counts["rays_opaque"]
     )
+
+
+def test_a_shadow_that_moves_is_opaque_however_bright_it_is_beside_it():
+    """A pin of gold in air; pixels that are dead, fail for a time, or fail at random are none."""
+    random, views, columns = np.random.default_rng(1), 60, 64
+    values = np.full((views, 5, columns), 0.5, np.float32)
+    middle = 32 + 20 * np.sin(np.linspace(0, np.pi, views))
+    pin = np.abs(np.arange(columns) - middle[:, None]) < 2.5
+    values[np.broadcast_to(pin[:, None], values.shape)] = np.inf
+    failing = np.zeros(values.shape, bool)
+    failing[:, :, 3:6] = True
+    failing[20:40, 1:4, 9:12] = True
+    failing[:, 2, 15:20] = random.random((views, 5)) < 0.7
+    failing[random.random(values.shape) < 0.05] = True
+    failing &= ndimage.distance_transform_cdt(~np.broadcast_to(pin[:, None], values.shape)) > 3
+    values[failing] = np.inf
+    # The shadow's rim is left out in the first and the last view.
+    assert fill_opaque(values, PHOTONS) >= 0.98 * 5 * pin.sum()
+    assert np.isnan(values[failing]).all()
+
+
+def test_a_shadow_is_followed_as_by_a_label_of_all_views():
+    from tomo_polysplat.scan.shadows import moving_shadows
+
+    values = np.where(np.random.default_rng(4).random((12, 9, 11)) < 0.3, np.inf, 1.0)
+    found = np.stack([np.zeros((9, 11), bool) if one is None else one for one in moving_shadows(values)])
+    near = np.zeros((3, 3, 3))
+    near[1], near[:, 1, 1] = 1, 1
+    dark = np.isinf(values)
+    beside = np.pad(dark, ((1, 1), (0, 0), (0, 0)))
+    labels, number = ndimage.label(dark & (beside[:-2] | beside[2:]), near)
+    wanted = np.zeros(values.shape, bool)
+    for label in range(1, number + 1):
+        one = labels == label
+        if one.any(axis=(1, 2)).sum() >= 5:
+            wanted |= one & (one.any(axis=0).sum() >= 2 * one.sum(axis=(1, 2)).max())
+    np.testing.assert_array_equal(found, wanted)
+    assert 0 < found.sum() < (labels > 0).sum()

@@ -16,10 +16,18 @@ from numpy.typing import DTypeLike
 
 from tomo_polysplat.checks import fail, require_array
 from tomo_polysplat.parallel import run_tasks, split_range
+from tomo_polysplat.physics.spectrum import Spectrum
+from tomo_polysplat.physics.water import water_linearised
 
-__all__ = ["describe_polynomial", "require_water_correction", "undo_water_correction"]
+__all__ = [
+    "describe_polynomial",
+    "require_water_correction",
+    "undo_water_correction",
+    "usual_water_correction",
+]
 
 _TABLE = 4096
+_DEGREE = 6
 _NEWTON_STEPS = 3
 _PART = 1 << 18
 _REMEDY = "ascending powers of P as in (0, 1, 0.02) for P + 0.02 P^2"
@@ -40,6 +48,40 @@ def require_water_correction(coefficients: Any) -> tuple[float, ...]:
         got = f"c_0 = {values[0]:g}, c_1 = {values[1]:g}"
         raise fail("water_correction", "c_0 = 0 and c_1 > 0", got, _REMEDY)
     return tuple(map(float, values))
+
+
+def usual_water_correction(spectrum: Spectrum, largest: float) -> tuple[float, ...]:
+    """The polynomial of a scanner that corrects for water under a spectrum, for who does not know it.
+
+    Parameters
+    ----------
+    spectrum : Spectrum
+    largest : float
+        Largest corrected value that there is.
+
+    Returns
+    -------
+    tuple of float
+        ``c_0`` (0), ``c_1``, ...: within 0.01 of `water_linearised` for tubes of 60 to 140 kV behind 1 to 8 mm of
+        aluminium and values up to 12. It rises beyond ``largest``. Water of 1 g/cm3 gets its attenuation at the
+        spectrum's effective energy.
+
+    Raises
+    ------
+    ValueError
+        If ``largest`` is not above 0.
+    """
+    if not 0 < largest < np.inf:
+        raise fail("largest", "a value above 0", repr(largest), "give the largest value of the projections")
+    # Beyond what is needed, so that noise on the largest value is undone too.
+    measured = 1.2 * largest * np.linspace(0.0, 1.0, _TABLE)[1:]
+    wanted = water_linearised(measured, spectrum)
+    for degree in range(_DEGREE, 1, -1):
+        powers = measured[:, None] ** np.arange(1, degree + 1)
+        coefficients = np.linalg.lstsq(powers, wanted, rcond=None)[0]
+        if (np.diff(powers @ coefficients) > 0).all() and coefficients[0] > 0:
+            return (0.0, *map(float, coefficients))
+    return (0.0, float(wanted @ measured / (measured @ measured)))
 
 
 def describe_polynomial(coefficients: Sequence[float]) -> str:

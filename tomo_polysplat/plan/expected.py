@@ -16,6 +16,10 @@ logger = logging.getLogger(__name__)
 # fits and second runs, and Gaussians spread. On a CPU it came to 1.07 (pins, 24^3) and 1.21 (teeth, 32^3) with metal,
 # 0.98 (lung, 36^3) and 0.95 (pepper, 48^3) without.
 _LONGER = 1.05
+# By how much where it is still to be asked whether pixels average light: the second way is a run of some passes, and
+# averaged steps are slower. On a CPU it came to 1.2 and 1.35 (36^3), on a GPU (bone, 400^3 and 768^3) to 1.3 and 1.45
+# with thin rays, and to 2.0 with averaged light.
+_LIGHT_OPEN = 1.5
 # A growing cloud has its last number of Gaussians for about this share of the run.
 _GROWN = 0.7
 # Less is not worth a line of the log, nor some words on compiling.
@@ -91,6 +95,7 @@ def expected(
     growth: float,
     memory: str,
     *,
+    light_open: bool = False,
     compiled: float = 0.0,
 ) -> Expected:
     """From the seconds of a step as timed.
@@ -104,10 +109,12 @@ def expected(
     growth : float
         Times as many Gaussians as now at the end.
     memory : str
+    light_open : bool
+        Whether it is still to be asked if pixels average light.
     compiled : float
         Seconds of compiling, of which `so_far` has none.
     """
-    longer = _LONGER * (1 + _GROWN * (max(growth, 1.0) - 1))
+    longer = (_LIGHT_OPEN if light_open else _LONGER) * (1 + _GROWN * (max(growth, 1.0) - 1))
     seconds = so_far + longer * (steps - done) * a_step
     return Expected(seconds, so_far, steps, a_step, memory, compiled)
 

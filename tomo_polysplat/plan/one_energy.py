@@ -1,4 +1,4 @@
-"""Whether a scan's start explains its rays better by one energy than by the spectrum that was told."""
+"""Whether a scan's rays show that its spectrum is not theirs: by the mass of each view, or by one energy."""
 
 from __future__ import annotations
 
@@ -6,14 +6,18 @@ import logging
 import math
 from dataclasses import replace
 
+import torch
+
 from tomo_polysplat.fit.misses import misses
 from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.physics.water_correction import usual_water_correction
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.first_volume import first_volume
 from tomo_polysplat.plan.lab import Lab
 from tomo_polysplat.plan.means import Means
 from tomo_polysplat.plan.order import decide_start
 from tomo_polysplat.plan.short_fit import short_fit
+from tomo_polysplat.scan.mass_of_views import hardening_shown
 from tomo_polysplat.start.initial import initial_volume_on
 
 __all__ = ["doubt_spectrum"]
@@ -30,7 +34,7 @@ _MOST_VOXELS = 1 << 24
 
 
 def doubt_spectrum(problem: Problem, misfit: float, means: Means) -> Answer | None:
-    """What to do about a spectrum that fits rays clearly worse than one energy does; None for no doubt.
+    """What to do about a spectrum whose hardening the rays do not show, or that one energy beats; None for no doubt.
 
     Parameters
     ----------
@@ -40,6 +44,8 @@ def doubt_spectrum(problem: Problem, misfit: float, means: Means) -> Answer | No
     means : Means
         Of the fit to come.
     """
+    if (linear := _doubt_hardening(problem, means.device)) is not None:
+        return linear
     if not problem.polychromatic or math.prod(problem.grid.shape) > _MOST_VOXELS or misfit <= 0:
         return None
     one = problem.with_one_energy()
@@ -60,6 +66,26 @@ def doubt_spectrum(problem: Problem, misfit: float, means: Means) -> Answer | No
     )
     logger.warning("The spectrum does not fit: %s.", words)
     return Answer("doubted", words, Status.FOUND, {"left by one energy": ratio})
+
+
+def _doubt_hardening(problem: Problem, device: torch.device) -> Answer | None:
+    """That the views add up to the same mass as they are, which rays of this spectrum do not; None for no doubt."""
+    spectrum = problem.spectrum
+    if spectrum is None or problem.filter_map is not None:
+        return None
+    shown = hardening_shown(problem.projections, problem.geometry, spectrum)
+    if shown is None or not shown.none:
+        return None
+    largest = float(problem.measured(device).nan_to_num(nan=-math.inf).max())
+    polynomial = ", ".join(f"{c:.6g}" for c in usual_water_correction(spectrum, largest))
+    words = (
+        f"all views see the same mass, which shows {shown.share:.2f} (standard error {shown.error:.2g}) of the"
+        " spectrum's hardening: either the scanner has corrected its rays for water, then pass its polynomial, or the"
+        f" usual one of this spectrum, water_correction=({polynomial}); or the beam has one energy, then pass no"
+        " spectrum; or the spectrum is far too soft (docs/spectrum.md)"
+    )
+    logger.warning("The spectrum does not fit: %s.", words)
+    return Answer("doubted", words, Status.FOUND, shown._asdict())
 
 
 def _by_seeds(one: Problem, means: Means) -> float:

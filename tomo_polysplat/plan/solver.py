@@ -187,7 +187,8 @@ class Solver:
         growth = plan.answers["growth"].value if "growth" in plan.answers else 1.0
         memory = plan.facts["memory"].why if "memory" in plan.facts else ""
         parts = clock.steps, clock.done, a_step, so_far, float(growth), f"memory {memory}"
-        found = expected(*parts, compiled=compiled_seconds() - self.compiled)
+        compiled, light_open = compiled_seconds() - self.compiled, "pixel_rays" not in plan.answers
+        found = expected(*parts, light_open=light_open, compiled=compiled)
         tell(found, self.run_options.time_budget)
 
     def _tell_pace(self, plan: Plan, room: float, lacking: float) -> None:

@@ -14,6 +14,8 @@ _VIEWS = 24
 _MOST = 8_000_000
 _BINS = 16
 _LARGEST_EXPONENT = 700.0
+# Error of a variance told by the median absolute deviation of n normal values, times sqrt(n), and how many of it tell.
+_OF_A_MEDIAN, _CLEARLY = 2.33, 3.0
 
 
 def photons_per_ray(
@@ -23,9 +25,9 @@ def photons_per_ray(
 
     Counts that are Poisson distributed give ``-log(I/I0)`` a variance ``exp(P) / I0``. The variance is taken
     from second differences along detector rows, ``p[j-1] - 2 p[j] + p[j+1]``, whose variance is six times
-    that of a pixel. What all views have in common at a pixel is left out of them: a detector whose gains differ by
-    3 % has no more noise. It is estimated by the median absolute deviation, which edges disturb little. Structure can
-    only add to the variance, so the quietest bins of P give the noise.
+    that of a pixel. It is estimated by the median absolute deviation, which edges disturb little. Structure can only
+    add to the variance, so the quietest bins of P give the noise. So do gains of pixels, which all views have in
+    common: where each pixel's mean over the views is clearly a part of the variance, it is left out.
 
     Parameters
     ----------
@@ -45,16 +47,29 @@ def photons_per_ray(
     rows = max(1, -(-math.prod(some.shape) // _MOST))
     some = some[:, ::rows]
     some = torch.from_numpy(some.astype(np.float64)) if isinstance(some, np.ndarray) else some.double()
-    difference = _of_views(some[..., 3:-1] - 2 * some[..., 2:-2] + some[..., 1:-3]).abs()
-    if dimmed is not None:
-        # As if the pixels had the whole beam: what bins go by is the object alone.
-        difference *= torch.exp(-0.5 * torch.as_tensor(dimmed)[::rows, 2:-2].to(difference))
+    difference = some[..., 3:-1] - 2 * some[..., 2:-2] + some[..., 1:-3]
     # Bins go by the pixels beside the three: if they went by a pixel's own value, its noise would be sorted away.
     middle = 0.5 * (some[..., 4:] + some[..., :-4])
+    # As if the pixels had the whole beam: what bins go by is the object alone.
+    whole = torch.ones_like(difference[0])
+    if dimmed is not None:
+        whole = torch.exp(-0.5 * torch.as_tensor(dimmed)[::rows, 2:-2].to(difference))
+    (plain, error), (own, _) = (
+        _variance((kept * whole).abs(), middle) for kept in (difference, _of_views(difference))
+    )
+    variance = own if own < (1 - _CLEARLY * error) * plain else plain
+    return max(1.0, 1 / variance) if 0 < variance < math.inf else float("inf")
+
+
+def _variance(difference: torch.Tensor, middle: torch.Tensor) -> tuple[float, float]:
+    """Of an unattenuated ray, from second differences and the values that they lie among, and its relative error.
+
+    Infinity if they are too few.
+    """
     good = torch.isfinite(difference) & torch.isfinite(middle)
     difference, middle = difference[good], middle[good]
     if len(middle) < 4 * _BINS:
-        return float("inf")
+        return float("inf"), 1.0
     middle, order = middle.sort()
     rates = []
     for values, differences in zip(middle.tensor_split(_BINS), difference[order].tensor_split(_BINS)):
@@ -62,16 +77,13 @@ def photons_per_ray(
         # A broken detector may give values whose exponential no float can hold.
         level = min(max(_median(values), -_LARGEST_EXPONENT), _LARGEST_EXPONENT)
         rates.append(deviation**2 / math.exp(level))
-    variance = sorted(rates)[_BINS // 8]
-    return max(1.0, 1 / variance) if variance > 0 else float("inf")
+    return sorted(rates)[_BINS // 8], _OF_A_MEDIAN / math.sqrt(len(middle) / _BINS)
 
 
 def _of_views(values: torch.Tensor) -> torch.Tensor:
     """(views, rows, columns) less each pixel's mean over the views, of the same noise; NaN where there is one view."""
-    if len(values) < 2:
-        return values
     good = torch.isfinite(values)
-    count = good.sum(dim=0)
+    count = good.sum(dim=0, dtype=values.dtype)
     mean = torch.where(good, values, torch.zeros_like(values)).sum(dim=0) / count
     # As many as the mean takes of the variance are missing (Bessel).
     return (values - mean) * torch.sqrt(count / (count - 1))

@@ -2,7 +2,8 @@
 
 A count of 0 has no logarithm, but it tells that the ray is opaque. Without such rays metal may come out hollow where it
 is thickest, because only rays past it are left. So an opaque ray gets the logarithm of a small part of a photon. Its
-large noise gives it a small weight. A dead pixel counts 0 as well, but has light around it in most views.
+large noise gives it a small weight. A dead pixel counts 0 as well, but has light around it in most views, and stays
+where it is, while what metal hides moves over the detector.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from tomo_polysplat.parallel import run_tasks
+from tomo_polysplat.scan.shadows import moving_shadows
 
 __all__ = ["fill_opaque"]
 
@@ -51,6 +53,10 @@ def fill_opaque(values: np.ndarray, photons: float) -> int:
             found[number] = lightless & _surrounded(values[number], lightless, dark)
 
     run_tasks(look, [(number,) for number in range(len(values))])
+    if known:
+        for pieces, moving in zip(found, moving_shadows(values)):
+            if pieces is not None and moving is not None:
+                pieces |= moving
     for view, pieces in zip(values, found):
         if pieces is not None:
             without += np.isposinf(view)

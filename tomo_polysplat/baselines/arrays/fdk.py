@@ -19,7 +19,7 @@ def fdk(
     filter_name: str = "ram-lak",
     device: str = "cpu",
 ) -> np.ndarray:
-    """Feldkamp, Davis and Kress (1984, doi:10.1364/JOSAA.1.000612); ASTRA's FDK_CUDA on a GPU.
+    """Feldkamp, Davis and Kress (1984, doi:10.1364/JOSAA.1.000612); ASTRA's backprojection on a GPU.
 
     Parameters
     ----------
