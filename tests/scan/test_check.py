@@ -2,6 +2,7 @@
 
 import tracemalloc
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -105,14 +106,20 @@ def test_a_missing_logarithm(scan, change, word):
     assert set(found) == {"logarithm"} and word in found["logarithm"].text
 
 
+@cache
+def as_many_views_as_columns(scene, geometry):
+    scan = simulate_scan(scene, SIZE, 60, geometry=geometry)
+    assert scan.views == scan.columns
+    return scan
+
+
 @pytest.mark.parametrize("axes", [(0, 2), (1, 2)], ids=str)
 def test_swapped_axes(axes):
     """Only axes of equal length can be swapped without anything else noticing."""
     for scene, geometry in SCANS:
         if geometry == "fan" and 0 in axes:
             continue
-        scan = simulate_scan(scene, SIZE, 60, geometry=geometry)
-        assert scan.views == scan.columns
+        scan = as_many_views_as_columns(scene, geometry)
         found = defects(replace(scan, projections=scan.projections.swapaxes(*axes), valid=None))
         assert set(found) == {"order of axes"}, (scene, geometry)
         assert str(axes).strip("()") in found["order of axes"].remedy
