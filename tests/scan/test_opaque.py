@@ -163,6 +163,13 @@ def test_rays_clipped_to_one_value_are_opaque(limit):
     assert (told[darker][~same] == np.float32(-np.log(limit))).all()
 
 
+def test_rays_clipped_to_less_than_a_photon_keep_their_value():
+    projections, geometry, _, _ = rod(0.5)
+    value = np.float32(np.log(2.5 * 2e3))
+    told, counts = usable_rays(np.minimum(projections, value), geometry, None)
+    assert told.max() == value and 0.9 < counts["rays_opaque"] / np.isinf(projections).sum() <= 1
+
+
 def test_what_is_not_at_the_end_of_the_scale_stays_as_it_is():
     """Noise, plain values, few counts, detail that is bright, and data without noise."""
     projections, geometry, _, _ = rod(0.5)

@@ -13,7 +13,7 @@ import numpy as np
 from tomo_polysplat.scan.noise import photons_per_ray
 from tomo_polysplat.scan.opaque import fill_opaque, is_dark
 
-__all__ = ["fill_dark_end"]
+__all__ = ["dark_end", "fill_dark_end"]
 
 # Noise and detail repeat no value exactly: rays at the end are so many, this share of all at least, and this many
 # times as many as those of any other value among some of the largest. Counts of few photons do repeat.
@@ -26,6 +26,8 @@ _ONE_PHOTON = 1e-4
 def fill_dark_end(values: np.ndarray) -> int:
     """Give rays at the upper end of the scale that of opaque ones, in place, where no light can have come.
 
+    An end at less than a photon stays: it is as good a guess as that of opaque rays.
+
     Parameters
     ----------
     values : (views, rows, columns) float32 array
@@ -36,18 +38,29 @@ def fill_dark_end(values: np.ndarray) -> int:
     int
         How many there were; others at the end stay as they are.
     """
+    opaque, value = dark_end(values)
+    if opaque is None:
+        return 0
+    values[opaque] = value
+    return int(np.count_nonzero(opaque))
+
+
+def dark_end(values: np.ndarray) -> tuple[np.ndarray | None, float]:
+    """Which rays `fill_dark_end` gives which value; None where there are none. Parameters are its own."""
     ended, end = _at_the_end(values)
     if ended is None:
-        return 0
+        return None, end
     clipped = np.where(ended, np.float32(np.inf), values)
     # Without the rays at the end, which all have the same value, and so no noise.
     photons = photons_per_ray(clipped)
     if not is_dark(end, photons):
-        return 0
+        return None, end
     fill_opaque(clipped, photons)
     opaque = ended & np.isfinite(clipped)
-    values[opaque] = clipped[opaque]
-    return int(np.count_nonzero(opaque))
+    if not opaque.any():
+        return None, end
+    value = float(clipped[opaque][0])
+    return opaque, end if math.log(photons) <= end <= value else value
 
 
 def _at_the_end(values: np.ndarray) -> tuple[np.ndarray | None, float]:

@@ -9,7 +9,7 @@ import numpy as np
 from tomo_polysplat.scan.dropouts import dropped_rays
 from tomo_polysplat.scan.probes.finding import DEFECT, OK, Finding
 from tomo_polysplat.scan.probes.measured import Measured
-from tomo_polysplat.scan.scale_end import fill_dark_end
+from tomo_polysplat.scan.scale_end import dark_end
 from tomo_polysplat.scan.stuck import stuck_pixels
 
 __all__ = ["DEAD", "RAYS", "bad_rays", "probe_rays"]
@@ -95,9 +95,8 @@ def _starved(projections: np.ndarray, valid: np.ndarray, level: float) -> np.nda
 def _dark_end(projections: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Rays clipped to one value that a reconstruction takes for opaque."""
     values = np.where(valid, projections, np.nan).astype(np.float32).swapaxes(0, 1)
-    filled = values.copy()
-    fill_dark_end(filled)
-    return valid & (filled != values).swapaxes(0, 1)
+    opaque, _ = dark_end(values)
+    return np.zeros(valid.shape, bool) if opaque is None else opaque.swapaxes(0, 1)
 
 
 def _dead_pixels(projections: np.ndarray, valid: np.ndarray, level: float) -> np.ndarray:
