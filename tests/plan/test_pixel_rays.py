@@ -72,7 +72,7 @@ def test_the_loser_leaves_no_trace_of_itself():
         (False, {}, {}, "without metal"),
         (True, {"passes": 9.0}, {}, "in so few passes"),
         (True, {}, {"time_budget": 0.5}, "time budget"),
-        (True, {}, {"spectrum": None}, "without metal"),
+        (True, {}, {"spectrum": None}, "one energy"),
     ],
 )
 def test_nobody_asks_where_it_cannot_be_told(metal, changes, options, words):
