@@ -90,7 +90,7 @@ def test_the_right_model_leaves_noise():
     ) and found.within == pytest.approx(0.997, abs=0.003)
     assert found.rays == VIEWS * ROWS * COLUMNS
     assert np.abs(found.bias).mean() == pytest.approx(np.sqrt(2 / np.pi / VIEWS), rel=0.1), "normal means"
-    assert verdict(ball(), found)[0].startswith("The model explains the rays to 1 times their noise: 99.")
+    assert verdict(ball(), found)[0].startswith("The model explains the rays to 1.1 times their noise: 99.")
     assert verdict(ball(), found)[2] == "Nothing stands out that ought to be distrusted."
 
 
