@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -48,7 +49,7 @@ class Block:
         return ~(self.usable | np.isposinf(self.values))
 
 
-class _MadeWhenLookedAt(np.lib.mixins.NDArrayOperatorsMixin):
+class _MadeWhenLookedAt(np.lib.mixins.NDArrayOperatorsMixin, ABC):
     """An array (rows, views, columns) of which only what is looked at is ever made."""
 
     ndim = 3
@@ -98,8 +99,9 @@ class _MadeWhenLookedAt(np.lib.mixins.NDArrayOperatorsMixin):
         remedy = "change numpy.asarray of it, or pass valid="
         raise fail("projections", "no change of what stays where it is", "an assignment", remedy, TypeError)
 
+    @abstractmethod
     def _made(self, rows: np.ndarray, views: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        raise NotImplementedError
+        """What is where these rows, views and columns meet, each of them rising."""
 
 
 class Counts(_MadeWhenLookedAt):

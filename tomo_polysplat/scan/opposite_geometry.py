@@ -28,12 +28,8 @@ def opposite_rays_of(
 
     Parameters
     ----------
-    projections : (views, rows, columns) array
-        -log(I/I0); NaN for rays that are not to be used.
-    geometry : Geometry
-        As told.
-    valid : (views, rows, columns) bool array, optional
-        Rays to use, of those that are finite.
+    projections, geometry, valid
+        See `tomo_polysplat.scan.axis_offset.axis_offset`.
 
     Raises
     ------

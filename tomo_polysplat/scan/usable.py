@@ -69,7 +69,7 @@ def usable_rays(
     if proj_geom.get("type") == "cyl_cone_vec":
         # After resampling, a ray that uses any ray without light is infinite.
         values[np.isposinf(values)] = np.nan
-    if any(np.isposinf(view).any() for view in values) if counts["rays_not_finite"] else False:
+    if counts["rays_not_finite"] and any(np.isposinf(view).any() for view in values):
         counts["rays_opaque"] = fill_opaque(values, photons_per_ray(values))
         counts["rays_not_finite"] -= counts["rays_opaque"]
         used += counts["rays_opaque"]
