@@ -12,7 +12,7 @@ import os
 import pickle
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -22,7 +22,7 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
-__all__ = ["ALONE", "RankFailed", "Ranks", "current_ranks", "join", "join_here", "leave", "led_by"]
+__all__ = ["ALONE", "RankFailed", "Ranks", "current_ranks", "join", "join_here", "leave", "led_by", "part_of"]
 
 # Bytes of a message that travels at once; of a longer one the rest follows.
 _MESSAGE = 4096
@@ -73,10 +73,6 @@ class Ranks:
     _made: int = 0
     _gone: list[int] = field(default_factory=list)
     _broken: bool = False
-
-    def mine(self, length: int) -> slice:
-        """This rank's part of ``range(length)``; empty where there are too few for all."""
-        return slice(length * self.rank // self.count, length * (self.rank + 1) // self.count)
 
     def sum_(self, *tensors: torch.Tensor) -> None:
         """Add up contiguous tensors of one type over all ranks, in place."""
@@ -152,6 +148,16 @@ class Ranks:
                 dist.broadcast(tensors[-1], 0)
         return _Unpickler(io.BytesIO(body), tensors).load()
 
+    def send(self, tensors: Iterable[torch.Tensor], rank: int = 0) -> None:
+        """To one rank what it takes by `receive`."""
+        for tensor in filter(torch.Tensor.numel, tensors):
+            dist.send(tensor.detach().contiguous(), rank)
+
+    def receive(self, tensors: Iterable[torch.Tensor], rank: int = 0) -> None:
+        """From one rank, into contiguous tensors of the same shapes and types as those sent."""
+        for tensor in filter(torch.Tensor.numel, tensors):
+            dist.recv(tensor.detach(), rank)
+
     @contextmanager
     def together(self) -> Iterator[None]:
         """Make something that all ranks take part in.
@@ -222,6 +228,11 @@ class Ranks:
         return False
 
 
+def part_of(length: int, rank: int, count: int) -> slice:
+    """A rank's part of ``range(length)``; empty where there are too few for all."""
+    return slice(length * rank // count, length * (rank + 1) // count)
+
+
 ALONE = Ranks()
 _CURRENT: ContextVar[Ranks] = ContextVar("_CURRENT", default=ALONE)
 
@@ -255,7 +266,15 @@ def join(ranks: Ranks) -> None:
             timeout=_PATIENCE,
         )
         # NCCL connects when it is first used, which would otherwise be beside a graph that is recorded.
-        dist.all_reduce(torch.zeros(1, device=ranks.device))
+        one = torch.zeros(1, device=ranks.device)
+        dist.all_reduce(one)
+        for other in range(1, ranks.count):
+            if ranks.rank == 0:
+                ranks.send([one], other)
+                ranks.receive([one], other)
+            elif ranks.rank == other:
+                ranks.receive([one])
+                ranks.send([one])
 
 
 def join_here(ranks: Ranks) -> None:
