@@ -225,7 +225,7 @@ def test_runs_that_share_memory_step_as_if_alone(every):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("place", ["_of_rays", "_volume_gradients", "_update"])
+@pytest.mark.parametrize("place", ["_of_portion", "_volume_gradients", "_update"])
 def test_a_gpu_without_room_for_a_second_run_goes_on_with_the_first(place, monkeypatch):
     """Wherever in the recording it ends; torch can then give memory back and record again."""
     from tomo_polysplat.fit.choose_step import NoRoom
@@ -263,7 +263,7 @@ def test_a_recording_that_is_invalidated_leaves_torch_in_order():
     with pytest.MonkeyPatch.context() as patch:
         do = GraphStep._update
         # To wait for a stream that is recorded is forbidden, and ends the recording.
-        patch.setattr(GraphStep, "_update", lambda step, made: (do(step, made), made.scale.cpu()))
+        patch.setattr(GraphStep, "_update", lambda step, *made: (do(step, *made), made[0][0].cpu()))
         assert isinstance(make_step(fit_problem("cone", True, "cuda", "triton"), batch=BATCH), EagerStep)
     torch.cuda.empty_cache()
     assert isinstance(make_step(fit_problem("cone", True, "cuda", "triton"), batch=BATCH), GraphStep)

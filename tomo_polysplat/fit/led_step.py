@@ -72,11 +72,11 @@ class LedStep:
         self._let_go = weakref.finalize(self, ranks.let_go, self._number)
         self._let_go.atexit = False
         beside = self._beside()
-        views = rays.views
+        views, counts = rays.views, [len(part) for part in self._parts]
         about = {
             # None of them, for their kinds.
             "gaussians": gaussians.select(self._parts[0][:0]),
-            "counts": [len(part) for part in self._parts],
+            "counts": counts,
             "planes": self._planes,
             "spacing": setup.spacing,
             "rays": (rays.photons, rays.model_error, rays.held_out, rays.dimmed),
@@ -92,7 +92,7 @@ class LedStep:
         own = Gaussians(
             **gaussians.select(self._parts[0]).each(), **{k: getattr(gaussians, k).clone() for k in OF_ALL}
         ).copy()
-        part = Part(ranks, self._planes[0], gaussians.position.device)
+        part = Part(ranks, self._planes[0], max(counts), gaussians.position.device)
         shared: Step | None = None if beside is None else beside._own
         try:
             self._own: Step = self._make(setup._replace(gaussians=own), self._batch, ranks, shared, part)

@@ -77,7 +77,7 @@ def first_gaussians(
         projections=values.nbytes if values.device.type == device.type else 0,
     )
     if (ranks := current_ranks().count) > 1:
-        memory = f"on each of {ranks} devices {memory}"
+        memory = f"on the first of {ranks} devices {memory}"
     return gaussians, {
         "gaussians": (len(gaussians), kinds),
         "work": ("", work(plan, problem, settings, len(gaussians))),
@@ -117,15 +117,14 @@ def _runs(plan: Plan) -> int:
 
 
 def _all_else(plan: Plan, problem: Problem, device: torch.device) -> dict[str, int]:
-    """What memory is needed for besides Gaussians, as `fit.memory` asks, on each of the ranks that share the steps."""
-    ranks, (planes, *slice_shape) = current_ranks().count, problem.grid.shape
-    if ranks > 1 and device.type == "cuda":
-        # A slab each, with the planes beside it.
-        planes = min(-(-planes // ranks) + 2, planes)
+    """What memory is needed for besides Gaussians, as `fit.memory` asks: on each rank all images of a step and all voxels.
+
+    A rank makes the voxels that its Gaussians reach, which may be all.
+    """
     rays = _runs(plan) * plan.pixel_rays**2 if plan.pixel_rays else 1 + AVERAGED_RAYS**2
     return {
-        "views": -(-plan.views_per_step // ranks),
+        "views": plan.views_per_step,
         "pixels": rays * problem.geometry.rows * problem.geometry.columns,
-        "voxels": planes * math.prod(slice_shape),
+        "voxels": math.prod(problem.grid.shape),
         "runs": _runs(plan),
     }
