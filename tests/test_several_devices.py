@@ -118,6 +118,20 @@ class TestThreeProcesses:
         shared, one = reconstruct(cone(), settings=settings), alone(cone(), settings=settings)
         assert same(shared.volume, one.volume) and not same(shared.volume, before.volume)
 
+    def test_hold_others_when_gaussians_have_changed_places(self, three, monkeypatch):
+        """With the optimiser's memory of them: from then on each rank's are those of another one."""
+        end = Fitter._end_pass
+
+        def turned_over(self, share):
+            told = end(self, share)
+            self.gaussians.position[:, 2] *= -1
+            return told
+
+        settings = ROUGH | {"passes": 1.4, "relocated": 0.0}
+        monkeypatch.setattr(Fitter, "_end_pass", torch.no_grad()(turned_over))
+        shared, one = reconstruct(cone(), settings=settings), alone(cone(), settings=settings)
+        assert same(shared.volume, one.volume)
+
     def test_stand_still_after_ctrl_c_within_a_step(self, three, monkeypatch):
         """The last thing that they do: the best state is returned, and nothing more is asked of them."""
         step, made = EagerStep.__call__, []

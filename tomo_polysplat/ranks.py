@@ -151,12 +151,12 @@ class Ranks:
     def send(self, tensors: Iterable[torch.Tensor], rank: int = 0) -> None:
         """To one rank what it takes by `receive`."""
         for tensor in filter(torch.Tensor.numel, tensors):
-            dist.send(tensor.detach().contiguous(), rank)
+            _wait_for(dist.isend, tensor.detach().contiguous(), rank)
 
     def receive(self, tensors: Iterable[torch.Tensor], rank: int = 0) -> None:
         """From one rank, into contiguous tensors of the same shapes and types as those sent."""
         for tensor in filter(torch.Tensor.numel, tensors):
-            dist.recv(tensor.detach(), rank)
+            _wait_for(dist.irecv, tensor.detach(), rank)
 
     @contextmanager
     def together(self) -> Iterator[None]:
@@ -228,6 +228,12 @@ class Ranks:
         return False
 
 
+def _wait_for(what: Any, tensor: torch.Tensor, rank: int) -> None:
+    # As a batch: NCCL goes through the connections that there are, in place of new ones of two ranks with buffers.
+    for work in dist.batch_isend_irecv([dist.P2POp(what, tensor, rank)]):
+        work.wait()
+
+
 def part_of(length: int, rank: int, count: int) -> slice:
     """A rank's part of ``range(length)``; empty where there are too few for all."""
     return slice(length * rank // count, length * (rank + 1) // count)
@@ -266,15 +272,7 @@ def join(ranks: Ranks) -> None:
             timeout=_PATIENCE,
         )
         # NCCL connects when it is first used, which would otherwise be beside a graph that is recorded.
-        one = torch.zeros(1, device=ranks.device)
-        dist.all_reduce(one)
-        for other in range(1, ranks.count):
-            if ranks.rank == 0:
-                ranks.send([one], other)
-                ranks.receive([one], other)
-            elif ranks.rank == other:
-                ranks.receive([one])
-                ranks.send([one])
+        dist.all_reduce(torch.zeros(1, device=ranks.device))
 
 
 def join_here(ranks: Ranks) -> None:

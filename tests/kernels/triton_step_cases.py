@@ -221,6 +221,11 @@ def _stepped(kind, device, count, changes):
 def _of_rank(problem, rank, index, planes):
     from tomo_polysplat.fit.fused_step import FusedStep
 
-    part = Part(Ranks(rank, len(planes)), planes[rank], len(problem.gaussians) // len(planes), problem.gaussians.position.device)
+    part = Part(
+        Ranks(rank, len(planes)),
+        planes[rank],
+        len(problem.gaussians) // len(planes),
+        problem.gaussians.position.device,
+    )
     own = problem.gaussians.select(index).copy()
     return FusedStep(problem._replace(gaussians=own), BATCH, part)

@@ -214,7 +214,7 @@ class FusedStep:
         lent: tuple[torch.Tensor, ...] = ()
         if smooth:
             with self._beside():
-                voxels = self._voxelised(*drawn, output)
+                voxels = self._voxelised((*drawn, output))
                 if part is not None:
                     lent = (part.lent(voxels[1][0]),)
                 else:
@@ -297,7 +297,7 @@ class FusedStep:
     def _join(self) -> None:
         """Wait for what is made there."""
 
-    def _voxelised(self, *drawn: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _voxelised(self, drawn: _Drawn) -> tuple[torch.Tensor, torch.Tensor]:
         """Ellipsoids and their volume (1, nz, ny, nx), of the rank's planes."""
         record = ellipsoids(*drawn, self._box_table, VOXEL_CUTOFF)
         return record, box_forward.splat(record, 1, self._box, VOXEL_CUTOFF, self._largest[1])

@@ -108,7 +108,8 @@ class GraphStep(FusedStep):
 
     def _recorded(self, smooth: float, stream: torch.cuda.Stream) -> _Recorded:
         """A step as one graph, or as several between which ranks add up what they have made."""
-        stages, graphs = self._stages(smooth), []
+        stages = self._stages(smooth)
+        graphs: _Recorded = []
         while not graphs or graphs[-1][1]:
             graphs.append(self._captured(lambda: next(stages, ()), stream))
         return graphs

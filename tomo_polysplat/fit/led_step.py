@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.fit.setup import FitSetup
-from tomo_polysplat.fit.shares import Part, Planes, fit_in, parted, planes_of_all
+from tomo_polysplat.fit.shares import Part, fit_in, parted, planes_of_all
 from tomo_polysplat.fit.step import Moments, Step
 from tomo_polysplat.model.gaussians import OF_ALL, Gaussians
 from tomo_polysplat.ranks import Ranks

@@ -44,7 +44,7 @@ def weighted_huber(
 def roughness(
     gaussians: Gaussians, scene: FitScene, settings: Settings, part: Part | None = None
 ) -> torch.Tensor:
-    """Total variation of the volume; with a rank's ``part`` of the fit, that of its planes in the volume of all ranks."""
+    """Total variation of the volume; with a rank's ``part`` of the fit, that of its planes in the sum over ranks."""
     chosen = settings.tv_clip, scene.tv_corners, settings.bone_level
     if part is None:
         return total_variation(scene.attenuation(gaussians, scene.box), *chosen)

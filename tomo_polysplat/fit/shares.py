@@ -1,7 +1,7 @@
 """What each of several ranks holds of a fit: the Gaussians of a slab of z, and the planes of the volume they reach.
 
-Images and volumes are sums over Gaussians. So each rank makes those of its own, they are added up, and each goes on from
-the sum to the gradients of its own. Of volumes only the planes that several ranks reach have to be added up.
+Images and volumes are sums over Gaussians. So each rank makes those of its own, they are added up, and each goes on
+from the sum to the gradients of its own. Of volumes only the planes that several ranks reach have to be added up.
 """
 
 from __future__ import annotations
@@ -73,7 +73,9 @@ def planes_of_all(gaussians: Gaussians, parts: Sequence[torch.Tensor], box: Voxe
     return [Planes(each, np.flatnonzero(made > 1)) for each in own]
 
 
-def fit_in(gaussians: Gaussians, parts: Sequence[torch.Tensor], box: VoxelBox, held: Sequence[Planes]) -> bool:
+def fit_in(
+    gaussians: Gaussians, parts: Sequence[torch.Tensor], box: VoxelBox, held: Sequence[Planes]
+) -> bool:
     """Whether no Gaussian reaches beyond the planes of its part."""
     return all(
         max(now.start - 1, 0) >= planes.own.start and min(now.stop + 1, box.shape[0]) <= planes.own.stop

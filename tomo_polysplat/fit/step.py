@@ -49,9 +49,11 @@ class Step(Protocol):
     """
 
     pull: torch.Tensor
-    moments: Moments
     done: int
     largest: list[float]
+
+    @property
+    def moments(self) -> Moments: ...
 
     def __call__(self, views: np.ndarray, share: float) -> None:
         """Step towards the rays of these views and a smooth volume; ``share`` of the run is done, 0 to 1."""

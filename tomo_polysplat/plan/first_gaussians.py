@@ -117,9 +117,9 @@ def _runs(plan: Plan) -> int:
 
 
 def _all_else(plan: Plan, problem: Problem, device: torch.device) -> dict[str, int]:
-    """What memory is needed for besides Gaussians, as `fit.memory` asks: on each rank all images of a step and all voxels.
+    """What memory is needed for besides Gaussians, as `fit.memory` asks.
 
-    A rank makes the voxels that its Gaussians reach, which may be all.
+    On each rank that is for all images of a step, and the voxels that its Gaussians reach, which may be all.
     """
     rays = _runs(plan) * plan.pixel_rays**2 if plan.pixel_rays else 1 + AVERAGED_RAYS**2
     return {
