@@ -102,6 +102,13 @@ class TestThreeProcesses:
         shared, one = reconstruct(cone(), settings=settings), alone(cone(), settings=settings)
         assert "returned" not in one.plan and same(shared.volume, one.volume)
 
+    def test_compare_whole_images_where_similarity_is_asked_for(self, three):
+        """Which are those of all Gaussians on each."""
+        settings = ROUGH | {"ssim_weight": 0.3, "passes": 1.0}
+        shared, one = reconstruct(cone(), settings=settings), alone(cone(), settings=settings)
+        plain = alone(cone(), settings=settings | {"ssim_weight": 0.0})
+        assert same(shared.volume, one.volume) and not same(plain.volume, one.volume)
+
     def test_all_see_rays_that_change_during_a_run(self, three, monkeypatch):
         """As those of which gains or drift are taken out between two passes."""
         end = Fitter._end_pass

@@ -79,7 +79,7 @@ class Ranks:
         if self.count == 1:
             return
         if sum(tensor.numel() for tensor in tensors) > _LARGE:
-            for tensor in tensors:
+            for tensor in filter(torch.Tensor.numel, tensors):
                 dist.all_reduce(tensor)
             return
         flat = torch.cat([tensor.reshape(-1) for tensor in tensors])
