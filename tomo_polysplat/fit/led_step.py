@@ -89,9 +89,9 @@ class LedStep:
         }
         ranks.tell("make", self._number, _lent(rays.projections, ranks), about)
         self._hand_out(list(gaussians.each().values()))
-        own = Gaussians(
-            **gaussians.select(self._parts[0]).each(), **{k: getattr(gaussians, k).clone() for k in OF_ALL}
-        ).copy()
+        with torch.no_grad():
+            common = {name: getattr(gaussians, name).clone() for name in OF_ALL}
+            own = Gaussians(**gaussians.select(self._parts[0]).each(), **common)
         part = Part(ranks, self._planes[0], max(counts), gaussians.position.device)
         shared: Step | None = None if beside is None else beside._own
         try:
