@@ -158,6 +158,17 @@ class TestThreeProcesses:
             reconstruct(cone())
 
 
+@pytest.mark.gpu
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="there is one GPU at most")
+@pytest.mark.parametrize("scan", [cone, fan])
+def test_two_gpus_make_the_volume_of_one(scan):
+    shared, one = (
+        reconstruct(scan(), settings=ROUGH, **on) for on in ({"devices": [0, 1]}, {"device": "cuda:0"})
+    )
+    assert shared.plan["ranks"].value == 2
+    assert relative(shared.volume, one.volume) < SMOOTHED
+
+
 def test_a_process_that_dies_ends_the_run_and_its_checkpoint_goes_on_in_one(tmp_path):
     path, killed = tmp_path / "fit.npz", []
 
