@@ -16,6 +16,7 @@ from small_scans import QUICK, cone, fan, reconstruct
 
 import tomo_polysplat as tps
 from tomo_polysplat.fit.fitter import Fitter
+from tomo_polysplat.fit.led_step import LedStep
 from tomo_polysplat.fit.step import EagerStep
 from tomo_polysplat.rank_processes import devices_of, sharing
 from tomo_polysplat.ranks import ALONE, RankFailed, current_ranks, led_by, part_of
@@ -135,9 +136,11 @@ class TestThreeProcesses:
             return told
 
         settings = ROUGH | {"passes": 1.4, "relocated": 0.0}
+        anew, made = LedStep._anew, []
+        monkeypatch.setattr(LedStep, "_anew", lambda step: (made.append(1), anew(step)))
         monkeypatch.setattr(Fitter, "_end_pass", torch.no_grad()(turned_over))
         shared, one = reconstruct(cone(), settings=settings), alone(cone(), settings=settings)
-        assert same(shared.volume, one.volume)
+        assert same(shared.volume, one.volume) and made
 
     def test_stand_still_after_ctrl_c_within_a_step(self, three, monkeypatch):
         """The last thing that they do: the best state is returned, and nothing more is asked of them."""

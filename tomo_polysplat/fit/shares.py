@@ -19,9 +19,10 @@ from tomo_polysplat.render.renderer import VOXEL_CUTOFF
 
 __all__ = ["Part", "Planes", "fit_in", "parted", "planes_of_all", "reached"]
 
-# How far Gaussians may get on from when planes were chosen for them: in planes, and as a factor of their deviations.
-# What reaches beyond is still seen by the rays, but not smoothed there; once a pass planes are chosen anew if need be.
-_WANDERED, _WIDENED = 4, 1.5
+# How far Gaussians and borders may get on from when planes were chosen for them: in planes, as a share of all planes,
+# and as a factor of deviations. What reaches beyond is still seen by the rays, but not smoothed there; once a pass
+# planes are chosen anew if need be.
+_WANDERED, _OF_ALL, _WIDENED = 4, 1 / 32, 1.5
 
 
 def parted(gaussians: Gaussians, count: int) -> list[torch.Tensor]:
@@ -65,7 +66,7 @@ def planes_of_all(gaussians: Gaussians, parts: Sequence[torch.Tensor], box: Voxe
     """Those of each rank, with room for what its Gaussians may come to reach until planes are chosen anew."""
     depth, made = box.shape[0], np.zeros(box.shape[0], int)
     # One more: differences of neighbouring planes take those beside the ones that are reached.
-    wide = _WANDERED + 1
+    wide = max(_WANDERED, round(_OF_ALL * depth)) + 1
     own = []
     for part in reached(gaussians, parts, box, _WIDENED):
         own.append(slice(max(part.start - wide, 0), min(part.stop + wide, depth)))
