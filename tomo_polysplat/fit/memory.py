@@ -31,9 +31,10 @@ __all__ = [
 logger = logging.getLogger(__name__)
 
 # Bytes a Gaussian takes: 330 for parameters, moments, the best copy, pull and no smoothing's gradients, and what a step
-# makes of it on its way; its footprint and sums in each view of a step; and what ranks add up, kept between graphs
-# (2.8e6 Gaussians, 192^3 voxels and 6 views a step on an H100: 330 and, with the footprints of three views, 780).
-_GAUSSIAN, _FOOTPRINT, _ADDED_UP = 680, 144, 110
+# makes of it on its way; its footprint and sums in each view of a step (2.8e6 Gaussians, 192^3 voxels and 6 views a
+# step on an H100: 330 and, with the footprints of three views, 780). Of several ranks each has these of its part, and
+# the first one between passes parameters, moments, pull, the best copy and a place in a part of all of them.
+_GAUSSIAN, _FOOTPRINT, _WHOLE = 680, 144, 220
 # Bytes a pixel of a step takes: image and gradient of four channels, projections and their slopes.
 _PIXEL = 48
 # Bytes a voxel takes at once, by torch's own count on 40^3 to 64^3 (tests/fit/test_counted_memory.py): while a start is
@@ -209,7 +210,7 @@ def room_for_gaussians(device: torch.device, *, views: int, pixels: int, voxels:
         return math.inf
     left = max(_SHARE * free - sum(_of_all(views, pixels, voxels, runs, device).values()), 0.0)
     few = left / (runs * _of_a_gaussian(views))
-    if few < MANY or device.type == "cpu":
+    if few < _many() or device.type == "cpu":
         return few
     return left / (runs * _of_a_gaussian(min(views, FEW_VIEWS)))
 
@@ -235,18 +236,23 @@ def told_of_lack() -> Iterator[None]:
 
 
 def _of_gaussians(count: int, views: int, runs: int, device: torch.device) -> int:
-    """Bytes of so many Gaussians in each run."""
+    """Bytes of so many Gaussians in each run, on the first rank."""
     whole = runs * count * _of_a_gaussian(views)
     if device.type == "cpu":
-        return whole
+        return math.ceil(whole)
     # A GPU holds the footprints of fewer views at once of a large cloud, which may have grown from a smaller one.
     few = runs * count * _of_a_gaussian(min(views, FEW_VIEWS))
-    return max(few, min(whole, runs * MANY * _of_a_gaussian(views)))
+    return math.ceil(max(few, min(whole, runs * _many() * _of_a_gaussian(views))))
 
 
-def _of_a_gaussian(views: int) -> int:
-    added_up = _ADDED_UP if current_ranks().count > 1 else 0
-    return _GAUSSIAN + _FOOTPRINT * views + added_up
+def _many() -> int:
+    """How many Gaussians of all ranks make a large cloud on each."""
+    return MANY * current_ranks().count
+
+
+def _of_a_gaussian(views: int) -> float:
+    ranks = current_ranks().count
+    return (_WHOLE if ranks > 1 else 0) + (_GAUSSIAN + _FOOTPRINT * views) / ranks
 
 
 def _of_all(views: int, pixels: int, voxels: int, runs: int, device: torch.device) -> dict[str, int]:

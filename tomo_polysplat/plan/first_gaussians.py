@@ -75,11 +75,11 @@ def first_gaussians(
     memory = require_room(
         device,
         gaussians=many,
-        **_all_else(plan, problem, device, runs),
+        **_all_else(plan, problem, runs),
         projections=values.nbytes if values.device.type == device.type else 0,
     )
     if (ranks := current_ranks().count) > 1:
-        memory = f"on each of {ranks} devices {memory}"
+        memory = f"on the first of {ranks} devices {memory}"
     return gaussians, {
         "gaussians": (len(gaussians), kinds),
         "work": ("", work(plan, problem, settings, len(gaussians))),
@@ -97,7 +97,7 @@ def room_to_grow(gaussians: int, plan: Plan, problem: Problem, device: torch.dev
     problem : Problem
     device : torch.device
     """
-    room = room_for_gaussians(device, **_all_else(plan, problem, device, _runs(plan)))
+    room = room_for_gaussians(device, **_all_else(plan, problem, _runs(plan)))
     room /= _GROWING if _runs(plan) == 1 else 1.0
     if device.type != "cpu":
         room = min(room, _OF_SEEDS * most_seeds(problem))
@@ -117,7 +117,7 @@ def room_for_seeds(views: int, problem: Problem, device: torch.device) -> float:
 
 def why_one_run(gaussians: int, plan: Plan, problem: Problem, device: torch.device) -> str:
     """Why no second run is made beside the first, to ask the rays which of two models explains them, if so."""
-    needed = _all_else(plan, problem, device, _runs(plan))
+    needed = _all_else(plan, problem, _runs(plan))
     if has_room(device, gaussians=gaussians, **needed):
         return ""
     return "there is no room on the GPU for a second run beside it"
@@ -137,18 +137,17 @@ def _runs(plan: Plan) -> int:
     return 1 if plan.pixel_rays and plan.fat is not None else 2
 
 
-def _all_else(plan: Plan, problem: Problem, device: torch.device, runs: int) -> dict[str, int]:
-    """What memory is needed for besides Gaussians, as `fit.memory` asks, on each of the ranks that share the steps."""
-    ranks, (planes, *slice_shape) = current_ranks().count, problem.grid.shape
-    if ranks > 1 and device.type == "cuda":
-        # A slab each, with the planes beside it.
-        planes = min(-(-planes // ranks) + 2, planes)
+def _all_else(plan: Plan, problem: Problem, runs: int) -> dict[str, int]:
+    """What memory is needed for besides Gaussians, as `fit.memory` asks.
+
+    On each rank that is for all images of a step, and the voxels that its Gaussians reach, which may be all.
+    """
     rays = runs * (plan.pixel_rays or 1) ** 2
     if runs > 1 and not plan.pixel_rays:
         rays = 1 + AVERAGED_RAYS**2
     return {
-        "views": -(-plan.views_per_step // ranks),
+        "views": plan.views_per_step,
         "pixels": rays * problem.geometry.rows * problem.geometry.columns,
-        "voxels": planes * math.prod(slice_shape),
+        "voxels": math.prod(problem.grid.shape),
         "runs": runs,
     }
