@@ -13,6 +13,7 @@ PACKAGE = Path(__file__).parents[1] / "tomo_polysplat"
 # Functions whose calls are the way of a scan; see `way`.
 STAGES = (
     ("reconstruction.py", "reconstruct"),
+    ("reconstruction.py", "_problem"),
     ("plan/solver.py", "solve"),
     ("plan/preparation.py", "prepare"),
     ("plan/solver.py", "_fit"),
