@@ -39,6 +39,7 @@ _MOST_STEPS = 1e10
 _AT_ONCE = {"cuda": 1 << 28, "cpu": 1 << 22}
 
 
+# A scan, its first volume and how that was made: nothing else holds these together.
 def bridged_start(
     values: torch.Tensor,
     volume: torch.Tensor,
