@@ -16,7 +16,7 @@ logger = logging.getLogger(__name__)
 FILTER_REMEDY = (
     "write a material and its thickness with a unit, such as 'Al 1mm' or 'Al 0.5mm + Cu 0.1mm', or 'none'"
 )
-_NUMBER = r"(?P<size>\d+(?:[.,]\d+)?)\s*(?P<unit>mm|um|µm|cm)"
+_NUMBER = r"(?P<size>\d+(?:[.,]\d+)?)\s*(?P<unit>mm|um|[µ\u03bc]m|cm)"
 _NAME = r"(?P<name>[A-Za-z][A-Za-z0-9 ]*?)"
 _EITHER = (re.compile(rf"{_NAME}\s*[:=]?\s*{_NUMBER}"), re.compile(rf"{_NUMBER}\s*(?:of\s+)?{_NAME}"))
 _BARE = re.compile(r"(?P<name>[^:]+):(?P<size>[^:]+)")
@@ -41,7 +41,7 @@ def filters_of(text: str) -> dict[str, float] | None:
         match = next((m for pattern in _EITHER if (m := pattern.fullmatch(one))), None)
         if match is None:
             return None
-        name, unit = match["name"].strip(), match["unit"].replace("µ", "u")
+        name, unit = match["name"].strip(), match["unit"].replace("µ", "u").replace("\u03bc", "u")
         try:
             composition(name)
         except ValueError:
