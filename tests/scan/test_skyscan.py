@@ -176,7 +176,9 @@ def written_again(folder, replace, encoding="utf-8"):
 def test_logs_of_another_country_say_the_same(folder, encoding):
     """Decimal commas, and paths of letters that are not ASCII, in what a Windows program may write."""
     exact = tps.load_scan(folder)
-    written_again(folder, lambda text: text.replace(".", ",").replace("[Acq", "User=Núria µ\r\n[Acq"), encoding)
+    written_again(
+        folder, lambda text: text.replace(".", ",").replace("[Acq", "User=Núria µ\r\n[Acq"), encoding
+    )
     scan = tps.load_scan(folder)
     np.testing.assert_array_equal(scan.proj_geom["Vectors"], exact.proj_geom["Vectors"])
     assert scan.notes["scanner"]["tube_kv"] == "90.0" and scan.notes["scanner"]["filter"] == "1 mm Al"

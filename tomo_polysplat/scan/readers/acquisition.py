@@ -77,7 +77,9 @@ def _tilted(geometry: Geometry, degrees: float) -> Geometry:
         along = (vectors * right).sum(axis=1, keepdims=True) * right
         return along + cosine * (vectors - along) - sine * np.cross(right, vectors)
 
-    u, v, corner, origin = (turned(part) for part in (geometry.u, geometry.v, geometry.corner, geometry.origin))
+    u, v, corner, origin = (
+        turned(part) for part in (geometry.u, geometry.v, geometry.corner, geometry.origin)
+    )
     return replace(geometry, origin=origin, corner=corner, u=u, v=v)
 
 

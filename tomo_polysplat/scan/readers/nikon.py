@@ -117,7 +117,9 @@ def _degrees(text: IniText, folder: Path, numbers: np.ndarray) -> tuple[np.ndarr
     for file in _angle_files(folder):
         measured = _measured(file)
         if len(measured) <= numbers[-1]:
-            said.append(f"{file.name} has {len(measured)} angles for {len(numbers)} pictures: even steps are taken")
+            said.append(
+                f"{file.name} has {len(measured)} angles for {len(numbers)} pictures: even steps are taken"
+            )
             break
         from_first = np.rad2deg(np.unwrap(np.deg2rad(measured[numbers])))
         from_first -= from_first[0]
