@@ -49,6 +49,21 @@ def test_arguments_say_what_the_toml_file_says(bare, folder):
     assert scan.spectrum is None  # the tube stands in the file only
 
 
+def test_pictures_that_are_missing_are_said(bare):
+    names = sorted(file.name for file in bare.iterdir())
+    (bare / [name for name in names if name.startswith("proj")][7]).unlink()
+    gap = " | ".join(tps.load_scan(bare, scanner=STATED).notes["scanner"]["guessed"])
+    assert "the numbers of the pictures jump (6 to 8): steps are taken to be even" in gap
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_toml_file_of_a_windows_program(bare, folder, encoding):
+    told = tps.load_scan(folder)
+    text = (folder / "scan.toml").read_text()
+    (bare / "scan.toml").write_bytes(text.replace("\n", "\r\n").encode(encoding))
+    np.testing.assert_array_equal(tps.load_scan(bare).proj_geom["Vectors"], told.proj_geom["Vectors"])
+
+
 def test_pictures_sorted_into_folders_and_angles_from_a_file(tmp_path):
     pictures = pictures_of(marked())
     for name, frames in (

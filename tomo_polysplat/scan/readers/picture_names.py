@@ -28,8 +28,22 @@ PICTURE_SUFFIXES = (*TIFF_SUFFIXES, ".npy", ".edf")
 _MOST_GAPS = 3
 # Words in a name that make a picture, or a folder of them, a flat or a dark one, or one with the object.
 _WORDS = {
-    "flats": ("flat", "flats", "white", "whites", "open", "bright", "ref", "gain", "ff", "i0"),
-    "darks": ("dark", "darks", "dk", "df", "background"),
+    "flats": (
+        *(
+            "flat",
+            "flats",
+            "flatfield",
+            "white",
+            "whites",
+            "whitefield",
+            "open",
+            "openbeam",
+            "bright",
+            "brightfield",
+        ),
+        *("ref", "refs", "reference", "gain", "ff", "i0", "io", "blank", "blanks"),
+    ),
+    "darks": ("dark", "darks", "darkfield", "darkcurrent", "dk", "df", "di", "offset", "background"),
     "projections": ("projections", "projection", "proj", "projs", "data", "tomo", "images", "raw"),
 }
 

@@ -12,7 +12,13 @@ import numpy as np
 from tomo_polysplat.checks import fail
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup
 from tomo_polysplat.scan.readers.picture_files import frames_of
-from tomo_polysplat.scan.readers.picture_names import PICTURE_SUFFIXES, has_word, named_files, pictures_in
+from tomo_polysplat.scan.readers.picture_names import (
+    PICTURE_SUFFIXES,
+    gaps_in,
+    has_word,
+    named_files,
+    pictures_in,
+)
 from tomo_polysplat.scan.readers.stated import read_toml, require_known, stated_over
 
 __all__ = ["full_turn", "guessed", "read", "recognises", "written_beside"]
@@ -42,6 +48,11 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     frames = frames_of(files["projections"])
     known |= {name: files[name] for name in ("flats", "darks") if files[name]}
     told = Acquisition(KIND, frames, full_turn(frames.shape[0]), folder.name, other=other)
+    if "degrees" not in known and (gaps := gaps_in(files["projections"])):
+        told = told.saying(
+            f"the numbers of the pictures jump ({gaps}): steps are taken to be even over those that are there; give "
+            "degrees="
+        )
     return guessed(stated_over(told, known, folder), known)
 
 

@@ -204,9 +204,10 @@ def _drift(log: IniText) -> list[str]:
     table = log.text("TS modified according to").replace("\\", "/").split("/")[-1]
     if not table:
         return []
+    far = f"at most {most[0] or '?'} rows and {most[1] or '?'} columns"
     return [
-        f"the pictures have moved, by at most {most[0] or '?'} rows and {most[1] or '?'} columns ({table}), which is not "
-        "undone; reconstruct with align=True (--align), which finds it"
+        f"the pictures have moved, by {far} ({table}), which is not undone; reconstruct with align=True (--align), "
+        "which finds it"
     ]
 
 

@@ -49,7 +49,7 @@ class XrmFrames:
         sides = picture_size(file)
         told = file.number(kind, "<i4")
         if told is None and names and 0 < sides[0] < _MOST_SIDE and 0 < sides[1] < _MOST_SIDE:
-            told = _USUAL.get((file.size(names[0]) or 0) / (sides[0] * sides[1]))
+            told = _USUAL.get((file.size(names[0]) or 0) // (sides[0] * sides[1]))
         if not names or not all(0 < side < _MOST_SIDE for side in sides) or told not in _TYPES:
             got = f"{len(names)} of {sides[0]} x {sides[1]} pixels of type {told} in {file.path}"
             raise fail("path", "pictures of numbers", got, "name the .txrm file of the projections")
