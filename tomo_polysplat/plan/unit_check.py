@@ -28,7 +28,7 @@ _ATTENUATES, _DARKER = 0.1, 95.0
 _VIEWS = 24
 # Of the hardening by a solid of its density, what light matter shows whose density is told ten times too high, if it is
 # even: 0.05 to 0.2. Solids show more.
-_LIGHT = 0.18
+_LIGHT = 0.2
 _WRONG_LENGTHS = "The unit of length or the size of a pixel looks wrong"
 
 
