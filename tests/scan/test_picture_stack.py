@@ -49,6 +49,13 @@ def test_arguments_say_what_the_toml_file_says(bare, folder):
     assert scan.spectrum is None  # the tube stands in the file only
 
 
+def test_a_pixel_of_another_unit_goes_around_the_source(bare):
+    with pytest.raises(ValueError, match=r"pixel: expected a detector within 130 degrees.*one unit"):
+        tps.load_scan(bare, scanner=STATED | {"pixel": 1600.0})
+    wide = tps.load_scan(bare, scanner=STATED | {"pixel": 16.0, "offset": (0.0, 0.0)})
+    assert "the source sees the detector under 100 degrees" in " | ".join(wide.notes["scanner"]["guessed"])
+
+
 def test_pictures_that_are_missing_are_said(bare):
     names = sorted(file.name for file in bare.iterdir())
     (bare / [name for name in names if name.startswith("proj")][7]).unlink()
