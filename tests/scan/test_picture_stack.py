@@ -63,6 +63,12 @@ def test_pictures_that_are_missing_are_said(bare):
     assert "the numbers of the pictures jump (6 to 8): steps are taken to be even" in gap
 
 
+def test_angles_that_are_stated_stand_over_the_arc_of_the_file(folder):
+    told = tps.load_scan(folder)
+    scan = tps.load_scan(folder, scanner={"degrees": np.arange(48) * 7.5})
+    np.testing.assert_allclose(scan.proj_geom["Vectors"], told.proj_geom["Vectors"], atol=1e-9)
+
+
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
 def test_a_toml_file_of_a_windows_program(bare, folder, encoding):
     told = tps.load_scan(folder)

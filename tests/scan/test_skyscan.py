@@ -117,13 +117,18 @@ def test_what_the_log_leaves_open_is_said(folder):
         ),
         ("Object to Source (mm)=100.000", "Object to Source (mm)=far", "a number as 'Object to Source"),
         ("Camera to Source (mm)=250.000", "Camera to Source (mm)=50", "at least source_object"),
+        ("Step (deg)=7.500", "Step (deg)=0.000", None),  # a full turn
+        ("Step (deg)=7.500\nUse 360 Rotation=YES", "Use 360 Rotation=NO", "Rotation Step .deg.: expected"),
         ("Prefix=marker_", "Prefix=no", None),
     ],
 )
 def test_logs_that_cannot_be_meant(folder, old, new, message):
     change(folder, (old, new))
-    if message is None:  # the log's own name says which pictures are meant
-        assert tps.load_scan(folder).views == 48
+    if message is None:  # what is missing, such as which pictures are meant, is told otherwise
+        write_folder("skyscan", folder.parent / "untouched", marked())
+        expected = tps.load_scan(folder.parent / "untouched")
+        found = tps.load_scan(folder)
+        np.testing.assert_allclose(found.proj_geom["Vectors"], expected.proj_geom["Vectors"], atol=1e-9)
         return
     with pytest.raises(ValueError, match=message):
         tps.load_scan(folder)
@@ -155,6 +160,9 @@ def test_pictures_of_another_size_in_between(folder):
         ("Al 0,5mm", {"Al": 0.05}),
         ("Al 500 \u00b5m", {"Al": 0.05}),
         ("Al 500 \u03bcm", {"Al": 0.05}),
+        ("Al 0.5mm / Cu 0.038mm", {"Al": 0.05, "Cu": 0.0038}),
+        ("Al 0,5mm, Cu 0,04 mm filter", {"Al": 0.05, "Cu": 0.004}),
+        ("Al (0.5mm)", {"Al": 0.05}),
         ("No Filter", {}),
         ("", {}),
         ("Al+Cu", None),
@@ -223,6 +231,10 @@ def test_the_log_of_a_reconstruction_beside_that_of_the_scan(folder):
     change(folder, ("[Reconstruction]\nPostalignment=-1.50\n", ""))
     scan = tps.load_scan(folder)
     np.testing.assert_array_equal(scan.proj_geom["Vectors"], exact.proj_geom["Vectors"])
+    with pytest.raises(
+        ValueError, match="a scan, got .*the log of a reconstruction; name the folder of the proj"
+    ):
+        tps.load_scan(folder / "marker__rec.log")
 
 
 def test_a_part_of_connected_scans(folder):

@@ -31,7 +31,7 @@ def filters_of(text: str) -> dict[str, float] | None:
     Parameters
     ----------
     text : str
-        One or more filters, joined by ``+``, ``;``, ``&`` or ``and``.
+        One or more filters, joined by ``+``, ``;``, ``&``, ``/``, a comma or ``and``.
     """
     plain = text.strip().strip('"').lower()
     if plain in _NONE:
@@ -70,7 +70,9 @@ def require_filters(argument: str, text: str) -> dict[str, float]:
 
 
 def _apart(text: str) -> list[str]:
-    return [one.strip() for one in re.split(r"\s*(?:\+|;|&|\band\b)\s*", text.strip().strip('"'))]
+    # A comma before a digit is a decimal sign.
+    plain = re.sub(r"[()]|\bfilter\s*$", " ", text.strip().strip('"'), flags=re.I)
+    return [one.strip() for one in re.split(r"\s*(?:\+|;|&|/|,(?!\d)|\band\b)\s*", plain)]
 
 
 def _in_cm(argument: str, one: str) -> dict[str, float]:

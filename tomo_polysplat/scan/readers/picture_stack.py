@@ -21,7 +21,7 @@ from tomo_polysplat.scan.readers.picture_names import (
 )
 from tomo_polysplat.scan.readers.stated import read_toml, require_known, stated_over
 
-__all__ = ["full_turn", "guessed", "read", "recognises", "written_beside"]
+__all__ = ["full_turn", "guessed", "read", "recognises", "stated_beside", "written_beside"]
 
 KIND = "stack of TIFFs, EDF or .npy files"
 _REMEDY = (
@@ -41,7 +41,7 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     """See `tomo_polysplat.load_scan`; `stated` has its ``scanner``."""
     folder = path if path.is_dir() else path.parent
     written, other = written_beside(path)
-    known = written | require_known(stated, "scanner")
+    known = stated_beside(written, stated)
     if path.suffix.lower() in PICTURE_SUFFIXES and path.is_file():
         known.setdefault("projections", path)
     files = _sorted_out(folder, known)
@@ -73,6 +73,14 @@ def written_beside(path: Path) -> tuple[dict[str, Any], dict[str, str]]:
     aliased = {key: value for key, value in table.items() if _is_known(key)}
     other = {key: str(value) for key, value in table.items() if not _is_known(key)}
     return require_known(aliased, file.name), other
+
+
+def stated_beside(written: Mapping[str, Any], stated: Mapping[str, Any]) -> dict[str, Any]:
+    """What is written in a file, with what the user states in its place: angles as a list, or as an arc."""
+    said = require_known(stated, "scanner")
+    angles = {"degrees", "arc"}
+    kept = {key: value for key, value in written.items() if not (key in angles and said.keys() & angles)}
+    return kept | said
 
 
 def _is_known(key: str) -> bool:

@@ -60,7 +60,7 @@ def acquisition_of(path: Path, stated: Mapping[str, Any]) -> Acquisition:
             return scans[0][1].read(folder, stated).saying(f"what is read is {folder.name} in {path.name}")
     if picture_stack.recognises(path):
         return picture_stack.read(path, stated)
-    kinds = ", ".join(reader.KIND for reader in READERS)
+    kinds = ", ".join(reader.KIND.split(" (")[0] for reader in READERS)
     raise fail(
         "path",
         f"a Data Exchange HDF5 file, an .npz scan, or one of: {kinds}",

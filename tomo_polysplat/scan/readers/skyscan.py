@@ -47,6 +47,10 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     """See `tomo_polysplat.load_scan`; `stated` has its ``scanner``."""
     file = the_one(_logs(path), remedy="name its .log file")
     folder, log = file.parent, IniText(file)
+    prefix = log.text("Filename Prefix")
+    if _RECONSTRUCTION.fullmatch(file.stem) and not _RECONSTRUCTION.fullmatch(prefix):
+        remedy = f"name the folder of the projections, {prefix}0000.tif and so on"
+        raise fail("path", "a scan", f"{file}, the log of a reconstruction", remedy)
     files, said = _counted(_pictures(folder, log, file.stem), log)
     frames = TiffFrames(files)
     _require_size(log, frames)
@@ -60,7 +64,7 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
         KIND,
         frames,
         setup,
-        name=log.text("Filename Prefix", otherwise=file.stem).rstrip("_~ "),
+        name=(prefix or file.stem).rstrip("_~ "),
         from_detector=True,
         tube=Tube(log.number("Source Voltage (kV)", otherwise=0.0) or None, _filters(log)),
         exposure=log.number("Exposure (ms)", otherwise=0.0) / 1000 or None,
@@ -155,8 +159,16 @@ def _setup(log: IniText, numbers: np.ndarray, rows: int) -> tuple[Setup, list[st
     if "ON" in log.text("Camera Offset").upper():
         said.append("the camera was offset: is that in the pictures? give offset= if it is not")
     sense, guess = _sense(log)
-    degrees = sense * log.number("Rotation Step (deg)") * numbers
+    degrees = sense * _step(log, numbers) * numbers
     return Setup(degrees, (width, height), near, far, (0.0, ((rows - 1) / 2 - line) * height)), said + guess
+
+
+def _step(log: IniText, numbers: np.ndarray) -> float:
+    """Degrees from one picture to the next."""
+    step = log.number("Rotation Step (deg)", otherwise=0.0)
+    if step == 0 and log.text("Use 360 Rotation").upper() == "YES":
+        return 360.0 / (int(numbers[-1]) + 1)
+    return step or require_number("Rotation Step (deg)", step, above=0.0)
 
 
 def _pixel(log: IniText, magnification: float) -> tuple[float, list[str]]:
