@@ -213,14 +213,16 @@ def test_pictures_with_capital_endings_eight_digits_and_some_missing(folder):
     assert "jump (6 to 9)" in guesses(scan) and "46 pictures are there" in guesses(scan)
 
 
-def test_views_beyond_a_full_turn(tmp_path):
+@pytest.mark.parametrize("more", [1, 24])
+def test_views_beyond_a_full_turn(folder, more):
     """A scanner that ends where it has begun takes one more picture than there are steps."""
-    write_folder("skyscan", tmp_path / "a", marked())
-    (tmp_path / "a" / "marker_0048.tif").write_bytes((tmp_path / "a" / "marker_0000.tif").read_bytes())
-    change(tmp_path / "a", ("Files=  48", "Files=  49"))
-    scan = tps.load_scan(tmp_path / "a")
-    assert scan.views == 49 and len(scan.notes["scanner"]["guessed"]) == 1
+    for k in range(more):
+        (folder / f"marker_{48 + k:04d}.tif").write_bytes((folder / f"marker_{k:04d}.tif").read_bytes())
+    change(folder, ("Files=  48", f"Files=  {48 + more}"))
+    scan = tps.load_scan(folder)
+    assert scan.views == 48 + more and len(scan.notes["scanner"]["guessed"]) == 1
     np.testing.assert_allclose(scan.proj_geom["Vectors"][48], scan.proj_geom["Vectors"][0], atol=1e-9)
+    require_the_same_volume(scan, marked())
 
 
 def test_the_log_of_a_reconstruction_beside_that_of_the_scan(folder):

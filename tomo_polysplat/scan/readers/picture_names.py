@@ -43,7 +43,7 @@ _WORDS = {
         ),
         *("ref", "refs", "reference", "gain", "ff", "i0", "io", "blank", "blanks"),
     ),
-    "darks": ("dark", "darks", "darkfield", "darkcurrent", "dk", "df", "di", "offset", "background"),
+    "darks": ("dark", "darks", "darkfield", "darkcurrent", "dk", "df", "di", "background"),
     "projections": ("projections", "projection", "proj", "projs", "data", "tomo", "images", "raw"),
 }
 
