@@ -190,6 +190,7 @@ def test_what_does_not_fit_is_refused(bare, stated, message):
     [
         ({"rows": (5, 99)}, "rows: expected first < end, from 0 to 33, got 5, 99"),
         ({"views": 0}, "views: expected a positive whole number"),
+        ({"views": 48}, "views: expected a step that leaves some of 48 views, got 48; 2 takes every other"),
         ({"binning": 50}, "binning: expected at most the 33 rows"),
         ({"columns": 7}, "columns: expected two whole numbers"),
     ],
