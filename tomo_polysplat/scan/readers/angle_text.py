@@ -49,7 +49,7 @@ def _decimal_commas(lines: list[str]) -> bool:
     points = any(re.search(r"\d\.\d", line) for line in lines)
     if points or not any(re.search(r"\d,\d", line) for line in lines):
         return False
-    if any(re.search(r"\S[;\s]+[-+]?\d", line) for line in lines):
+    if any(re.search(r"[^;\s][;\s]+[-+]?\d", line) for line in lines):
         return True
     halves = [line.split(",") for line in lines if re.search(r"\d", line)]
     if any(len(parts) != 2 or not parts[0].strip().lstrip("+-").isdecimal() for parts in halves):
