@@ -3,7 +3,8 @@
 What the keys mean is as NRecon, the maker's program, uses them: lengths in the object are those of ``Image Pixel
 Size`` at ``Object to Source``, binning included; lines are counted from the lowest; ``Postalignment`` is the axis'
 shift in columns. Its sign and the sense of rotation are those of the SkyScan parser of the ASTRA Toolbox's tools:
-pictures are as seen from the detector, and the object turns counterclockwise seen from above for ``CC``.
+pictures are as seen from the detector, and the object turns counterclockwise seen from above for ``CC``. TIGRE's
+reader has the same sense, and counts the lines as here.
 """
 
 from __future__ import annotations
