@@ -16,7 +16,7 @@ from tomo_polysplat.ranks import current_ranks
 
 __all__ = [
     "free_bytes",
-    "most_gaussians",
+    "has_room",
     "projections_stay",
     "require_machine",
     "require_room",
@@ -34,9 +34,6 @@ logger = logging.getLogger(__name__)
 # makes of it on its way; its footprint and sums in each view of a step; and what ranks add up, kept between graphs
 # (2.8e6 Gaussians, 192^3 voxels and 6 views a step on an H100: 330 and, with the footprints of three views, 780).
 _GAUSSIAN, _FOOTPRINT, _ADDED_UP = 680, 144, 110
-# Runs of a large cloud at once, while the rays are asked which of two models explains them. The second's step is tried
-# before it is recorded into the memory of the first, so that for a moment all of a step is there twice.
-_RUNS = 2
 # Bytes a pixel of a step takes: image and gradient of four channels, projections and their slopes.
 _PIXEL = 48
 # Bytes a voxel takes at once, by torch's own count on 40^3 to 64^3 (tests/fit/test_counted_memory.py): while a start is
@@ -137,6 +134,11 @@ def step_bytes(
     )
 
 
+def has_room(device: torch.device, **needed: int) -> bool:
+    """Whether a CUDA device has the memory that `step_bytes` tells; others are not asked."""
+    return device.type == "cpu" or sum(step_bytes(device, **needed).values()) <= _SHARE * free_bytes(device)
+
+
 # All that a step takes, and the words of two kinds of device.
 def require_room(
     device: torch.device,
@@ -210,13 +212,6 @@ def room_for_gaussians(device: torch.device, *, views: int, pixels: int, voxels:
     if few < MANY or device.type == "cpu":
         return few
     return left / (runs * _of_a_gaussian(min(views, FEW_VIEWS)))
-
-
-def most_gaussians(device: torch.device) -> float:
-    """How many Gaussians of a large cloud a CUDA device holds in its free memory; infinity without one."""
-    if device.type == "cpu" or not torch.cuda.is_available():
-        return math.inf
-    return _SHARE * free_bytes(device) / (_RUNS * _of_a_gaussian(FEW_VIEWS))
 
 
 @contextmanager
