@@ -12,6 +12,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -112,11 +113,8 @@ def _pictures(folder: Path, log: IniText, stem: str) -> list[Path]:
     length = log.number("Filename Index Length", otherwise=4)
     digits = int(require_number("Filename Index Length", length, at_least=0, at_most=_MOST_DIGITS))
     # Another number of digits than the log tells of is what a program that renamed them has left.
-    for prefix, end in (
-        *((p, f"{{{digits}}}") for p in (log.text("Filename Prefix"), stem)),
-        (stem, "{3,}"),
-        ("", "{3,}"),
-    ):
+    names = [name for name in (log.text("Filename Prefix"), stem) if name]
+    for prefix, end in (*product(names, (f"{{{digits}}}", "{3,}")), ("", "{3,}")):
         name = re.compile(rf"{re.escape(prefix)}_*\d{end}" if prefix else rf".*\d{end}", re.I)
         chosen = [file for file in tiffs if name.fullmatch(file.stem)]
         if not prefix:
