@@ -9,6 +9,7 @@ from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.physics.water import areal_density, transmitted_energy
 from tomo_polysplat.plan.decisions.soft_reference import soft_reference
+from tomo_polysplat.plan.hardening import coarse, hardening_of
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.bridged import bridged_start
 from tomo_polysplat.start.initial import initial_volume_on
@@ -31,10 +32,13 @@ def first_volume(problem: Problem, device: torch.device, settings: Settings) -> 
     volume, done = initial_volume_on(values, problem.geometry, problem.grid, device)
     reference = soft_reference(_looked_at(volume, device), problem, settings)
     problem.remember_solid(reference.value != reference.first)
+    soft = coarse(volume) if problem.solid else None
     for _ in range(_TIMES if problem.solid else 0):
         values = _as_if_solid(problem, primary, reference.number)
         volume, done = initial_volume_on(values, problem.geometry, problem.grid, device)
         reference = soft_reference(_looked_at(volume, device), problem, settings, problem.solid)
+    if soft is not None:
+        problem.remember_solid(problem.solid, hardening_of(soft, coarse(volume)))
     metal = reference.adapted(settings).metal_level * problem.depth * reference.value
     if not values.is_cuda:
         volume = volume.cpu()
