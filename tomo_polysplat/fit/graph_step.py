@@ -13,7 +13,7 @@ from tomo_polysplat.fit.fused_step import FusedStep
 from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.fit.shares import Part
 from tomo_polysplat.fit.step import smoothing
-from tomo_polysplat.free_memory import give_back, recording
+from tomo_polysplat.free_memory import give_back, keeps_more_than, recording
 from tomo_polysplat.model.gaussians import Gaussians
 
 __all__ = ["GraphStep"]
@@ -29,8 +29,7 @@ def _give_back(device: torch.device) -> None:
 
     While a graph is recorded nothing can be given back, and no other graph can use what was kept for one.
     """
-    unused = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    if unused > _UNUSED * torch.cuda.mem_get_info(device)[1]:
+    if keeps_more_than(_UNUSED, device):
         give_back()
 
 

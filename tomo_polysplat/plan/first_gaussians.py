@@ -10,6 +10,7 @@ import torch
 
 from tomo_polysplat.fit.memory import has_room, require_room, room_for_gaussians, start_stays
 from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.free_memory import MUCH, give_back, keeps_more_than
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.model.seed import Spacing, seed_gaussians
 from tomo_polysplat.plan.costs import work
@@ -65,6 +66,11 @@ def first_gaussians(
         problem.planar,
     )
     gaussians = gaussians if stays else gaussians.to(device)
+    if keeps_more_than(MUCH, device):
+        # As the start volume is moved (`plan.first_volume`).
+        gaussians = gaussians.to(torch.device("cpu"))
+        give_back()
+        gaussians = gaussians.to(device)
     free = int((gaussians.group < 0).sum())
     kinds = "none with a material number of its own"
     if several:

@@ -6,6 +6,7 @@ import torch
 
 from tomo_polysplat.fit.memory import start_stays
 from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.free_memory import MUCH, give_back, keeps_more_than
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.physics.water import areal_density, transmitted_energy
 from tomo_polysplat.plan.decisions.soft_reference import soft_reference
@@ -27,6 +28,18 @@ def first_volume(problem: Problem, device: torch.device, settings: Settings) -> 
     times ``problem.depth``. Rays through what shows as metal are bridged where that helps. It is on the host where the
     device has no room for what looks at it.
     """
+    volume, how = _made(problem, device, settings)
+    if keeps_more_than(MUCH, volume.device):
+        # Anew: amid what copies of the rays took it would keep all of that from being given back.
+        on_host = volume.cpu()
+        del volume
+        give_back()
+        volume = on_host.to(device)
+    return volume, how
+
+
+def _made(problem: Problem, device: torch.device, settings: Settings) -> tuple[torch.Tensor, str]:
+    """The same where it was made."""
     primary = problem.primary(device)
     values = _as_if_soft(problem, primary)
     volume, done = initial_volume_on(values, problem.geometry, problem.grid, device)

@@ -173,7 +173,7 @@ def _made_without(
 ) -> torch.Tensor:
     """The volume of rays of which those through metal, NaN, are bridged in place."""
     first, _ = initial_volume_on(rays, geometry, grid)
-    main = mass_level(first[~mask])
+    main = mass_level(first.masked_fill_(mask, 0.0))
     prior, thickness = normalising_volume(first, mask, main, metal), torch.empty_like(rays)
     for some in _portions(rays):
         thickness[some[0] : some[-1] + 1] = pair.forward(prior, some)
