@@ -1,0 +1,103 @@
+"""Sums over the rays of what a fit leaves and of how that would change were the scanner moved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.scan.moved_rays import falls_on
+from tomo_polysplat.settings import Settings
+
+__all__ = ["MoveSums", "move_sums"]
+
+# Views looked at together, and rays, beside a step's memory, which a GPU keeps.
+_AT_ONCE, _RAYS = 8, 1 << 23
+# Residuals beyond so many usual ones of some views, or of what a model is allowed, count as so many.
+_FAR = 4.0
+_LEAST_ERROR = 1e-3
+# Weights of a Gaussian of one pixel. Both sides are smoothed with it, so that noise has less of a part in the slopes.
+_BLUR = (0.0545, 0.2442, 0.4026, 0.2442, 0.0545)
+
+
+@dataclass(frozen=True)
+class MoveSums:
+    """Normal equations of moves, view by view.
+
+    Attributes
+    ----------
+    normal : (2, views, moves + 1, moves + 1) array
+        Sums of products of slopes, of the left half of the detector and of the right one. The last slope is that of
+        -log of the view's light, 1.
+    told : (2, views, moves + 1) array
+        Sums of slopes times measurement less model.
+    """
+
+    normal: np.ndarray
+    told: np.ndarray
+
+
+@torch.no_grad()
+def move_sums(
+    gaussians: Gaussians, scene: FitScene, rays: Rays, settings: Settings, falls: torch.Tensor
+) -> MoveSums:
+    """Those of all views.
+
+    Parameters
+    ----------
+    gaussians, scene, rays, settings
+        Of the fit.
+    falls : (moves, views, 3, 3) float64 tensor
+        How rays shift on the detector with each move (`scan.moved_rays.falls_of`).
+    """
+    allowed = max(settings.model_error, _LEAST_ERROR)
+    views, rows, columns = len(rays.views), rays.views.rows, rays.views.columns
+    device, moves = rays.target, len(falls)
+    falls = falls.to(device, torch.float32)
+    places = [torch.arange(n, device=device, dtype=torch.float32) for n in (columns, rows)]
+    normal = torch.zeros((2, views, moves + 1, moves + 1), dtype=torch.float64, device=device)
+    told = torch.zeros((2, views, moves + 1), dtype=torch.float64, device=device)
+    at_once = max(1, min(_AT_ONCE, _RAYS // (rows * columns * (moves + 1))))
+    for first in range(0, views, at_once):
+        some = np.arange(first, min(first + at_once, views))
+        seen, measured, fitted, _ = rays.batch(some)
+        predicted, _ = scene.projections(gaussians, seen)
+        used = (fitted > 0).to(predicted.dtype)
+        left = (measured - predicted) * used
+        usual = ((left * fitted).square().sum() / used.sum().clamp(min=1)).sqrt().clamp(min=allowed)
+        far = _FAR * usual / fitted.clamp(min=1e-12)
+        left = left.maximum(-far).minimum(far)
+        share = _smoothed(used)
+        left = _smoothed(left) / share.clamp(min=1e-6)
+        image = _smoothed(predicted) / _smoothed(torch.ones_like(predicted))
+        trust = fitted.square()
+        across, down = falls_on(falls[:, some[0] : some[-1] + 1], *places)
+        slopes = across * _slope(image, 2) + down * _slope(image, 1)
+        slopes = torch.cat([slopes, torch.ones_like(slopes[:1])]).transpose(0, 1)
+        for side, part in enumerate((slice(0, columns // 2), slice(columns // 2, columns))):
+            one = slopes[..., part].flatten(2).double()
+            weighed = one * trust[:, None, :, part].flatten(2).double()
+            normal[side, some[0] : some[-1] + 1] = weighed @ one.transpose(1, 2)
+            told[side, some[0] : some[-1] + 1] = (weighed @ left[:, :, part].flatten(1).double()[..., None])[..., 0]
+    return MoveSums(normal.cpu().numpy(), told.cpu().numpy())
+
+
+def _smoothed(images: torch.Tensor) -> torch.Tensor:
+    """(views, rows, columns) images smoothed by a pixel along both; what lies beside them is 0."""
+    kernel = images.new_tensor(_BLUR)
+    half = len(_BLUR) // 2
+    for shape, pad in (((1, 1, 1, -1), (0, half)), ((1, 1, -1, 1), (half, 0))):
+        images = torch.nn.functional.conv2d(images[:, None], kernel.reshape(shape), padding=pad)[:, 0]
+    return images
+
+
+def _slope(images: torch.Tensor, axis: int) -> torch.Tensor:
+    """Central differences along an axis, one-sided at the ends; 0 where there is but one pixel."""
+    if images.shape[axis] < 2:
+        return torch.zeros_like(images)
+    slope: torch.Tensor = torch.gradient(images, dim=axis)[0]
+    return slope
