@@ -82,7 +82,9 @@ def move_sums(
             one = slopes[..., part].flatten(2).double()
             weighed = one * trust[:, None, :, part].flatten(2).double()
             normal[side, some[0] : some[-1] + 1] = weighed @ one.transpose(1, 2)
-            told[side, some[0] : some[-1] + 1] = (weighed @ left[:, :, part].flatten(1).double()[..., None])[..., 0]
+            told[side, some[0] : some[-1] + 1] = (weighed @ left[:, :, part].flatten(1).double()[..., None])[
+                ..., 0
+            ]
     return MoveSums(normal.cpu().numpy(), told.cpu().numpy())
 
 

@@ -17,9 +17,9 @@ import torch
 
 from tomo_polysplat.fit.move_sums import move_sums
 from tomo_polysplat.fit.problem import Problem
-from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.nuisances.alignment import Alignment
 from tomo_polysplat.nuisances.alignment_search import worth_it
 from tomo_polysplat.nuisances.move_estimate import shifts_of_views, whole_moves
@@ -42,27 +42,42 @@ __all__ = ["realigned"]
 logger = logging.getLogger(__name__)
 
 # Moves of the whole scanner that are looked for, with those of single views.
-_WHOLE = ("u", "roll", "tilt")
-# One is looked for where the object leaves this share of what it does (`scan.gauges.effects`).
-_TOLD = 0.1
-# Moves are made of more than this, in pixels of what is seen, beyond so many standard errors.
-_TOLERATED, _SURE = 0.03, 4.0
+_WHOLE = ("u", "roll")
+# One is looked for where the object leaves this share of what it does (`scan.gauges.effects`), and the axis where
+# opposite rays tell it no better than this, in pixels: their error is the smaller one then.
+_TOLD, _AXIS_KNOWN = 0.1, 0.02
+# Moves of more than this, in pixels of what is seen, beyond so many standard errors are looked for; once any is, all
+# that are sure to so many are made.
+_LEAST, _SURE, _FOUND = 0.03, 4.0, 2.0
 # Fits, their passes, and the change, in pixels, after which the moves are known.
-_ROUNDS, _PASSES, _SETTLED = 4, 1.0, 0.03
+_ROUNDS, _PASSES, _SETTLED = 5, 1.0, 0.02
+# A step may be so many times what a fit says.
+_FARTHEST = 3.0
 
 
 @dataclass(frozen=True)
-class _Step:
-    """What is left to be moved: of the whole scanner by name, and of the views (views, 2); both as seen, in pixels."""
+class _Left:
+    """What a fit says is still to be moved.
 
-    whole: dict[str, float]
+    Attributes
+    ----------
+    whole : (moves,) array
+        Moves of the whole scanner, those alone that are sure.
+    views : (views, 2) array
+        Shifts of single views, likewise.
+    pixels : float
+        The largest of them, as seen.
+    clear : bool
+        Whether any is large, and sure, enough to be looked for.
+    """
+
+    whole: np.ndarray
     views: np.ndarray
     pixels: float
+    clear: bool
 
 
-def realigned(
-    problem: Problem, axis: Answer, means: Means, report: Callable[[float, str], Any]
-) -> Answer:
+def realigned(problem: Problem, axis: Answer, means: Means, report: Callable[[float, str], Any]) -> Answer:
     """Where the scanner stood, as a fit of one pass tells it; a few more find it out where it says that it moved.
 
     Parameters
@@ -82,7 +97,7 @@ def realigned(
     """
     report(0.0, "alignment")
     try:
-        moved, misfits = _Realignment(problem, means).moved(_tensors(axis.value))
+        moved, misfits = _Realignment(problem, axis, means).moved(_tensors(axis.value))
     except Exception as error:
         # Processes that share the steps may be left behind by one that fails.
         if current_ranks().count > 1:
@@ -92,7 +107,9 @@ def realigned(
     moves = {name: value.tolist() for name, value in moved.items() if bool(value.any())}
     words, told = Alignment.told(moves), {"without": misfits[0], "moved": misfits[-1]}
     if moves == axis.value or not worth_it(misfits[0], misfits[-1]):
-        logger.info("Alignment: %s", f"not confirmed: {words}" if moves != axis.value else "no more has moved")
+        logger.info(
+            "Alignment: %s", f"not confirmed: {words}" if moves != axis.value else "no more has moved"
+        )
         return axis
     logger.warning("The scanner stood elsewhere: %s. align=False leaves it.", words)
     return Answer(moves, words, Status.ASKED, {**axis.evidence, **told})
@@ -101,10 +118,12 @@ def realigned(
 class _Realignment:
     """Fits of a pass or two, and what they say of the scanner."""
 
-    def __init__(self, problem: Problem, means: Means) -> None:
+    def __init__(self, problem: Problem, axis: Answer, means: Means) -> None:
         self.problem, self.means = problem, means
         self.scanner = Scanner(problem.geometry, axis_of(problem))
-        whole = [name for name in _WHOLE if not (problem.geometry.planar and name != "u")]
+        whole = ["u"] if problem.geometry.planar else list(_WHOLE)
+        if axis.evidence.get("error", math.inf) <= _AXIS_KNOWN:
+            whole.remove("u")
         found = effects(self.scanner, whole, 1.0)
         self.names = tuple(name for name, effect in found.items() if effect.told >= _TOLD)
         self.seen = np.array([found[name].pixels for name in self.names])
@@ -114,40 +133,50 @@ class _Realignment:
     def moved(self, values: dict[str, torch.Tensor]) -> tuple[dict[str, torch.Tensor], list[float]]:
         """Where the scanner stood, and the misfits of held-out rays of fits by it, the first as it is."""
         misfits: list[float] = []
+        before: tuple[np.ndarray, np.ndarray] | None = None
         for number in range(_ROUNDS):
             gaussians, scene, rays, misfit = self._fitted(values)
             misfits.append(misfit)
             if number == _ROUNDS - 1:
                 break
             left = self._left(gaussians, scene, rays, values)
-            if left.pixels == 0 or (number and left.pixels < _SETTLED):
+            if not (number or left.clear) or not left.pixels:
                 break
-            values = _stepped(values, left)
+            step = left.whole if before is None else _secant(left.whole, *before)
+            before = left.whole, step
+            values = self._stepped(values, step, left.views)
+            if left.pixels < _SETTLED:
+                break
         return values, misfits
 
     def _left(
-        self,
-        gaussians: Gaussians,
-        scene: FitScene,
-        rays: Rays,
-        values: dict[str, torch.Tensor],
-    ) -> _Step:
+        self, gaussians: Gaussians, scene: FitScene, rays: Rays, values: dict[str, torch.Tensor]
+    ) -> _Left:
         """What a fit says is still to be moved."""
         falls = falls_of(self.scanner, values, (*self.names, "u", "v"))
         sums = move_sums(gaussians, scene, rays, self.settings, falls)
         normal, told, many = sums.normal, sums.told, len(self.names)
         moves = whole_moves(normal.sum(axis=0), told.sum(axis=0), range(many))
-        surely = np.abs(moves.value) * self.seen > _TOLERATED + _SURE * moves.error * self.seen
-        whole = np.where(surely, moves.value, 0.0)
+        size, error = np.abs(moves.value) * self.seen, moves.error * self.seen
+        whole = np.where(size > _FOUND * error, moves.value, 0.0)
         told = told - normal[..., :many] @ whole
         single = slice(many, many + 3)
         shifts = shifts_of_views(normal[:, :, single, single], told[:, :, single], self.gauge)
-        shifts = np.where(np.sqrt(np.mean(shifts**2, axis=0)) > _TOLERATED, shifts, 0.0)
-        pixels = math.hypot(
-            float(np.abs(whole * self.seen).max(initial=0.0)), float(np.sqrt(np.mean(shifts**2)))
-        )
-        logger.debug("moves %s errors %s views %s", moves.value, moves.error, np.sqrt(np.mean(shifts**2, axis=0)))
-        return _Step(dict(zip(self.names, whole.tolist())), shifts, pixels)
+        rms = np.sqrt(np.mean(shifts**2, axis=0))
+        pixels = float(max((np.abs(whole) * self.seen).max(initial=0.0), rms.max()))
+        clear = bool((size > _LEAST + _SURE * error).any() or (rms > _LEAST).any())
+        logger.debug("left: %s of errors %s, views %s px", moves.value, moves.error, rms)
+        return _Left(whole, shifts, pixels, clear)
+
+    def _stepped(
+        self, values: dict[str, torch.Tensor], whole: np.ndarray, shifts: np.ndarray
+    ) -> dict[str, torch.Tensor]:
+        """Values of the moves after a step; those that are 0 are left out."""
+        values = dict(values)
+        for name, by in [*zip(self.names, whole), ("views", shifts)]:
+            if np.any(by):
+                values[name] = values.get(name, 0.0) + torch.as_tensor(by, dtype=torch.float64)
+        return values
 
     def _fitted(self, values: dict[str, torch.Tensor]) -> tuple[Gaussians, FitScene, Rays, float]:
         """A fit by the scanner as it stood, with the misfit of its held-out rays."""
@@ -162,12 +191,12 @@ class _Realignment:
         return outcome.gaussians, scene, rays, float(min(errors))
 
 
-def _stepped(values: dict[str, torch.Tensor], left: _Step) -> dict[str, torch.Tensor]:
-    """Values of the moves after a step."""
-    zero = torch.zeros((), dtype=torch.float64)
-    moved = {name: values.get(name, zero) + by for name, by in left.whole.items()}
-    views = values.get("views", torch.zeros(left.views.shape, dtype=torch.float64))
-    return {**values, **moved, "views": views + torch.from_numpy(left.views)}
+def _secant(left: np.ndarray, left_before: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """How far to go, of what was left before a step and after it: the object hides a part of a move from each fit."""
+    gained = left_before - left
+    with np.errstate(divide="ignore", invalid="ignore"):
+        times = np.where((left_before != 0) & (gained * step > 0), step / gained, 1.0)
+    return left * np.clip(times, 1.0, _FARTHEST)
 
 
 def _tensors(moves: Mapping[str, Any]) -> dict[str, torch.Tensor]:
