@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from tomo_polysplat.fit.loss import misfit
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
@@ -35,10 +36,13 @@ class MoveSums:
         -log of the view's light, 1.
     told : (2, views, moves + 1) array
         Sums of slopes times measurement less model.
+    held_out : (views,) array
+        Mean misfit of the rays held out; NaN in views without any.
     """
 
     normal: np.ndarray
     told: np.ndarray
+    held_out: np.ndarray
 
 
 @torch.no_grad()
@@ -61,11 +65,14 @@ def move_sums(
     places = [torch.arange(n, device=device, dtype=torch.float32) for n in (columns, rows)]
     normal = torch.zeros((2, views, moves + 1, moves + 1), dtype=torch.float64, device=device)
     told = torch.zeros((2, views, moves + 1), dtype=torch.float64, device=device)
+    held_out = torch.full((views,), torch.nan, dtype=torch.float64, device=device)
     at_once = max(1, min(_AT_ONCE, _RAYS // (rows * columns * (moves + 1))))
     for first in range(0, views, at_once):
         some = np.arange(first, min(first + at_once, views))
-        seen, measured, fitted, _ = rays.batch(some)
+        seen, measured, fitted, aside = rays.batch(some)
         predicted, _ = scene.projections(gaussians, seen)
+        for k, view in enumerate(some.tolist() if rays.held_out else ()):
+            held_out[view] = misfit(predicted[k], measured[k], aside[k], settings)
         used = (fitted > 0).to(predicted.dtype)
         left = (measured - predicted) * used
         usual = ((left * fitted).square().sum() / used.sum().clamp(min=1)).sqrt().clamp(min=allowed)
@@ -85,7 +92,7 @@ def move_sums(
             told[side, some[0] : some[-1] + 1] = (weighed @ left[:, :, part].flatten(1).double()[..., None])[
                 ..., 0
             ]
-    return MoveSums(normal.cpu().numpy(), told.cpu().numpy())
+    return MoveSums(*(part.cpu().numpy() for part in (normal, told, held_out)))
 
 
 def _smoothed(images: torch.Tensor) -> torch.Tensor:

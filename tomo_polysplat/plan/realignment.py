@@ -21,7 +21,6 @@ from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.nuisances.alignment import Alignment
-from tomo_polysplat.nuisances.alignment_search import worth_it
 from tomo_polysplat.nuisances.move_estimate import shifts_of_views, whole_moves
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.axis import axis_of
@@ -46,13 +45,15 @@ _WHOLE = ("u", "roll")
 # One is looked for where the object leaves this share of what it does (`scan.gauges.effects`), and the axis where
 # opposite rays tell it no better than this, in pixels: their error is the smaller one then.
 _TOLD, _AXIS_KNOWN = 0.1, 0.02
-# Moves of more than this, in pixels of what is seen, beyond so many standard errors are looked for; once any is, all
-# that are sure to so many are made.
-_LEAST, _SURE, _FOUND = 0.03, 4.0, 2.0
+# Moves of more than this, in pixels of what is seen, beyond so many standard errors are looked for, and views shifted
+# by more than that; once any is, all that are sure to so many standard errors are made.
+_LEAST, _SURE, _LEAST_OF_VIEWS, _FOUND = 0.01, 2.5, 0.03, 2.0
+# They are kept where the misfit of the same held-out rays falls by more than this, and by so many standard errors.
+_BETTER, _SURELY_BETTER = 0.01, 3.0
 # Fits, their passes, and the change, in pixels, after which the moves are known.
 _ROUNDS, _PASSES, _SETTLED = 5, 1.0, 0.02
 # A step may be so many times what a fit says.
-_FARTHEST = 3.0
+_FARTHEST = 2.0
 
 
 @dataclass(frozen=True)
@@ -69,12 +70,15 @@ class _Left:
         The largest of them, as seen.
     clear : bool
         Whether any is large, and sure, enough to be looked for.
+    held_out : (views,) array
+        Misfits of the rays held out of the fit.
     """
 
     whole: np.ndarray
     views: np.ndarray
     pixels: float
     clear: bool
+    held_out: np.ndarray
 
 
 def realigned(problem: Problem, axis: Answer, means: Means, report: Callable[[float, str], Any]) -> Answer:
@@ -105,14 +109,26 @@ def realigned(problem: Problem, axis: Answer, means: Means, report: Callable[[fl
         logger.warning("A short fit failed, so the scanner stays where it is: %r", error)
         return axis
     moves = {name: value.tolist() for name, value in moved.items() if bool(value.any())}
-    words, told = Alignment.told(moves), {"without": misfits[0], "moved": misfits[-1]}
-    if moves == axis.value or not worth_it(misfits[0], misfits[-1]):
-        logger.info(
-            "Alignment: %s", f"not confirmed: {words}" if moves != axis.value else "no more has moved"
-        )
+    if moves == axis.value:
+        logger.info("Alignment: no more has moved")
+        return axis
+    words, (better, error) = Alignment.told(moves), _improvement(misfits[0], misfits[-1])
+    share = f"misfit of held-out rays falls by {better:.1%} (standard error {error:.1%})"
+    if not better > max(_BETTER, _SURELY_BETTER * error):
+        logger.info("Alignment: not moved, %s; the %s", words, share)
         return axis
     logger.warning("The scanner stood elsewhere: %s. align=False leaves it.", words)
-    return Answer(moves, words, Status.ASKED, {**axis.evidence, **told})
+    evidence = {**axis.evidence, "better": better, "better_error": error}
+    return Answer(moves, f"{words}; the {share}", Status.ASKED, evidence)
+
+
+def _improvement(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
+    """By what share the misfits of the views fall, and its standard error."""
+    both = np.isfinite(before) & np.isfinite(after)
+    fall, mean = (before - after)[both], float(before[both].mean()) if both.any() else 0.0
+    if not mean > 0 or len(fall) < 2:
+        return 0.0, math.inf
+    return float(fall.mean()) / mean, float(fall.std(ddof=1)) / math.sqrt(len(fall)) / mean
 
 
 class _Realignment:
@@ -130,22 +146,19 @@ class _Realignment:
         self.gauge = view_gauge(self.scanner).numpy()
         self.settings = replace(coarse_settings(means.settings), passes=_PASSES)
 
-    def moved(self, values: dict[str, torch.Tensor]) -> tuple[dict[str, torch.Tensor], list[float]]:
+    def moved(self, values: dict[str, torch.Tensor]) -> tuple[dict[str, torch.Tensor], list[np.ndarray]]:
         """Where the scanner stood, and the misfits of held-out rays of fits by it, the first as it is."""
-        misfits: list[float] = []
+        misfits: list[np.ndarray] = []
         before: tuple[np.ndarray, np.ndarray] | None = None
         for number in range(_ROUNDS):
-            gaussians, scene, rays, misfit = self._fitted(values)
-            misfits.append(misfit)
-            if number == _ROUNDS - 1:
-                break
-            left = self._left(gaussians, scene, rays, values)
-            if not (number or left.clear) or not left.pixels:
+            left = self._left(*self._fitted(values), values)
+            misfits.append(left.held_out)
+            if not (number or left.clear) or not left.pixels or number == _ROUNDS - 1:
                 break
             step = left.whole if before is None else _secant(left.whole, *before)
             before = left.whole, step
             values = self._stepped(values, step, left.views)
-            if left.pixels < _SETTLED:
+            if number and left.pixels < _SETTLED:
                 break
         return values, misfits
 
@@ -164,9 +177,9 @@ class _Realignment:
         shifts = shifts_of_views(normal[:, :, single, single], told[:, :, single], self.gauge)
         rms = np.sqrt(np.mean(shifts**2, axis=0))
         pixels = float(max((np.abs(whole) * self.seen).max(initial=0.0), rms.max()))
-        clear = bool((size > _LEAST + _SURE * error).any() or (rms > _LEAST).any())
+        clear = bool((size > _LEAST + _SURE * error).any() or (rms > _LEAST_OF_VIEWS).any())
         logger.debug("left: %s of errors %s, views %s px", moves.value, moves.error, rms)
-        return _Left(whole, shifts, pixels, clear)
+        return _Left(whole, shifts, pixels, clear, sums.held_out)
 
     def _stepped(
         self, values: dict[str, torch.Tensor], whole: np.ndarray, shifts: np.ndarray
@@ -178,8 +191,8 @@ class _Realignment:
                 values[name] = values.get(name, 0.0) + torch.as_tensor(by, dtype=torch.float64)
         return values
 
-    def _fitted(self, values: dict[str, torch.Tensor]) -> tuple[Gaussians, FitScene, Rays, float]:
-        """A fit by the scanner as it stood, with the misfit of its held-out rays."""
+    def _fitted(self, values: dict[str, torch.Tensor]) -> tuple[Gaussians, FitScene, Rays]:
+        """A fit by the scanner as it stood."""
         settings, device = self.settings, self.means.device
         problem = self.problem.seen_by(moved_geometry(self.scanner, values)) if values else self.problem
         start, _ = first_volume(problem, device, settings)
@@ -187,8 +200,7 @@ class _Realignment:
         scene, rays = scene_of(problem, plan, settings, device), rays_of(problem, plan, settings, device)
         seeds, _ = first_gaussians(start, plan, problem, settings, device)
         outcome = fitted_shortly(seeds, plan, problem, scene, rays, replace(self.means, settings=settings))
-        errors = [entry["held_out"] or entry["loss"] for entry in outcome.history] or [math.inf]
-        return outcome.gaussians, scene, rays, float(min(errors))
+        return outcome.gaussians, scene, rays
 
 
 def _secant(left: np.ndarray, left_before: np.ndarray, step: np.ndarray) -> np.ndarray:
