@@ -194,7 +194,9 @@ class _Realignment:
     def _fitted(self, values: dict[str, torch.Tensor]) -> tuple[Gaussians, FitScene, Rays]:
         """A fit by the scanner as it stood."""
         settings, device = self.settings, self.means.device
-        problem = self.problem.seen_by(moved_geometry(self.scanner, values)) if values else self.problem
+        # What is told of one start is not kept for another.
+        geometry = moved_geometry(self.scanner, values) if values else self.problem.geometry
+        problem = self.problem.seen_by(geometry)
         start, _ = first_volume(problem, device, settings)
         plan = plan_from_start(start, problem, settings, device)
         scene, rays = scene_of(problem, plan, settings, device), rays_of(problem, plan, settings, device)
