@@ -52,6 +52,8 @@ _LEAST, _SURE, _LEAST_OF_VIEWS, _FOUND = 0.01, 2.5, 0.03, 2.0
 _BETTER, _SURELY_BETTER = 0.01, 3.0
 # Fits, their passes, and the change, in pixels, after which the moves are known.
 _ROUNDS, _PASSES, _SETTLED = 5, 1.0, 0.02
+# A run of fewer passes is not asked: a fit would be too large a part of it.
+_LEAST_PASSES = 5.0
 # A step may be so many times what a fit says.
 _FARTHEST = 2.0
 
@@ -99,6 +101,8 @@ def realigned(problem: Problem, axis: Answer, means: Means, report: Callable[[fl
     Answer
         That of the axis, where there is no more to move, or where held-out rays do not confirm it.
     """
+    if (means.settings.passes or math.inf) < _LEAST_PASSES:
+        return axis
     report(0.0, "alignment")
     try:
         moved, misfits = _Realignment(problem, axis, means).moved(_tensors(axis.value))
