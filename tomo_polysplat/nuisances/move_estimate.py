@@ -51,9 +51,10 @@ def whole_moves(normal: np.ndarray, told: np.ndarray, which: Sequence[int]) -> W
         _solved(matrix.sum(axis=0) - matrix[part].sum(axis=0), right.sum(axis=0) - right[part].sum(axis=0))
         for part in groups
     ]
-    if any(one is None for one in without):
+    told_without = [one for one in without if one is not None]
+    if len(told_without) < len(groups):
         return nothing
-    return WholeMoves(whole, np.sqrt((len(groups) - 1) * np.var(np.stack(without), axis=0)))
+    return WholeMoves(whole, np.sqrt((len(groups) - 1) * np.var(np.stack(told_without), axis=0)))
 
 
 def shifts_of_views(normal: np.ndarray, told: np.ndarray, gauge: np.ndarray) -> np.ndarray:

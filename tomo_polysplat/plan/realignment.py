@@ -106,11 +106,11 @@ def realigned(problem: Problem, axis: Answer, means: Means, report: Callable[[fl
     report(0.0, "alignment")
     try:
         moved, misfits = _Realignment(problem, axis, means).moved(_tensors(axis.value))
-    except Exception as error:
+    except Exception as broken:
         # Processes that share the steps may be left behind by one that fails.
         if current_ranks().count > 1:
             raise
-        logger.warning("A short fit failed, so the scanner stays where it is: %r", error)
+        logger.warning("A short fit failed, so the scanner stays where it is: %r", broken)
         return axis
     moves = {name: value.tolist() for name, value in moved.items() if bool(value.any())}
     if moves == axis.value:
