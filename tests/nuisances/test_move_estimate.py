@@ -54,6 +54,23 @@ def test_views_are_shifted_by_what_both_halves_tell():
     assert abs(found.mean(axis=0)).max() < 1e-12
 
 
+def test_a_half_that_sees_little_hides_no_shift():
+    rng = np.random.default_rng(2)
+    true = rng.normal(0, 0.4, (VIEWS, 2))
+    true -= true.mean(axis=0)
+    normal, told = halves(rng, true, 1.0)
+    # A hundredth of the slopes, and as much noise.
+    weak = sums(rng, 0.01 * true, 1.0)
+    normal[0], told[0] = weak[0], weak[1]
+    normal[0, :, :2], normal[0, :, :, :2], told[0, :, :2] = (
+        0.01 * normal[0, :, :2],
+        0.01 * normal[0, :, :, :2],
+        0.01 * told[0, :, :2],
+    )
+    found = shifts_of_views(normal, told, mean_of_all())
+    assert np.sqrt(np.mean((found - true) ** 2)) < 0.1
+
+
 def test_noise_shifts_no_view():
     for seed in range(20):
         rng = np.random.default_rng(seed)

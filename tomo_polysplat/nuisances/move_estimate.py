@@ -60,7 +60,7 @@ def whole_moves(normal: np.ndarray, told: np.ndarray, which: Sequence[int]) -> W
 def shifts_of_views(normal: np.ndarray, told: np.ndarray, gauge: np.ndarray) -> np.ndarray:
     """Shifts of single views along columns and rows, shrunk by how well they are known, (views, 2).
 
-    Both halves of the detector tell the same shift. By how much they differ is the noise; what exceeds that is believed
+    Both halves of the detector tell the same shift. By how much they differ is the noise. What exceeds that is believed
     (empirical Bayes: Morris 1983, doi:10.1080/01621459.1983.10477920), where it does so surely.
 
     Parameters
@@ -70,33 +70,36 @@ def shifts_of_views(normal: np.ndarray, told: np.ndarray, gauge: np.ndarray) -> 
     gauge : (2 views, n) array
         Orthonormal shifts, (views, 2) flattened, that are none of single views (`scan.gauges.view_gauge`).
     """
-    both, left, right = (
-        _less_gauge(_of_views(matrix, values), gauge)
+    whole, (left, of_left), (right, of_right) = (
+        _of_views(matrix, values)
         for matrix, values in (
             (normal.sum(axis=0), told.sum(axis=0)),
             (normal[0], told[0]),
             (normal[1], told[1]),
         )
     )
-    noise = 0.25 * np.mean((left - right) ** 2, axis=0)
+    both = _less_gauge(whole[0], gauge)
+    apart = _less_gauge(left, gauge) - _less_gauge(right, gauge)
+    # A half that sees less detail has more noise, and less of a part in both.
+    part = of_left / np.maximum(of_left + of_right, 1e-300)
+    noise = np.mean(part * (1 - part) * apart**2, axis=0)
     excess = np.mean(both**2, axis=0) - noise
     sure = excess > _SURE * np.sqrt(2 / len(both)) * noise
     return both * np.where(sure, excess / np.maximum(excess + noise, 1e-300), 0.0)
 
 
-def _of_views(normal: np.ndarray, told: np.ndarray) -> np.ndarray:
-    """(views, 2) shifts; 0 along what tells nothing."""
+def _of_views(normal: np.ndarray, told: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(views, 2) shifts, 0 along what tells nothing, and how much tells each: the sum of its squared slopes."""
     matrix, right = _without_constant(normal, told, (0, 1))
-    size = np.einsum("vkk->vk", matrix)
-    usable = size > _RANK * max(float(size.max(initial=0.0)), 1e-300)
+    told_by = np.einsum("vkk->vk", matrix)
+    usable = told_by > _RANK * max(float(told_by.max(initial=0.0)), 1e-300)
     # Along rows a scan of one row tells nothing.
     cross = np.where(usable.all(axis=1), matrix[:, 0, 1], 0.0)
-    size = np.where(usable, size, 1.0)
-    right = np.where(usable, right, 0.0)
+    size, right = np.where(usable, told_by, 1.0), np.where(usable, right, 0.0)
     least = np.maximum(size[:, 0] * size[:, 1] - cross**2, _RANK * size[:, 0] * size[:, 1])
     first = size[:, 1] * right[:, 0] - cross * right[:, 1]
     second = size[:, 0] * right[:, 1] - cross * right[:, 0]
-    return np.stack([first, second], axis=1) / least[:, None]
+    return np.stack([first, second], axis=1) / least[:, None], np.where(usable, told_by, 0.0)
 
 
 def _less_gauge(shifts: np.ndarray, gauge: np.ndarray) -> np.ndarray:
