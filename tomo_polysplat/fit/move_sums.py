@@ -58,49 +58,56 @@ def move_sums(
     falls : (moves, views, 3, 3) float64 tensor
         How rays shift on the detector with each move (`scan.moved_rays.falls_of`).
     """
-    allowed = max(settings.model_error, _LEAST_ERROR)
     views, rows, columns = len(rays.views), rays.views.rows, rays.views.columns
-    device, moves = rays.target, len(falls)
+    device, many = rays.target, len(falls) + 1
     falls = falls.to(device, torch.float32)
-    places = [torch.arange(n, device=device, dtype=torch.float32) for n in (columns, rows)]
-    normal = torch.zeros((2, views, moves + 1, moves + 1), dtype=torch.float64, device=device)
-    told = torch.zeros((2, views, moves + 1), dtype=torch.float64, device=device)
+    normal = torch.zeros((2, views, many, many), dtype=torch.float64, device=device)
+    told = torch.zeros((2, views, many), dtype=torch.float64, device=device)
     held_out = torch.full((views,), torch.nan, dtype=torch.float64, device=device)
-    at_once = max(1, min(_AT_ONCE, _RAYS // (rows * columns * (moves + 1))))
+    at_once = max(1, min(_AT_ONCE, _RAYS // (rows * columns * many)))
     for first in range(0, views, at_once):
         some = np.arange(first, min(first + at_once, views))
+        here = slice(first, first + len(some))
         seen, measured, fitted, aside = rays.batch(some)
         predicted, _ = scene.projections(gaussians, seen)
         for k, view in enumerate(some.tolist() if rays.held_out else ()):
             held_out[view] = misfit(predicted[k], measured[k], aside[k], settings)
-        used = (fitted > 0).to(predicted.dtype)
-        left = (measured - predicted) * used
-        usual = ((left * fitted).square().sum() / used.sum().clamp(min=1)).sqrt().clamp(min=allowed)
-        far = _FAR * usual / fitted.clamp(min=1e-12)
-        left = left.maximum(-far).minimum(far)
-        share = _smoothed(used)
-        left = _smoothed(left) / share.clamp(min=1e-6)
-        image = _smoothed(predicted) / _smoothed(torch.ones_like(predicted))
-        trust = fitted.square()
-        across, down = falls_on(falls[:, some[0] : some[-1] + 1], *places)
-        slopes = across * _slope(image, 2) + down * _slope(image, 1)
-        slopes = torch.cat([slopes, torch.ones_like(slopes[:1])]).transpose(0, 1)
+        left = _left(measured - predicted, fitted, max(settings.model_error, _LEAST_ERROR))
+        slopes, trust = _slopes(predicted, falls[:, here]), fitted.square()
         for side, part in enumerate((slice(0, columns // 2), slice(columns // 2, columns))):
             one = slopes[..., part].flatten(2).double()
             weighed = one * trust[:, None, :, part].flatten(2).double()
-            normal[side, some[0] : some[-1] + 1] = weighed @ one.transpose(1, 2)
-            told[side, some[0] : some[-1] + 1] = (weighed @ left[:, :, part].flatten(1).double()[..., None])[
-                ..., 0
-            ]
+            normal[side, here] = weighed @ one.transpose(1, 2)
+            told[side, here] = torch.einsum("vmp,vp->vm", weighed, left[..., part].flatten(1).double())
     return MoveSums(*(part.cpu().numpy() for part in (normal, told, held_out)))
+
+
+def _left(residual: torch.Tensor, fitted: torch.Tensor, allowed: float) -> torch.Tensor:
+    """What is left of the fitted rays, (views, rows, columns), smoothed; those far off count as less far ones."""
+    used = (fitted > 0).to(residual.dtype)
+    usual = ((residual * fitted).square().sum() / used.sum().clamp(min=1)).sqrt().clamp(min=allowed)
+    far = _FAR * usual / fitted.clamp(min=1e-12)
+    return _smoothed(residual.maximum(-far).minimum(far) * used) / _smoothed(used).clamp(min=1e-6)
+
+
+def _slopes(predicted: torch.Tensor, falls: torch.Tensor) -> torch.Tensor:
+    """(views, moves + 1, rows, columns) change of smoothed images with each move, and 1."""
+    image = _smoothed(predicted) / _smoothed(torch.ones_like(predicted))
+    rows, columns = (torch.arange(n, device=image.device, dtype=image.dtype) for n in image.shape[1:])
+    across, down = falls_on(falls, columns, rows)
+    slopes = across * _slope(image, 2) + down * _slope(image, 1)
+    return torch.cat([slopes, torch.ones_like(slopes[:1])]).transpose(0, 1)
 
 
 def _smoothed(images: torch.Tensor) -> torch.Tensor:
     """(views, rows, columns) images smoothed by a pixel along both; what lies beside them is 0."""
-    kernel = images.new_tensor(_BLUR)
     half = len(_BLUR) // 2
-    for shape, pad in (((1, 1, 1, -1), (0, half)), ((1, 1, -1, 1), (half, 0))):
-        images = torch.nn.functional.conv2d(images[:, None], kernel.reshape(shape), padding=pad)[:, 0]
+    # No convolution: a GPU's may round to ten bits.
+    for axis, pad in ((2, (half, half)), (1, (0, 0, half, half))):
+        wide, many = torch.nn.functional.pad(images, pad), images.shape[axis]
+        images = sum(
+            (share * wide.narrow(axis, k, many) for k, share in enumerate(_BLUR)), torch.zeros_like(images)
+        )
     return images
 
 
