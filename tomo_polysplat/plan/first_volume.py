@@ -38,8 +38,9 @@ def first_volume(problem: Problem, device: torch.device, settings: Settings) -> 
     metal = reference.adapted(settings).metal_level * problem.depth * reference.value
     if not values.is_cuda:
         volume = volume.cpu()
+    spare = values is not primary
     volume, bridged = bridged_start(
-        values, volume, done["method"], problem.geometry, problem.grid, metal=metal
+        values, volume, done["method"], problem.geometry, problem.grid, metal=metal, spare=spare
     )
     return _looked_at(volume, device), f"{done['method'].upper()}: {done['reason']}{bridged}"
 
