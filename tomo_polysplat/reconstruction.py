@@ -147,9 +147,10 @@ def reconstruct(
         Known density in g/cm3, at most 25, of what most of the object is made of, the first of ``materials``.
     align : "auto", bool, or names among "u", "v", "roll", "tilt", "slant", "distance", "skew", "views"
         Move the scanner's geometry to where the rays have it, before the fit. "auto": the detector along its columns
-        where opposite rays say that the axis of rotation is off and two short fits confirm it; a scan that is right
-        stays as it is, bit for bit. True: what the rays tell of the axis, the detector's roll, the skew of the axis
-        and shifts of single views, by fits that take about as long as the run. Names: these alone, likewise; pixels,
+        where opposite rays say that the axis of rotation is off and two short fits confirm it, its roll and shifts of
+        single views where a fit of one pass shows them and a few more confirm them; a scan that is right stays as it
+        is, bit for bit. True: the skew of the axis as well, by fits that take about as long as the run. Names: these
+        alone, likewise; pixels,
         degrees, and per cent of the distance. Moves that held-out rays do not confirm are not made.
         `Result.geometry` is the geometry found, ``result.plan["alignment"]`` the moves. None or False: the geometry
         is as told. Beside a ``time_budget`` "auto" alone, without the fits.

@@ -112,7 +112,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="*",
         metavar="MOVE",
         help="first move the geometry to where the rays have it: u, v, roll, tilt, slant, distance, skew, views;"
-        " alone: what of these the rays tell (default: an axis that is off)",
+        " alone: what of these the rays tell (default: axis, roll, views)",
     )
     moved.add_argument("--no-align", action="store_true", help="use the geometry as told")
     group.add_argument(

@@ -181,8 +181,11 @@ class Problem:
         return float(self.grid.voxel_size[: self.dimensions].min())
 
     def seen_by(self, geometry: Geometry) -> Problem:
-        """The same measurements by a scanner that stood elsewhere, in the solver's coordinates."""
-        return replace(self, geometry=geometry)
+        """The same measurements by a scanner that stood elsewhere; copies of them on devices serve both."""
+        other, known = replace(self, geometry=geometry), self._known
+        shared = _Known(known.copies, known.level, photons=known.photons, taken=known.taken)
+        object.__setattr__(other, "_known", shared)
+        return other
 
     def told_geometry(self) -> Geometry:
         """The scanner in the caller's unit, its views in the caller's order."""

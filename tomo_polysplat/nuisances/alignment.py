@@ -78,7 +78,7 @@ class Alignment(Nuisance):
     }
     found_by = Found.GRADIENT
     gauge = "moves of the whole object: what views have in common, and what moves it, is taken out of their shifts"
-    cost = "fits of six passes on joined pixels, before the run"
+    cost = "a fit of one pass before the run, and more where it shows moves; if asked for, fits of joined pixels"
 
     def __init__(
         self,

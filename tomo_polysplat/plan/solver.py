@@ -31,6 +31,7 @@ from tomo_polysplat.plan.never_worse import judge, note_seeds
 from tomo_polysplat.plan.order import ask_between, decide
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.preparation import PreparedFit, RunOptions, calibrate, physics, prepare, under
+from tomo_polysplat.plan.realignment import realigned
 from tomo_polysplat.plan.steady_light import SteadyLight
 
 __all__ = ["Solver"]
@@ -129,6 +130,8 @@ class Solver:
             found = self.saved.plan.facts["alignment"]
         elif self.moved == "auto":
             found = find_axis(problem, options, self.report)
+            if options.time_budget is None:
+                found = realigned(problem, found, options, self.report)
         else:
             # Names are asked for as they stand: who leaves out "u" does not want the axis moved.
             axis = find_axis(problem, options, self.report) if self.moved == "usual" else None

@@ -1,0 +1,84 @@
+"""A detector that is rolled, and views that wobble, are found by default; a scanner that is right stays as it is."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+import tomo_polysplat as tps
+from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.plan import realignment
+from tomo_polysplat.plan.answer import Answer, Status
+from tomo_polysplat.plan.means import Means
+from tomo_polysplat.scan.geometry import from_astra
+from tomo_polysplat.scan.moves import Scanner, moved_geometry
+from tomo_polysplat.settings import make_settings
+
+AXIS = Answer({}, "the axis of rotation is where it was told", Status.ASKED, {"offset": 0.0, "error": 0.005})
+VIEWS = 48
+MEANS = Means(make_settings("balanced", None), None, 0, torch.device("cpu"))
+
+
+@cache
+def wobble():
+    shifts = np.random.default_rng(4).normal(0, 0.6, (VIEWS, 2))
+    return shifts - shifts.mean(axis=0)
+
+
+@cache
+def problem(moved):
+    """Told by a geometry that lacks what the scanner did: it is told moved the other way, to first order."""
+    scan = tps.simulate_scan("teeth", 20, VIEWS, photons=1e5)
+    geometry, grid = from_astra(scan.proj_geom, scan.vol_geom)
+    moves = {"roll": torch.tensor(-1.5).double(), "views": torch.from_numpy(-wobble())} if moved else {}
+    told = moved_geometry(Scanner(geometry), moves) if moved else geometry
+    values = np.ascontiguousarray(scan.projections.transpose(1, 0, 2))
+    return Problem.of(values, told, grid, scan.unit, scan.spectrum, None)
+
+
+def ask(moved, axis=AXIS):
+    return realignment.realigned(problem(moved), axis, MEANS, lambda *_: None)
+
+
+def test_a_scanner_that_is_right_is_left():
+    assert ask(False) is AXIS
+
+
+def test_roll_and_shifts_of_views_are_found():
+    found, true = ask(True), problem(True)
+    assert found.value["roll"] == pytest.approx(1.5, abs=0.15)
+    # But for what would move the object.
+    order = np.arange(VIEWS) if true.order is None else np.argsort(true.order)
+    shifts = np.array(found.value["views"])[order]
+    assert np.std(shifts[:, 1] - wobble()[:, 1]) < 0.15 and np.std(shifts[:, 0] - wobble()[:, 0]) < 0.3
+    assert found.evidence["better"] > 0.2 and "falls" in found.why
+
+
+@pytest.mark.parametrize(
+    "before, after",
+    [([1.0, 1.2, 0.9], [0.995, 1.194, 0.896]), ([1.0, 1.2, 0.9], [1.6, 0.5, 0.6]), ([np.nan] * 3, [1.0] * 3)],
+)
+def test_moves_that_held_out_rays_do_not_confirm_are_not_made(monkeypatch, before, after):
+    found = {"roll": torch.tensor(1.0).double()}, [np.array(before), np.array(after)]
+    monkeypatch.setattr(realignment._Realignment, "moved", lambda *_: found)
+    assert ask(False) is AXIS
+
+
+def test_a_fit_that_fails_moves_nothing_and_ends_no_run(monkeypatch, caplog):
+    def failing(*_):
+        raise RuntimeError("broken")
+
+    monkeypatch.setattr(realignment, "first_volume", failing)
+    assert ask(False) is AXIS and "broken" in caplog.text
+
+
+def test_a_short_run_is_not_asked(monkeypatch):
+    monkeypatch.setattr(realignment._Realignment, "moved", None)
+    quick = Means(make_settings("balanced", {"passes": 4.0}), None, 0, torch.device("cpu"))
+    assert realignment.realigned(problem(False), AXIS, quick, lambda *_: None) is AXIS
+
+
+def test_a_roll_that_hides_from_a_fit_is_reached_by_longer_steps():
+    left, before, step = np.array([0.2, 0.3, -0.1]), np.array([0.4, 0.0, 0.2]), np.array([0.4, 0.0, 0.2])
+    np.testing.assert_allclose(realignment._secant(left, before, step), [0.4, 0.3, -0.1])

@@ -1,0 +1,119 @@
+"""Sums over the rays of what a fit leaves and of how that would change were the scanner moved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from tomo_polysplat.fit.loss import misfit
+from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.scan.moved_rays import falls_on
+from tomo_polysplat.settings import Settings
+
+__all__ = ["MoveSums", "move_sums"]
+
+# Views looked at together, and rays, beside a step's memory, which a GPU keeps.
+_AT_ONCE, _RAYS = 8, 1 << 23
+# Residuals beyond so many usual ones of some views, or of what a model is allowed, count as so many.
+_FAR = 4.0
+_LEAST_ERROR = 1e-3
+# Weights of a Gaussian of one pixel. Both sides are smoothed with it, so that noise has less of a part in the slopes.
+_BLUR = (0.0545, 0.2442, 0.4026, 0.2442, 0.0545)
+
+
+@dataclass(frozen=True)
+class MoveSums:
+    """Normal equations of moves, view by view.
+
+    Attributes
+    ----------
+    normal : (2, views, moves + 1, moves + 1) array
+        Sums of products of slopes, of the left half of the detector and of the right one. The last slope is that of
+        -log of the view's light, 1.
+    told : (2, views, moves + 1) array
+        Sums of slopes times measurement less model.
+    held_out : (views,) array
+        Mean misfit of the rays held out; NaN in views without any.
+    """
+
+    normal: np.ndarray
+    told: np.ndarray
+    held_out: np.ndarray
+
+
+@torch.no_grad()
+def move_sums(
+    gaussians: Gaussians, scene: FitScene, rays: Rays, settings: Settings, falls: torch.Tensor
+) -> MoveSums:
+    """Those of all views.
+
+    Parameters
+    ----------
+    gaussians, scene, rays, settings
+        Of the fit.
+    falls : (moves, views, 3, 3) float64 tensor
+        How rays shift on the detector with each move (`scan.moved_rays.falls_of`).
+    """
+    views, rows, columns = len(rays.views), rays.views.rows, rays.views.columns
+    device, many = rays.target, len(falls) + 1
+    falls = falls.to(device, torch.float32)
+    normal = torch.zeros((2, views, many, many), dtype=torch.float64, device=device)
+    told = torch.zeros((2, views, many), dtype=torch.float64, device=device)
+    held_out = torch.full((views,), torch.nan, dtype=torch.float64, device=device)
+    at_once = max(1, min(_AT_ONCE, _RAYS // (rows * columns * many)))
+    for first in range(0, views, at_once):
+        some = np.arange(first, min(first + at_once, views))
+        here = slice(first, first + len(some))
+        seen, measured, fitted, aside = rays.batch(some)
+        predicted, _ = scene.projections(gaussians, seen)
+        for k, view in enumerate(some.tolist() if rays.held_out else ()):
+            held_out[view] = misfit(predicted[k], measured[k], aside[k], settings)
+        left = _left(measured - predicted, fitted, max(settings.model_error, _LEAST_ERROR))
+        slopes, trust = _slopes(predicted, falls[:, here]), fitted.square()
+        for side, part in enumerate((slice(0, columns // 2), slice(columns // 2, columns))):
+            one = slopes[..., part].flatten(2).double()
+            weighed = one * trust[:, None, :, part].flatten(2).double()
+            normal[side, here] = weighed @ one.transpose(1, 2)
+            told[side, here] = torch.einsum("vmp,vp->vm", weighed, left[..., part].flatten(1).double())
+    return MoveSums(*(part.cpu().numpy() for part in (normal, told, held_out)))
+
+
+def _left(residual: torch.Tensor, fitted: torch.Tensor, allowed: float) -> torch.Tensor:
+    """What is left of the fitted rays, (views, rows, columns), smoothed; those far off count as less far ones."""
+    used = (fitted > 0).to(residual.dtype)
+    usual = ((residual * fitted).square().sum() / used.sum().clamp(min=1)).sqrt().clamp(min=allowed)
+    far = _FAR * usual / fitted.clamp(min=1e-12)
+    return _smoothed(residual.maximum(-far).minimum(far) * used) / _smoothed(used).clamp(min=1e-6)
+
+
+def _slopes(predicted: torch.Tensor, falls: torch.Tensor) -> torch.Tensor:
+    """(views, moves + 1, rows, columns) change of smoothed images with each move, and 1."""
+    image = _smoothed(predicted) / _smoothed(torch.ones_like(predicted))
+    rows, columns = (torch.arange(n, device=image.device, dtype=image.dtype) for n in image.shape[1:])
+    across, down = falls_on(falls, columns, rows)
+    slopes = across * _slope(image, 2) + down * _slope(image, 1)
+    return torch.cat([slopes, torch.ones_like(slopes[:1])]).transpose(0, 1)
+
+
+def _smoothed(images: torch.Tensor) -> torch.Tensor:
+    """(views, rows, columns) images smoothed by a pixel along both; what lies beside them is 0."""
+    half = len(_BLUR) // 2
+    # No convolution: a GPU's may round to ten bits.
+    for axis, pad in ((2, (half, half)), (1, (0, 0, half, half))):
+        wide, many = torch.nn.functional.pad(images, pad), images.shape[axis]
+        images = sum(
+            (share * wide.narrow(axis, k, many) for k, share in enumerate(_BLUR)), torch.zeros_like(images)
+        )
+    return images
+
+
+def _slope(images: torch.Tensor, axis: int) -> torch.Tensor:
+    """Central differences along an axis, one-sided at the ends; 0 where there is but one pixel."""
+    if images.shape[axis] < 2:
+        return torch.zeros_like(images)
+    slope: torch.Tensor = torch.gradient(images, dim=axis)[0]
+    return slope

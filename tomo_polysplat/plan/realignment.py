@@ -1,0 +1,241 @@
+"""Moves of the scanner that opposite rays do not tell, by default: roll, tilt, single views, and an axis they miss.
+
+What a fit of a pass leaves of the rays tells them. Where there are any, two or three more fits find them to hundredths
+of a pixel, and rays held out of these have to confirm them.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from tomo_polysplat.fit.move_sums import move_sums
+from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.nuisances.alignment import Alignment
+from tomo_polysplat.nuisances.move_estimate import shifts_of_views, whole_moves
+from tomo_polysplat.plan.answer import Answer, Status
+from tomo_polysplat.plan.axis import axis_of
+from tomo_polysplat.plan.coarse import coarse_settings
+from tomo_polysplat.plan.first_gaussians import first_gaussians
+from tomo_polysplat.plan.first_volume import first_volume
+from tomo_polysplat.plan.means import Means
+from tomo_polysplat.plan.model import rays_of, scene_of
+from tomo_polysplat.plan.order import plan_from_start
+from tomo_polysplat.plan.trial import fitted_shortly
+from tomo_polysplat.ranks import current_ranks
+from tomo_polysplat.scan.gauges import effects, view_gauge
+from tomo_polysplat.scan.moved_rays import falls_of
+from tomo_polysplat.scan.moves import Scanner, moved_geometry
+
+__all__ = ["realigned"]
+
+logger = logging.getLogger(__name__)
+
+# Moves of the whole scanner that are looked for, with those of single views.
+_WHOLE = ("u", "roll")
+# One is looked for where the object leaves this share of what it does (`scan.gauges.effects`), and the axis where
+# opposite rays tell it no better than this, in pixels: their error is the smaller one then.
+_TOLD, _AXIS_KNOWN = 0.1, 0.02
+# Moves of more than this, in pixels of what is seen, beyond so many standard errors are looked for, and views shifted
+# by more than that; once any is, all that are sure to so many standard errors are made.
+_LEAST, _SURE, _LEAST_OF_VIEWS, _FOUND = 0.01, 2.5, 0.03, 2.0
+# They are kept where the misfit of the same held-out rays falls by more than this, and by so many standard errors.
+_BETTER, _SURELY_BETTER = 0.01, 2.5
+# Fits, their passes, and the change, in pixels, after which the moves are known.
+_ROUNDS, _PASSES, _SETTLED = 5, 1.0, 0.02
+# A run of fewer passes is not asked: a fit would be too large a part of it.
+_LEAST_PASSES = 5.0
+# A step may be so many times what a fit says. An axis stays if less than this of a step is gained: half acquisitions
+# gained 0.4, and went a pixel astray; whole turns gain 0.9 and more.
+_FARTHEST, _GAINED = 2.0, 0.6
+
+
+@dataclass(frozen=True)
+class _Left:
+    """What a fit says is still to be moved.
+
+    Attributes
+    ----------
+    whole : (moves,) array
+        Moves of the whole scanner, those alone that are sure.
+    views : (views, 2) array
+        Shifts of single views, likewise.
+    pixels : float
+        The largest of them, as seen.
+    clear : bool
+        Whether any is large, and sure, enough to be looked for.
+    held_out : (views,) array
+        Misfits of the rays held out of the fit.
+    """
+
+    whole: np.ndarray
+    views: np.ndarray
+    pixels: float
+    clear: bool
+    held_out: np.ndarray
+
+
+def realigned(problem: Problem, axis: Answer, means: Means, report: Callable[[float, str], Any]) -> Answer:
+    """Where the scanner stood, as a fit of one pass tells it; a few more find it out where it says that it moved.
+
+    Parameters
+    ----------
+    problem : Problem
+        As told.
+    axis : Answer
+        Of `plan.axis.find_axis`, with which it begins.
+    means : Means
+    report : callable
+        Gets the share done, none, and words.
+
+    Returns
+    -------
+    Answer
+        That of the axis, where there is no more to move, or where held-out rays do not confirm it.
+    """
+    if (means.settings.passes or math.inf) < _LEAST_PASSES:
+        return axis
+    report(0.0, "alignment")
+    try:
+        moved, misfits = _Realignment(problem, axis, means).moved(_tensors(axis.value))
+    except Exception as broken:
+        # Processes that share the steps may be left behind by one that fails.
+        if current_ranks().count > 1:
+            raise
+        logger.warning("A short fit failed, so the scanner stays where it is: %r", broken)
+        return axis
+    moves = {name: value.tolist() for name, value in moved.items() if bool(value.any())}
+    if moves == axis.value:
+        logger.info("Alignment: no more has moved")
+        return axis
+    words, (better, error) = Alignment.told(moves), _improvement(misfits[0], misfits[-1])
+    share = f"misfit of held-out rays falls by {better:.1%} (standard error {error:.1%})"
+    if not better > max(_BETTER, _SURELY_BETTER * error):
+        logger.info("Alignment: not moved, %s; the %s", words, share)
+        return axis
+    logger.warning("The scanner stood elsewhere: %s. align=False leaves it.", words)
+    evidence = {**axis.evidence, "better": better, "better_error": error}
+    return Answer(moves, f"{words}; the {share}", Status.ASKED, evidence)
+
+
+def _improvement(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
+    """By what share the misfits of the views fall, and its standard error."""
+    both = np.isfinite(before) & np.isfinite(after)
+    fall, mean = (before - after)[both], float(before[both].mean()) if both.any() else 0.0
+    if not mean > 0 or len(fall) < 2:
+        return 0.0, math.inf
+    return float(fall.mean()) / mean, float(fall.std(ddof=1)) / math.sqrt(len(fall)) / mean
+
+
+class _Realignment:
+    """Fits of a pass or two, and what they say of the scanner."""
+
+    def __init__(self, problem: Problem, axis: Answer, means: Means) -> None:
+        self.problem, self.means = problem, means
+        self.scanner = Scanner(problem.geometry, axis_of(problem))
+        whole = ["u"] if problem.geometry.planar else list(_WHOLE)
+        if axis.evidence.get("error", math.inf) <= _AXIS_KNOWN:
+            whole.remove("u")
+        found = effects(self.scanner, whole, 1.0)
+        self.names = tuple(name for name, effect in found.items() if effect.told >= _TOLD)
+        self.seen = np.array([found[name].pixels for name in self.names])
+        self.gauge = view_gauge(self.scanner).numpy()
+        self.settings = replace(coarse_settings(means.settings), passes=_PASSES)
+
+    def moved(self, start: dict[str, torch.Tensor]) -> tuple[dict[str, torch.Tensor], list[np.ndarray]]:
+        """Where the scanner stood, and the misfits of held-out rays of fits by it, the first as it is."""
+        values, misfits = start, list[np.ndarray]()
+        before: tuple[np.ndarray, np.ndarray] | None = None
+        for number in range(_ROUNDS):
+            left = self._left(*self._fitted(values), values)
+            misfits.append(left.held_out)
+            if not (number or left.clear) or not left.pixels or number == _ROUNDS - 1:
+                break
+            if before is not None and self._hides_axis(left.whole, *before):
+                values, before = self._without_axis(values, start), None
+                continue
+            step = left.whole if before is None else _secant(left.whole, *before)
+            before = left.whole, step
+            values = self._stepped(values, step, left.views)
+            if number and left.pixels < _SETTLED:
+                break
+        return values, misfits
+
+    def _hides_axis(self, left: np.ndarray, left_before: np.ndarray, step: np.ndarray) -> bool:
+        """Whether the object takes the place of most of a step of the axis, as it does where one half of it is seen."""
+        if "u" not in self.names:
+            return False
+        at = self.names.index("u")
+        return bool(step[at] != 0 and (left_before[at] - left[at]) / step[at] < _GAINED)
+
+    def _without_axis(
+        self, values: dict[str, torch.Tensor], start: dict[str, torch.Tensor]
+    ) -> dict[str, torch.Tensor]:
+        """The values with the axis where it was at the start, where it now stays."""
+        stay = np.array([name != "u" for name in self.names])
+        self.names, self.seen = tuple(name for name in self.names if name != "u"), self.seen[stay]
+        rest = {name: value for name, value in values.items() if name != "u"}
+        return rest | {name: value for name, value in start.items() if name == "u"}
+
+    def _left(
+        self, gaussians: Gaussians, scene: FitScene, rays: Rays, values: dict[str, torch.Tensor]
+    ) -> _Left:
+        """What a fit says is still to be moved."""
+        falls = falls_of(self.scanner, values, (*self.names, "u", "v"))
+        sums = move_sums(gaussians, scene, rays, self.settings, falls)
+        normal, told, many = sums.normal, sums.told, len(self.names)
+        moves = whole_moves(normal.sum(axis=0), told.sum(axis=0), range(many))
+        size, error = np.abs(moves.value) * self.seen, moves.error * self.seen
+        whole = np.where(size > _FOUND * error, moves.value, 0.0)
+        told = told - normal[..., :many] @ whole
+        single = slice(many, many + 3)
+        shifts = shifts_of_views(normal[:, :, single, single], told[:, :, single], self.gauge)
+        rms = np.sqrt(np.mean(shifts**2, axis=0))
+        pixels = float(max((np.abs(whole) * self.seen).max(initial=0.0), rms.max()))
+        clear = bool((size > _LEAST + _SURE * error).any() or (rms > _LEAST_OF_VIEWS).any())
+        logger.debug("left: %s of errors %s, views %s px", moves.value, moves.error, rms)
+        return _Left(whole, shifts, pixels, clear, sums.held_out)
+
+    def _stepped(
+        self, values: dict[str, torch.Tensor], whole: np.ndarray, shifts: np.ndarray
+    ) -> dict[str, torch.Tensor]:
+        """Values of the moves after a step; those that are 0 are left out."""
+        values = dict(values)
+        for name, by in [*zip(self.names, whole), ("views", shifts)]:
+            if np.any(by):
+                values[name] = values.get(name, 0.0) + torch.as_tensor(by, dtype=torch.float64)
+        return values
+
+    def _fitted(self, values: dict[str, torch.Tensor]) -> tuple[Gaussians, FitScene, Rays]:
+        """A fit by the scanner as it stood."""
+        settings, device = self.settings, self.means.device
+        # What is told of one start is not kept for another.
+        geometry = moved_geometry(self.scanner, values) if values else self.problem.geometry
+        problem = self.problem.seen_by(geometry)
+        start, _ = first_volume(problem, device, settings)
+        plan = plan_from_start(start, problem, settings, device)
+        scene, rays = scene_of(problem, plan, settings, device), rays_of(problem, plan, settings, device)
+        seeds, _ = first_gaussians(start, plan, problem, settings, device)
+        outcome = fitted_shortly(seeds, plan, problem, scene, rays, replace(self.means, settings=settings))
+        return outcome.gaussians, scene, rays
+
+
+def _secant(left: np.ndarray, left_before: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """How far to go, of what was left before a step and after it: the object hides a part of a move from each fit."""
+    gained = left_before - left
+    with np.errstate(divide="ignore", invalid="ignore"):
+        times = np.where((left_before != 0) & (gained * step > 0), step / gained, 1.0)
+    return left * np.clip(times, 1.0, _FARTHEST)
+
+
+def _tensors(moves: Mapping[str, Any]) -> dict[str, torch.Tensor]:
+    return {name: torch.tensor(value, dtype=torch.float64) for name, value in moves.items()}
