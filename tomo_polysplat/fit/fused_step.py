@@ -28,6 +28,7 @@ from tomo_polysplat.kernels.project import triton_backward as rays_backward
 from tomo_polysplat.kernels.project import triton_forward as rays_forward
 from tomo_polysplat.kernels.project.triton_pull_back import pull_back as rays_pull_back
 from tomo_polysplat.kernels.project.triton_setup import footprints
+from tomo_polysplat.kernels.step.faint import HALO
 from tomo_polysplat.kernels.step.triton_activate import activate
 from tomo_polysplat.kernels.step.triton_detector import detected_misfit_gradient
 from tomo_polysplat.kernels.step.triton_misfit import Measurement, Splat, misfit_gradient
@@ -104,8 +105,9 @@ class FusedStep:
             self._curves = torch.cat([scene.reference_curve, scene.output_curve])
         self._measurement = self._measure()
         self._planes = ranks.mine(scene.box.shape[0])
-        # With the planes beside them, which their differences need.
-        self._slab = slice(max(self._planes.start - 1, 0), min(self._planes.stop + 1, scene.box.shape[0]))
+        # With the planes beside them, which their differences and what counts as faint need.
+        first, end = self._planes.start - HALO, self._planes.stop + HALO
+        self._slab = slice(max(first, 0), min(end, scene.box.shape[0]))
         depth = self._slab.stop - self._slab.start
         self._box = scene.box.part((self._slab.start, 0, 0), (depth, *scene.box.shape[1:]))
         self._box_table = box_table(self._box, device)
