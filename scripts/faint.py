@@ -35,7 +35,7 @@ _CUBE = np.ones((3, 3, 3), bool)
 
 
 def labels_of(phantom: Phantom, size: int, half_width: float) -> np.ndarray:
-    """(size, size, size) number of the matter at each voxel's centre, of a material and density, all fat alike; 0: none."""
+    """(size, size, size) number of the matter at voxel centres, by material and density, fat by material alone."""
     ends = (np.arange(size) + 0.5) / size * 2 * half_width - half_width
     z, y, x = np.meshgrid(ends, ends, ends, indexing="ij")
     points, labels = np.stack([x, y, z], axis=-1), np.zeros((size,) * 3, int)
