@@ -113,7 +113,7 @@ class Settings:
     """Standard deviations at which a projected Gaussian ends."""
 
     # Smoothing.
-    tv_weight: float = 0.045
+    tv_weight: float = 0.04
     """Weight of the total variation per voxel, in soft references."""
     tv_factor: float | None = None
     """Factor of ``tv_weight``."""
