@@ -121,8 +121,8 @@ def test_with_a_corner_noise_beside_an_edge_counts_in_full_and_the_edge_by_its_l
     assert found == pytest.approx((1e-3 + 0.1 * math.log(8.0)) / 2, rel=1e-4)
 
 
-@pytest.mark.parametrize(("wall", "faint"), [(7, 2), (6, 1), (5, 0)])
-def test_faint_differences_count_squared_unless_an_edge_is_within_two_voxels(wall, faint):
+@pytest.mark.parametrize(("wall", "faint"), [(8, 2), (7, 1), (6, 0)])
+def test_faint_differences_count_squared_unless_an_edge_is_within_three_voxels(wall, faint):
     """By Huber's function with its corner at a half of theirs, in the logarithm; of two differences so many."""
     row, corner, height = torch.zeros((1, 1, 13), dtype=torch.float64), 0.1, 0.02
     row[..., 3], row[..., wall:] = height, 0.4
@@ -137,7 +137,7 @@ def test_nothing_dense_is_faint_nor_what_is_beside_it():
     row = torch.full((1, 1, 9), 3.0)
     assert not away_from_edges(row, 0.1, 2.2).any() and away_from_edges(row, 0.1, 3.0).all()
     row[..., 4] = 3.2
-    assert away_from_edges(row, 0.1, 3.0)[0, 0].tolist() == [True] * 2 + [False] * 5 + [True] * 2
+    assert away_from_edges(row, 0.1, 3.0)[0, 0].tolist() == [True] + [False] * 7 + [True]
 
 
 def test_the_pull_on_an_edge_falls_with_its_height():

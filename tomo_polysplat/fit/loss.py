@@ -119,7 +119,7 @@ def part_of_variation(
 
 @torch.no_grad()
 def away_from_edges(volume: torch.Tensor, corner: float, dense: float) -> torch.Tensor:
-    """Which voxels have no edge and no dense matter beside them, within two voxels along each axis.
+    """Which voxels have no edge and no dense matter beside them, within three voxels along each axis.
 
     Parameters
     ----------
