@@ -8,11 +8,13 @@ from pathlib import Path
 
 from tomo_polysplat.nuisances.known import NUISANCES
 from tomo_polysplat.plan.order import ORDER
+from tomo_polysplat.settings import _CHOICES, _RANGES, _SWITCHES
 
 PACKAGE = Path(__file__).parents[1] / "tomo_polysplat"
 # Functions whose calls are the way of a scan; see `way`.
 STAGES = (
     ("reconstruction.py", "reconstruct"),
+    ("reconstruction.py", "_problem"),
     ("plan/solver.py", "solve"),
     ("plan/preparation.py", "prepare"),
     ("plan/solver.py", "_fit"),
@@ -113,8 +115,27 @@ def _box(top: float, size: float):
     )
 
 
+# What no range of numbers says.
+_OTHER = {"curves": "1 or 3", "agent": "a dict of settings", "memory": "bytes, or text"}
+
+
+def _range(name: str) -> str:
+    """The values that a setting takes besides None."""
+    if name in _OTHER:
+        return _OTHER[name]
+    if name in _SWITCHES:
+        return "True, False"
+    if name in _CHOICES:
+        return ", ".join(f'"{choice}"' for choice in _CHOICES[name])
+    limits = _RANGES.get(name, {"at_least": 0.0})
+    most = f" to {limits['at_most']:g}" if "at_most" in limits else ""
+    if "above" in limits:
+        return f"above 0{most and ',' + most}"
+    return f"{limits['at_least']:g}{most}" if most else f"from {limits['at_least']:g}"
+
+
 def settings_tables() -> str:
-    """The settings by group, as the source has them: name, default, and its sentence."""
+    """The settings by group, as the source has them: name, default, range, and its sentence."""
     source = (PACKAGE / "settings.py").read_text(encoding="utf-8")
     lines, parts = source.splitlines(), []
     found = next(n for n in ast.parse(source).body if isinstance(n, ast.ClassDef) and n.name == "Settings")
@@ -125,9 +146,10 @@ def settings_tables() -> str:
         above = [line.strip() for line in lines[field.lineno - 2 : field.lineno - 1]]
         if above and above[0].startswith("# "):
             group = above[0][2:].rstrip(".")
-            parts.append(f"\n## {group}\n\n| Setting | Default | What it is |\n|---|---|---|")
+            parts.append(f"\n## {group}\n\n| Setting | Default | Values | What it is |\n|---|---|---|---|")
         told = " ".join(ast.literal_eval(words.value).split()).replace("|", "\\|")
-        parts.append(f"| `{ast.unparse(field.target)}` | {ast.unparse(field.value)} | {told} |")
+        name = ast.unparse(field.target)
+        parts.append(f"| `{name}` | {ast.unparse(field.value)} | {_range(name)} | {told} |")
     return "\n".join(parts) + "\n"
 
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 __all__ = ["make"]
@@ -16,28 +19,74 @@ _COMMANDS = (
     ("tomo-polysplat", "import", "my_scan/", "-o", "scan.h5"),
     ("tomo-polysplat", "recon", "scan.h5", "-o", "volume.tif", "--quality", "fast"),
 )
+_DEMO = ("tomo-polysplat", "demo", "--overwrite")
+_RESULT = ("tomo-polysplat", "recon", "scan.h5", "-o", "result.h5", "--quality", "fast")
+_VIEW = ("tomo-polysplat", "view", "result.h5", "--scan", "scan.h5", "--no-browser")
+_BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 # Of a line of output that is shown.
 _WIDTH = 150
 
 
 def make(folder: Path) -> None:
-    """Write ``commands.txt`` and ``commands.png`` into a folder."""
-    with tempfile.TemporaryDirectory() as place:
-        shown = [_shown(command, Path(place)) for command in _COMMANDS]
-        (folder / "commands.txt").write_text("\n".join(shown), encoding="utf-8")
-        _draw(Path(place) / "volume.tif", folder / "commands.png")
+    """Write what commands print, as ``commands.txt``, ``demo.txt`` and ``view.txt``, and pictures of what they make.
+
+    Without a browser the page of ``view`` is the picture that is stored beside this file.
+    """
+    with tempfile.TemporaryDirectory() as name:
+        place = Path(name)
+        (folder / "commands.txt").write_text(_printed(_COMMANDS, place), encoding="utf-8")
+        _draw(place / "volume.tif", folder / "commands.png")
+        shown = _printed((_RESULT,), place)
+        with _running(_VIEW, place) as lines:
+            (folder / "view.txt").write_text(f"{shown}\n{_told(_VIEW, lines)}", encoding="utf-8")
+            _photograph(lines[0], folder / "view.png")
+        (folder / "demo.txt").write_text(_printed((_DEMO,), place), encoding="utf-8")
+        shutil.copy(place / "demo.png", folder / "demo.png")
 
 
-def _shown(command: tuple[str, ...], place: Path) -> str:
-    """A command as it is typed, and what it prints."""
-    real = [sys.executable, *command[1:]]
-    if command[0] != "python":
-        real = [sys.executable, "-c", _MAIN, *command[1:]]
-    done = subprocess.run(
-        real, cwd=place, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=True
-    )
-    lines = [f"$ {' '.join(command)}", *done.stdout.splitlines()]
+def _printed(commands: tuple[tuple[str, ...], ...], place: Path) -> str:
+    """Commands as they are typed, and what they print."""
+    told = []
+    for command in commands:
+        done = subprocess.run(
+            _real(command), cwd=place, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=True
+        )
+        told.append(_told(command, done.stdout.splitlines()))
+    return "\n".join(told)
+
+
+def _real(command: tuple[str, ...]) -> list[str]:
+    if command[0] == "python":
+        return [sys.executable, *command[1:]]
+    return [sys.executable, "-c", _MAIN, *command[1:]]
+
+
+def _told(command: tuple[str, ...], printed: list[str]) -> str:
+    lines = [f"$ {' '.join(command)}", *printed]
     return "\n".join(line for text in lines for line in _broken(text)) + "\n"
+
+
+@contextmanager
+def _running(command: tuple[str, ...], place: Path) -> Iterator[list[str]]:
+    """A command that waits for the end of the block; its first two lines."""
+    with subprocess.Popen(_real(command), cwd=place, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        try:
+            yield [process.stdout.readline().rstrip() for _ in range(2)]
+        finally:
+            process.terminate()
+
+
+def _photograph(address: str, path: Path) -> None:
+    browser = next((found for name in _BROWSERS if (found := shutil.which(name))), None)
+    if browser is None:
+        shutil.copy(Path(__file__).parent / "view.png", path)
+        return
+    # Its own folder, so that a browser that somebody uses is left alone.
+    with tempfile.TemporaryDirectory() as profile:
+        options = ("--headless", "--no-sandbox", "--disable-gpu", "--window-size=1300,760")
+        own = (f"--user-data-dir={profile}", "--virtual-time-budget=8000", f"--screenshot={path}")
+        subprocess.run([browser, *options, *own, address], capture_output=True, check=True, timeout=120)
 
 
 def _broken(text: str) -> list[str]:

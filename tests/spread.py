@@ -7,22 +7,26 @@ from xdist.scheduler import LoadFileScheduling
 
 # Their tests share nothing, so each may go to another worker.
 SPLIT = ("tests/test_notebooks.py",)
-# Files that take longest, the longest first; the order of the others does not matter.
+# Files that take longest, the longest first; the order of the others does not matter. The first one runs no kernel of
+# numba's: meanwhile the other worker compiles them, once for both.
 LONGEST = (
+    "tests/kernels/test_triton_steps.py",
     "tests/bench/test_bench_hard.py",
-    "tests/plan/test_tv_factor.py",
-    "tests/plan/test_scatter_search.py",
     "tests/test_several_devices.py",
     "tests/bench/test_bench_physics.py",
-    "tests/kernels/test_triton_steps.py",
-    "tests/plan/test_pixel_rays.py",
     "tests/scan/test_check.py",
+    "tests/plan/test_scatter_search.py",
+    "tests/plan/test_tv_factor.py",
     "tests/test_reconstruct.py",
     "tests/plan/test_light.py",
+    "tests/plan/test_pixel_rays.py",
     "tests/kernels/test_triton.py",
-    "tests/test_reconstruct_fat.py",
     "tests/test_threads.py",
+    "tests/plan/test_edges.py",
+    "tests/plan/test_plan.py",
     "tests/test_readme.py",
+    "tests/plan/test_never_worse.py",
+    "tests/fuzz/test_fuzz.py",
     "tests/test_notebooks.py",
 )
 

@@ -11,11 +11,15 @@ NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 # Text that is replaced so that a test takes seconds; each must be there.
 SMALL = {
     "01_quickstart": {"SIZE, VIEWS, QUALITY = 48, 120": "SIZE, VIEWS, QUALITY = 24, 48"},
-    "02_tomopy_pipeline": {"COLUMNS, ROWS, VIEWS = 72, 12, 150": "COLUMNS, ROWS, VIEWS = 40, 4, 60"},
-    "03_astra_cone_geometry": {"SIZE, VIEWS, QUALITY = 40, 120": "SIZE, VIEWS, QUALITY = 20, 48"},
-    "04_spectrum_and_materials": {"SIZE, VIEWS, QUALITY = 40, 120": "SIZE, VIEWS, QUALITY = 32, 60"},
+    "02_tomopy_pipeline": {
+        "COLUMNS, ROWS, VIEWS = 72, 12, 150": "COLUMNS, ROWS, VIEWS = 40, 4, 44",
+        '"unit": "cm"}': '"unit": "cm", "quality": "fast"}',
+        'unit="cm").volume': 'unit="cm", quality="fast").volume',
+    },
+    "03_astra_cone_geometry": {"SIZE, VIEWS, QUALITY = 40, 120": "SIZE, VIEWS, QUALITY = 16, 32"},
+    "04_spectrum_and_materials": {"SIZE, VIEWS, QUALITY = 40, 120": "SIZE, VIEWS, QUALITY = 24, 40"},
     "05_speed_against_error": {
-        "SIZE, VIEWS, PASSES = 40, 120, (10, 40)": "SIZE, VIEWS, PASSES = 16, 32, (2, 4)"
+        "SIZE, VIEWS, PASSES = 40, 120, (10, 40)": "SIZE, VIEWS, PASSES = 16, 24, (1, 2)"
     },
     "06_against_other_methods": {
         'SIZE, VIEWS, QUALITY = 40, 120, "balanced"': 'SIZE, VIEWS, QUALITY = 16, 32, "fast"'

@@ -1,6 +1,7 @@
 """The package as a whole: what importing it costs, which way imports go, and that it is packaged whole."""
 
 import ast
+import graphlib
 import importlib
 import subprocess
 import sys
@@ -121,6 +122,28 @@ def test_imports_go_one_way():
         if LEVEL[home.get(other, other)] > LEVEL[part]
     ]
     assert not upward, "\n".join(upward)
+
+
+def imported_modules(path, known):
+    """Modules of the package that a file imports anywhere, for type checking as well."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom):
+            whole = [f"{node.module}.{alias.name}" for alias in node.names]
+            yield from (name if name in known else node.module for name in whole)
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+
+
+def test_no_modules_import_each_other():
+    """But for results, which can show themselves to what knows what a result is."""
+    known = {
+        ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
+        for path in PACKAGE.rglob("*.py")
+        if path.relative_to(PACKAGE).parts[0] not in ("result", "report", "quality")
+    }
+    graph = {name: {*imported_modules(path, known)} & (known.keys() - {name}) for name, path in known.items()}
+    assert sum(map(len, graph.values())) > 500, "the search for imports found next to nothing"
+    graphlib.TopologicalSorter(graph).prepare()
 
 
 def test_basics_depend_on_basics_only():

@@ -46,6 +46,10 @@ def test_the_readme_has_at_most_1500_words():
     assert len(re.sub(r"^```.*?^```", "", README, flags=re.S | re.M).split()) <= 1500
 
 
+def test_the_changelog_of_what_was_never_released_has_at_most_40_lines():
+    assert len((ROOT / "CHANGELOG.md").read_text(encoding="utf-8").splitlines()) <= 40
+
+
 PAGES = [
     page
     for page in sorted((ROOT / "docs").rglob("*.md"))

@@ -16,16 +16,21 @@ from small_scans import QUICK, cone, fan, reconstruct
 
 import tomo_polysplat as tps
 from tomo_polysplat.fit.fitter import Fitter
+from tomo_polysplat.fit.led_step import LedStep
 from tomo_polysplat.fit.step import EagerStep
 from tomo_polysplat.rank_processes import devices_of, sharing
-from tomo_polysplat.ranks import ALONE, RankFailed, Ranks, current_ranks, led_by
+from tomo_polysplat.ranks import ALONE, RankFailed, current_ranks, led_by, part_of
 from tomo_polysplat.scan.io import save_scan
 
 CPU = torch.device("cpu")
 TWO = ["cpu", "cpu"]
 # What is added up in another order differs by rounding, which grows with every step. A Gaussian whose gradient is all
 # rounding may step either way: so much of nearly all voxels, in the largest one, and so much of the volume, in L2.
-SAME, NEARLY_ALL, OF_ALL = 3e-5, 0.95, 1e-3
+SAME, NEARLY_ALL, OF_ALL = 3e-5, 0.95, 1e-4
+# Smoothing takes the sign of a slope from it where neighbouring voxels are as good as equal. One process whose volumes
+# are rounded otherwise differs by up to 4e-4 in L2, and one that does not smooth by 8e-2.
+SMOOTHED = 1e-3
+ROUGH = QUICK | {"tv_weight": 0.0}
 
 
 def children():
@@ -80,7 +85,7 @@ class TestThreeProcesses:
 
     @pytest.mark.parametrize("scan", [cone, tilted, parallel, fan])
     def test_make_the_volume_of_one(self, scan, three):
-        shared, one = reconstruct(scan()), alone(scan())
+        shared, one = (made(scan(), settings=ROUGH) for made in (reconstruct, alone))
         assert three.count == 3 and shared.plan["ranks"].value == 3 and "ranks" not in one.plan
         assert "returned" not in one.plan, "the start was better, so that nothing is compared"
         assert same(shared.volume, one.volume)
@@ -88,10 +93,22 @@ class TestThreeProcesses:
             assert entry["loss"] == pytest.approx(other["loss"], rel=1e-4)
             assert entry["held_out"] == pytest.approx(other["held_out"], rel=1e-4)
 
+    @pytest.mark.parametrize("scan", [cone, parallel])
+    def test_smooth_as_one(self, scan, three):
+        shared, one = reconstruct(scan()), alone(scan())
+        assert "returned" not in one.plan and relative(shared.volume, one.volume) < SMOOTHED
+
     def test_may_be_more_than_the_views_of_a_step(self, three):
-        settings = QUICK | {"views_per_step": 2, "passes": 0.5}
+        settings = ROUGH | {"views_per_step": 2, "passes": 0.5}
         shared, one = reconstruct(cone(), settings=settings), alone(cone(), settings=settings)
         assert "returned" not in one.plan and same(shared.volume, one.volume)
+
+    def test_compare_whole_images_where_similarity_is_asked_for(self, three):
+        """Which are those of all Gaussians on each."""
+        settings = ROUGH | {"ssim_weight": 0.3, "passes": 1.0}
+        shared, one = reconstruct(cone(), settings=settings), alone(cone(), settings=settings)
+        plain = alone(cone(), settings=settings | {"ssim_weight": 0.0})
+        assert same(shared.volume, one.volume) and not same(plain.volume, one.volume)
 
     def test_all_see_rays_that_change_during_a_run(self, three, monkeypatch):
         """As those of which gains or drift are taken out between two passes."""
@@ -103,11 +120,27 @@ class TestThreeProcesses:
             self.rays.weigh_anew()
             return told
 
-        settings = QUICK | {"passes": 1.4}
+        settings = ROUGH | {"passes": 1.4}
         before = alone(cone(), settings=settings)
         monkeypatch.setattr(Fitter, "_end_pass", less)
         shared, one = reconstruct(cone(), settings=settings), alone(cone(), settings=settings)
         assert same(shared.volume, one.volume) and not same(shared.volume, before.volume)
+
+    def test_hold_others_when_gaussians_have_changed_places(self, three, monkeypatch):
+        """With the optimiser's memory of them: from then on each rank's are those of another one."""
+        end = Fitter._end_pass
+
+        def turned_over(self, share):
+            told = end(self, share)
+            self.gaussians.position[:, 2] *= -1
+            return told
+
+        settings = ROUGH | {"passes": 1.4, "relocated": 0.0}
+        anew, made = LedStep._anew, []
+        monkeypatch.setattr(LedStep, "_anew", lambda step: (made.append(1), anew(step)))
+        monkeypatch.setattr(Fitter, "_end_pass", torch.no_grad()(turned_over))
+        shared, one = reconstruct(cone(), settings=settings), alone(cone(), settings=settings)
+        assert same(shared.volume, one.volume) and made
 
     def test_stand_still_after_ctrl_c_within_a_step(self, three, monkeypatch):
         """The last thing that they do: the best state is returned, and nothing more is asked of them."""
@@ -128,6 +161,17 @@ class TestThreeProcesses:
             reconstruct(cone())
 
 
+@pytest.mark.gpu
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="there is one GPU at most")
+@pytest.mark.parametrize("scan", [cone, fan])
+def test_two_gpus_make_the_volume_of_one(scan):
+    shared, one = (
+        reconstruct(scan(), settings=ROUGH, **on) for on in ({"devices": [0, 1]}, {"device": "cuda:0"})
+    )
+    assert shared.plan["ranks"].value == 2
+    assert relative(shared.volume, one.volume) < SMOOTHED
+
+
 def test_a_process_that_dies_ends_the_run_and_its_checkpoint_goes_on_in_one(tmp_path):
     path, killed = tmp_path / "fit.npz", []
 
@@ -136,9 +180,10 @@ def test_a_process_that_dies_ends_the_run_and_its_checkpoint_goes_on_in_one(tmp_
         os.kill(children()[0], signal.SIGKILL)
 
     with pytest.raises(RankFailed, match=r"rank 1 of 2 \(cpu\) was ended by signal 9"):
-        reconstruct(cone(), devices=TWO, callbacks=[kill], checkpoint=path)
+        reconstruct(cone(), devices=TWO, callbacks=[kill], checkpoint=path, settings=ROUGH)
     assert len(killed) == 1 and time.monotonic() - killed[0] < 30 and not children()
-    resumed, whole = reconstruct(cone(), resume=True, checkpoint=path), reconstruct(cone())
+    resumed = reconstruct(cone(), resume=True, checkpoint=path, settings=ROUGH)
+    whole = reconstruct(cone(), settings=ROUGH)
     assert len(resumed.history) == len(whole.history) == 2
     assert same(resumed.volume, whole.volume)
 
@@ -156,7 +201,7 @@ def test_what_a_process_fails_of_is_told():
 
 def test_torchrun_reconstructs_by_the_command_line(tmp_path):
     save_scan(fan(metal=False), tmp_path / "scan.npz")
-    about = [arg for name, value in QUICK.items() for arg in ("--set", f"{name}={value}")]
+    about = [arg for name, value in ROUGH.items() for arg in ("--set", f"{name}={value}")]
     command = [
         sys.executable,
         "-m",
@@ -170,13 +215,13 @@ def test_torchrun_reconstructs_by_the_command_line(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=120)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("wrote volume.npy") == 1 and '"ranks"' in (tmp_path / "about.json").read_text()
-    assert same(np.load(tmp_path / "volume.npy"), reconstruct(fan(metal=False)).volume)
+    assert same(np.load(tmp_path / "volume.npy"), reconstruct(fan(metal=False), settings=ROUGH).volume)
 
 
 @pytest.mark.parametrize("length", [0, 1, 2, 7, 12])
 def test_parts_of_ranks_are_all_and_differ_by_one_at_most(length):
     for count in (1, 2, 3, 5):
-        parts = [list(range(length))[Ranks(rank, count).mine(length)] for rank in range(count)]
+        parts = [list(range(length))[part_of(length, rank, count)] for rank in range(count)]
         assert sum(parts, []) == list(range(length))
         assert max(map(len, parts)) - min(map(len, parts)) <= 1
 

@@ -44,11 +44,14 @@ def in_processes(method, seeds, begin=None):
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="this system cannot fork")
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_forked_processes_side_by_side_give_what_one_gives_alone():
-    alone = [digest(seed) for seed in (0, 1)]
-    # Threads of torch and of the kernels have run in this process: a child has none of them.
-    torch.set_num_threads(max(2, torch.get_num_threads()))
-    torch.ones(600, 600) @ torch.ones(600, 600)
-    assert in_processes("fork", [0, 1]) == alone and alone[0] != alone[1]
+    alone, before = [digest(seed) for seed in (0, 1)], torch.get_num_threads()
+    try:
+        # Threads of torch and of the kernels have run in this process: a child has none of them.
+        torch.set_num_threads(max(2, before))
+        torch.ones(600, 600) @ torch.ones(600, 600)
+        assert in_processes("fork", [0, 1]) == alone and alone[0] != alone[1]
+    finally:
+        torch.set_num_threads(before)
 
 
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="this system cannot fork")

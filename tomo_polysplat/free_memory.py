@@ -21,13 +21,16 @@ if TYPE_CHECKING:
     import torch
 
 __all__ = [
-    *("available_memory", "bytes_of", "free_bytes", "in_gigabytes"),
-    *("give_back", "limit_memory", "memory_limits", "recording", "require_memory"),
+    *("MUCH", "available_memory", "bytes_of", "free_bytes", "in_gigabytes"),
+    *("give_back", "keeps_more_than", "limit_memory", "memory_limits", "recording", "require_memory"),
 ]
 
 # Held while a CUDA graph is recorded, which one thread of a process can do at a time. If another one gave memory back
 # meanwhile, torch would end that with an error.
 recording = threading.Lock()
+
+# Of a device's memory, what torch may keep unused before what is to stay is moved for it to be given back.
+MUCH = 0.2
 
 _MEMINFO, _OWN_GROUPS, _GROUPS = Path("/proc/meminfo"), Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
 # Limit, use, and what of the use is files that the system can let go of, in both versions of control groups.
@@ -89,6 +92,16 @@ def free_bytes(device: torch.device) -> int:
     free = torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device) - held
     limit = _LIMITS.get({}).get("cuda")
     return free if limit is None else max(min(free, int(limit) - held), 0)
+
+
+def keeps_more_than(share: float, device: torch.device) -> bool:
+    """Whether torch keeps more than this share of a device's memory for later, unused; nothing on a CPU."""
+    import torch
+
+    if device.type != "cuda":
+        return False
+    unused = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return unused > share * torch.cuda.mem_get_info(device)[1]
 
 
 def give_back() -> None:

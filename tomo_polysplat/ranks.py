@@ -12,7 +12,7 @@ import os
 import pickle
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -22,7 +22,7 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
-__all__ = ["ALONE", "RankFailed", "Ranks", "current_ranks", "join", "join_here", "leave", "led_by"]
+__all__ = ["ALONE", "RankFailed", "Ranks", "current_ranks", "join", "join_here", "leave", "led_by", "part_of"]
 
 # Bytes of a message that travels at once; of a longer one the rest follows.
 _MESSAGE = 4096
@@ -74,16 +74,12 @@ class Ranks:
     _gone: list[int] = field(default_factory=list)
     _broken: bool = False
 
-    def mine(self, length: int) -> slice:
-        """This rank's part of ``range(length)``; empty where there are too few for all."""
-        return slice(length * self.rank // self.count, length * (self.rank + 1) // self.count)
-
     def sum_(self, *tensors: torch.Tensor) -> None:
         """Add up contiguous tensors of one type over all ranks, in place."""
         if self.count == 1:
             return
         if sum(tensor.numel() for tensor in tensors) > _LARGE:
-            for tensor in tensors:
+            for tensor in filter(torch.Tensor.numel, tensors):
                 dist.all_reduce(tensor)
             return
         flat = torch.cat([tensor.reshape(-1) for tensor in tensors])
@@ -151,6 +147,16 @@ class Ranks:
             if tensors[-1].numel():
                 dist.broadcast(tensors[-1], 0)
         return _Unpickler(io.BytesIO(body), tensors).load()
+
+    def send(self, tensors: Iterable[torch.Tensor], rank: int = 0) -> None:
+        """To one rank what it takes by `receive`."""
+        for tensor in filter(torch.Tensor.numel, tensors):
+            _wait_for(dist.isend, tensor.detach().contiguous(), rank)
+
+    def receive(self, tensors: Iterable[torch.Tensor], rank: int = 0) -> None:
+        """From one rank, into contiguous tensors of the same shapes and types as those sent."""
+        for tensor in filter(torch.Tensor.numel, tensors):
+            _wait_for(dist.irecv, tensor.detach(), rank)
 
     @contextmanager
     def together(self) -> Iterator[None]:
@@ -220,6 +226,17 @@ class Ranks:
         with suppress(RuntimeError):
             return self.store.check([_LEFT])
         return False
+
+
+def _wait_for(what: Any, tensor: torch.Tensor, rank: int) -> None:
+    # As a batch: NCCL goes through the connections that there are, in place of new ones of two ranks with buffers.
+    for work in dist.batch_isend_irecv([dist.P2POp(what, tensor, rank)]):
+        work.wait()
+
+
+def part_of(length: int, rank: int, count: int) -> slice:
+    """A rank's part of ``range(length)``; empty where there are too few for all."""
+    return slice(length * rank // count, length * (rank + 1) // count)
 
 
 ALONE = Ranks()

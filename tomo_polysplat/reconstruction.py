@@ -268,7 +268,7 @@ def _note_ranks(plan: Plan) -> None:
         plan.note(
             "ranks",
             ranks.count,
-            f"each makes its part of the views of a step, on {ranks.device.type} devices",
+            f"each holds a part of the Gaussians, on {ranks.device.type} devices",
         )
 
 

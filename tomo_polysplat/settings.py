@@ -13,7 +13,7 @@ from tomo_polysplat.free_memory import bytes_of
 __all__ = ["PRESETS", "Settings", "make_settings"]
 
 _MOVED = ("position", "scale", "rotation", "attenuation", "material", "shared", "blur")
-# Of those that are not any number from 0 on. Material numbers reach a little below the first curve.
+# Of those that are not any number from 0 on; the docs print them. Material numbers go a little below the first curve.
 _RANGES: dict[str, dict[str, Any]] = {
     **dict.fromkeys(("soft_u", "bone_u", "metal_u"), {"at_least": -0.1, "at_most": 1.0}),
     "light_u": {"at_least": -0.1, "at_most": 0.1},

@@ -16,6 +16,8 @@ logger = logging.getLogger(__name__)
 CM_PER_UNIT = {"m": 100.0, "cm": 1.0, "mm": 0.1, "um": 1e-4}
 
 LENGTH_UNITS = (*CM_PER_UNIT, "pixel")
+# What else makes rays of metal look so.
+_ALIKE = "so do rays that were corrected for hardening, and a spectrum that lacks a filter"
 # Densities of water that attenuates as an object's main matter does, in g/cm3: what needs no question; what nobody
 # scans (foams have 0.015; aerogels have 0.003, but through centimetres of those no light is lost); and what no solid
 # attenuates like (gold: 280).
@@ -68,16 +70,22 @@ class Doubt(NamedTuple):
     impossible: bool
 
 
-def density_in_doubt(level: float, unit: str) -> Doubt | None:
+def density_in_doubt(level: float, unit: str, light: bool = False) -> Doubt | None:
     """Whether an object that attenuates like water of `level` g/cm3, in this unit, may be one of another unit.
 
-    Metal, of which a wrong unit of ordinary matter may make none, is not doubted.
+    Metal, of which a wrong unit of ordinary matter may make none, is not doubted, unless it hardens the beam as light
+    matter does (``light``), which is never so dense.
     """
-    if not level > 0 or _ORDINARY[0] <= level <= _DENSEST:
+    if not level > 0 or (_ORDINARY[0] <= level <= _DENSEST and not light):
         return None
     impossible = not _NOTHING <= level <= _DENSEST
     like = f"in {unit} the object attenuates like water of {level:.2g} g/cm3"
-    like += ", which no matter does" if impossible else ", as foam does"
+    if impossible:
+        like += ", which no matter does"
+    elif light:
+        like += f", but hardens the beam as light matter does ({_ALIKE})"
+    elif level < 1:
+        like += ", as foam does"
     others = {name: level * CM_PER_UNIT[unit] / size for name, size in CM_PER_UNIT.items() if name != unit}
     others = {name: it for name, it in others.items() if _ORDINARY[0] <= it <= _ORDINARY[1]}
     middle = math.sqrt(math.prod(_ORDINARY))

@@ -10,8 +10,8 @@ from tomo_polysplat.bench.ablation import AblationBench
 from tomo_polysplat.bench.ablation_affine import affine_errors, project_affine
 from tomo_polysplat.bench.ablation_variants import DEFAULT, GROUPS
 from tomo_polysplat.bench.measure import measure
-from tomo_polysplat.bench.methods import Options, Task
 from tomo_polysplat.bench.scenes import cached_scan
+from tomo_polysplat.bench.task import Options, Task
 from tomo_polysplat.cli import main
 from tomo_polysplat.kernels.project.reference import project
 from tomo_polysplat.kernels.views import DetectorViews

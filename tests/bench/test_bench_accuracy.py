@@ -13,10 +13,11 @@ from tomo_polysplat.bench.accuracy import AccuracyBench
 from tomo_polysplat.bench.accuracy_measures import Regions, edge_width
 from tomo_polysplat.bench.accuracy_stopping import stopping
 from tomo_polysplat.bench.measure import measure
-from tomo_polysplat.bench.methods import METHODS, Method, Options, Task
+from tomo_polysplat.bench.methods import METHODS, Method
 from tomo_polysplat.bench.runs import without_figures
 from tomo_polysplat.bench.scenes import cached_scan
 from tomo_polysplat.bench.tables import cell, grouped, markdown_table
+from tomo_polysplat.bench.task import Options, Task
 from tomo_polysplat.cli import main
 
 SOFT, METAL = 0.25, 5.0

@@ -11,11 +11,12 @@ from tomo_polysplat.bench import measure as measure_module
 from tomo_polysplat.bench import runs as runs_module
 from tomo_polysplat.bench import scenes
 from tomo_polysplat.bench.measure import error_history, measure
-from tomo_polysplat.bench.methods import METHODS, Method, Options, Task
+from tomo_polysplat.bench.methods import METHODS, Method
 from tomo_polysplat.bench.recon import ReconBench, run_recon_bench
 from tomo_polysplat.bench.recon_report import as_text, write_figures
 from tomo_polysplat.bench.runs import timed_runs, warm_up, with_errors
 from tomo_polysplat.bench.scenes import cache_folder, cached_scan, fewer_views
+from tomo_polysplat.bench.task import Options, Task
 from tomo_polysplat.cli import main
 from tomo_polysplat.fit.fork import FEWEST_PASSES
 from tomo_polysplat.fit.optimise import FitState

@@ -11,6 +11,7 @@ import torch
 from tomo_polysplat.fit import choose_step, follow
 from tomo_polysplat.fit.choose_step import NoRoom, own_step
 from tomo_polysplat.fit.led_step import LedStep
+from tomo_polysplat.fit.shares import parted, planes_of_all
 from tomo_polysplat.fit.step import EagerStep
 from tomo_polysplat.ranks import Ranks
 
@@ -36,7 +37,7 @@ class Recorded:
     """A graph that costs nothing."""
 
     def __init__(self, *parts):
-        self.beside = parts[-1]
+        self.beside = parts[3]
         self.pull, self.moments = None, {}
 
 
@@ -92,12 +93,15 @@ class Told(Ranks):
     def tell(self, *message):
         self.messages.append(message)
 
+    def send(self, tensors, rank=0):
+        self.messages.append(("tensors", len(list(tensors)), rank))
+
 
 def test_after_a_step_that_has_no_room_ranks_make_others(problem):
     ranks = Told()
 
     def make(*parts):
-        if isinstance(parts[-1], Recorded):
+        if isinstance(parts[3], Recorded):
             raise NoRoom("full")
         return Recorded(*parts)
 
@@ -114,8 +118,11 @@ def test_after_a_step_that_has_no_room_ranks_make_others(problem):
 def test_a_rank_that_follows_shares_the_same_and_goes_on_without_a_step(problem, monkeypatch):
     gaussians, spacing, rays, scene, settings = problem
     views, asked = rays.views, []
+    parts = parted(gaussians, 2)
     parts = {
-        "gaussians": gaussians,
+        "gaussians": gaussians.select(parts[0][:0]),
+        "counts": [len(part) for part in parts],
+        "planes": planes_of_all(gaussians, parts, scene.box),
         "spacing": spacing,
         "rays": (rays.photons, rays.model_error, rays.held_out, rays.dimmed),
         "views": (views.cone, views.origin, views.matrix, views.rows, views.columns, views.planar),
@@ -125,7 +132,7 @@ def test_a_rank_that_follows_shares_the_same_and_goes_on_without_a_step(problem,
     }
 
     def own(*given):
-        asked.append(given[-1])
+        asked.append(given[3])
         if len(asked) == 2:
             raise NoRoom("full")
         return Recorded(*given)
@@ -140,5 +147,7 @@ def test_a_rank_that_follows_shares_the_same_and_goes_on_without_a_step(problem,
         ),
         ([2], ("end",)),
     ]
-    follow.follow(SimpleNamespace(hear=lambda: messages.pop(0), device=torch.device("cpu")))
+    ranks = Ranks(1, 2)
+    ranks.hear, ranks.receive = lambda: messages.pop(0), lambda tensors: [t.fill_(0) for t in tensors]
+    follow.follow(ranks)
     assert asked[0] is None and isinstance(asked[1], Recorded) and asked[1] is asked[2]

@@ -9,11 +9,12 @@ import torch
 from tomo_polysplat.fit.loss import (
     away_from_edges,
     misfit,
-    part_of_variation,
     total_variation,
+    variation_of_slab,
     weighted_huber,
     weighted_l1,
 )
+from tomo_polysplat.kernels.step.faint import HALO
 from tomo_polysplat.settings import Settings
 
 
@@ -93,18 +94,19 @@ def test_total_variation_of_a_cube_is_its_surface():
     assert float(total_variation(volume, 10.0)) == pytest.approx(3 * 0.7 * 2 * 9 / (8 * 9 * 9))
 
 
-def test_parts_of_the_total_variation_add_up_to_it():
-    """Of planes shared out in any way, some of them to nobody; also of one slice, and with corners."""
+@pytest.mark.parametrize("corners", [(0.0, 0.0), (0.2, 0.05), (0.29, 0.05)])
+@pytest.mark.parametrize(("depth", "first", "last"), [(17, 0, 9), (17, 4, 14), (17, 0, 17), (1, 0, 1)])
+def test_the_slope_of_a_slab_is_that_of_the_whole_but_where_it_ends(depth, first, last, corners):
     generator = torch.Generator().manual_seed(1)
-    for depth, corners in ((7, (0.0, 0.0)), (7, (0.2, 0.05)), (1, (0.0, 0.0))):
-        volume = torch.rand((depth, 4, 5), generator=generator)
-        whole = float(total_variation(volume, 0.9, corners, 0.6))
-        for ends in ((0, depth), (0, 0, depth // 2, depth), (*range(depth + 1), depth)):
-            parts = [
-                float(part_of_variation(volume, slice(a, b), 0.9, corners, 0.6))
-                for a, b in zip(ends, ends[1:])
-            ]
-            assert sum(parts) == pytest.approx(whole, rel=1e-5)
+    volume = torch.rand((depth, 4, 5), generator=generator, dtype=torch.float64)
+    whole, slab = volume.clone().requires_grad_(), volume[first:last].clone().requires_grad_()
+    total_variation(whole, 0.9, corners, 0.6).backward()
+    variation_of_slab(slab, depth, 0.9, corners, 0.6).backward()
+    beside = HALO if any(corners) else 1
+    inner = slice(first + beside * (first > 0), last - beside * (last < depth))
+    told = slab.grad[inner.start - first : inner.stop - first]
+    torch.testing.assert_close(told, whole.grad[inner])
+    assert bool(told.any())
 
 
 def test_total_variation_of_one_slice_leaves_the_missing_axis_out():

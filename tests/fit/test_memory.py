@@ -103,8 +103,19 @@ def test_a_cloud_a_little_too_small_to_be_drawn_by_parts_takes_the_most(monkeypa
     counts = [100_000, 600_000, 999_999, 1_000_001, 1_500_000, 3_000_000]
     one = [taken(count) for count in counts]
     assert sorted(one) == one and [taken(count, 2) for count in counts] == [2 * size for size in one]
-    monkeypatch.setattr(memory, "current_ranks", lambda: Ranks(0, 2))
-    assert all(taken(count) > alone for count, alone in zip(counts, one))
+
+
+def test_ranks_part_what_gaussians_take(monkeypatch):
+    """But not what the first one has of all of them."""
+    scene = {"views": 12, "pixels": 0, "voxels": 0}
+    counts = [100_000, 999_999, 1_500_000, 3_000_000]
+    taken = {}
+    for ranks in (1, 2, 8):
+        monkeypatch.setattr(memory, "current_ranks", lambda ranks=ranks: Ranks(0, ranks))
+        taken[ranks] = [sum(memory.step_bytes(GPU, gaussians=count, **scene).values()) for count in counts]
+        assert sorted(taken[ranks]) == taken[ranks]
+    assert all(0.5 * one < two < 0.9 * one for one, two in zip(taken[1], taken[2]))
+    assert all(1 / 8 * one < eight < two for one, two, eight in zip(*taken.values()))
 
 
 def test_a_gpu_that_is_full_all_the_same_is_told_with_a_remedy(monkeypatch):

@@ -16,7 +16,10 @@ import torch
 
 from tomo_polysplat.fit.choose_step import make_step, why_eager
 from tomo_polysplat.fit.feed import StreamedFeed
+from tomo_polysplat.fit.shares import Part, Planes
 from tomo_polysplat.fit.step import EagerStep
+from tomo_polysplat.kernels import portions
+from tomo_polysplat.ranks import ALONE
 
 sys.path.append(str(Path(__file__).parents[1] / "kernels"))
 from step_scenes import BATCH, compare_steps, fit_problem
@@ -111,6 +114,34 @@ def test_gaussians_turn_from_the_second_step_on():
 )
 def test_a_graph_steps_like_autograd(kind, polychromatic, changes):
     compare_steps(graph_step, "cuda", ("cuda", "triton"), kind, polychromatic, **changes)
+
+
+def step_in_parts(problem, batch):
+    """As of a rank that holds all Gaussians and shares all planes, with nobody."""
+    from tomo_polysplat.fit.graph_step import GraphStep
+
+    depth, device = problem.scene.box.shape[0], problem.gaussians.position.device
+    part = Part(ALONE, Planes(slice(0, depth), np.arange(depth)), len(problem.gaussians), device)
+    made = GraphStep(problem, batch, part)
+    assert all(len(graphs) > 1 for graphs in made._graphs.values())
+    return made
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize(
+    ("kind", "polychromatic", "changes"),
+    [
+        ("cone", True, {"every": 2}),
+        ("parallel", False, {"blurring": False}),
+        ("fan", True, {"pixel_rays": 2}),
+    ],
+)
+@pytest.mark.parametrize("many", [1, 1 << 20])
+def test_a_graph_in_parts_steps_like_autograd(kind, polychromatic, changes, many, monkeypatch):
+    """Also with a part of the views at a time, between each of which ranks would add up."""
+    monkeypatch.setattr(portions, "MANY", many)
+    monkeypatch.setattr(portions, "FEW_VIEWS", 1)
+    compare_steps(step_in_parts, "cuda", ("cuda", "triton"), kind, polychromatic, **changes)
 
 
 @pytest.mark.gpu
@@ -225,7 +256,7 @@ def test_runs_that_share_memory_step_as_if_alone(every):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("place", ["_of_rays", "_volume_gradients", "_update"])
+@pytest.mark.parametrize("place", ["_of_portion", "_volume_gradients", "_update"])
 def test_a_gpu_without_room_for_a_second_run_goes_on_with_the_first(place, monkeypatch):
     """Wherever in the recording it ends; torch can then give memory back and record again."""
     from tomo_polysplat.fit.choose_step import NoRoom
@@ -263,7 +294,7 @@ def test_a_recording_that_is_invalidated_leaves_torch_in_order():
     with pytest.MonkeyPatch.context() as patch:
         do = GraphStep._update
         # To wait for a stream that is recorded is forbidden, and ends the recording.
-        patch.setattr(GraphStep, "_update", lambda step, made: (do(step, made), made.scale.cpu()))
+        patch.setattr(GraphStep, "_update", lambda step, *made: (do(step, *made), made[0][0].cpu()))
         assert isinstance(make_step(fit_problem("cone", True, "cuda", "triton"), batch=BATCH), EagerStep)
     torch.cuda.empty_cache()
     assert isinstance(make_step(fit_problem("cone", True, "cuda", "triton"), batch=BATCH), GraphStep)

@@ -2,6 +2,7 @@
 
 import functools
 import inspect
+import itertools
 from unittest import mock
 
 import numpy as np
@@ -10,9 +11,11 @@ from step_scenes import BATCH, compare_steps, fit_problem
 from triton_case import case
 
 from tomo_polysplat.fit.loss import away_from_edges, total_variation
+from tomo_polysplat.fit.shares import Part, parted, planes_of_all
 from tomo_polysplat.fit.step import EagerStep
 from tomo_polysplat.kernels import portions
-from tomo_polysplat.ranks import ALONE, Ranks
+from tomo_polysplat.model.gaussians import OF_ALL
+from tomo_polysplat.ranks import Ranks
 
 
 def _fused(problem, batch):
@@ -193,32 +196,55 @@ def _special(kernel, *args, grid, warmup, **named):
 
 
 @case
-def the_parts_of_ranks_add_up_to_the_step(device):
-    """Of three with two views to share, and of two in a plane, which cannot be cut into slabs."""
-    for kind, count, changes in (("cone", 3, {"pixel_rays": 2}), ("fan", 2, {"blurring": False})):
-        whole = _parts(_made(kind, device, ALONE, changes))
-        parts = [_parts(_made(kind, device, Ranks(rank, count), changes)) for rank in range(count)]
+def the_parts_of_ranks_make_the_step_of_one(device):
+    """Of three with few planes to part, and of two in a plane, which cannot be parted at all; also view by view."""
+    for kind, count, changes in (
+        ("cone", 3, {"pixel_rays": 2}),
+        ("cone", 2, {"count": 16}),
+        ("fan", 2, {"blurring": False}),
+    ):
+        with mock.patch.object(portions, "MANY", 8), mock.patch.object(portions, "FEW_VIEWS", 1):
+            whole, parts = _stepped(kind, device, 1, changes), _stepped(kind, device, count, changes)
         for name, values in whole.items():
-            total = sum(part[name] for part in parts)
-            np.testing.assert_allclose(
-                total, values, rtol=1e-4, atol=2e-5 * np.abs(values).max(), err_msg=name
-            )
-            assert np.abs(values).max() > 0, name
+            tolerance = 2e-5 * np.abs(values).max()
+            np.testing.assert_allclose(parts[name], values, rtol=1e-4, atol=tolerance, err_msg=name)
+            assert np.abs(values).max() > 0 or "blur" in name, name
 
 
-def _made(kind, device, ranks, changes):
+def _stepped(kind, device, count, changes):
+    """What a step of so many ranks, which take turns, makes of the optimiser's memory, and its misfit."""
+    problem = fit_problem(kind, True, device, "triton", **({"count": 9} | changes))
+    if count == 1:
+        indices, steps = [torch.arange(len(problem.gaussians))], [_fused(problem, BATCH)]
+    else:
+        indices = parted(problem.gaussians, count)
+        planes = planes_of_all(problem.gaussians, indices, problem.scene.box)
+        steps = [_of_rank(problem, rank, index, planes) for rank, index in enumerate(indices)]
+    for step in steps:
+        step._control.copy_(torch.from_numpy(step._next(np.array([3, 1]), 0.6)))
+    stages = [step._stages(0.3) for step in steps]
+    for summands in itertools.zip_longest(*stages):
+        for same in zip(*summands):
+            total = sum(tensor.clone() for tensor in same)
+            for tensor in same:
+                tensor.copy_(total)
+    found = {"misfit": steps[-1]._sums}
+    for name in problem.gaussians.parameters():
+        first = [step.moments[name][0] for step in steps]
+        if name in OF_ALL:
+            assert all(torch.equal(one, first[0]) for one in first)
+        found[name] = first[0] if name in OF_ALL else torch.cat(first)[torch.cat(indices).argsort()]
+    return {name: tensor.double().cpu().numpy() for name, tensor in found.items()}
+
+
+def _of_rank(problem, rank, index, planes):
     from tomo_polysplat.fit.fused_step import FusedStep
 
-    problem = fit_problem(kind, True, device, "triton", count=9, **changes)
-    step = FusedStep(problem, BATCH, ranks)
-    step._control.copy_(torch.from_numpy(step._next(np.array([3, 1]), 0.0)))
-    return step, step._gradients(0.3)
-
-
-def _parts(made):
-    step, gradients = made
-    names = ("position", "scale", "rotation", "weight")
-    found = {f"{k} of rays": t for k, t in zip(names, gradients.of_rays)}
-    found |= {f"{k} of the volume": t for k, t in zip(names, gradients.of_volume)}
-    found |= {"sums": step._sums} | ({"blur": step._grad_blur} if step.scene.blurring else {})
-    return {name: tensor.double().cpu().numpy() for name, tensor in found.items()}
+    part = Part(
+        Ranks(rank, len(planes)),
+        planes[rank],
+        len(problem.gaussians) // len(planes),
+        problem.gaussians.position.device,
+    )
+    own = problem.gaussians.select(index).copy()
+    return FusedStep(problem._replace(gaussians=own), BATCH, part)

@@ -25,9 +25,19 @@ def pins(subrays=1, metal=True, size=64, views=60):
     return tps.simulate_scan("pins", size=size, views=views, geometry="fan", subrays=subrays, metal=metal)
 
 
+def thin():
+    """A scan of infinitely thin rays."""
+    return pins(size=48, views=45)
+
+
 def small():
-    """A scan that is asked, for runs of which only the course matters."""
+    """A scan of averaged light, for runs of which only the course matters."""
     return pins(3, size=48, views=45)
+
+
+def large():
+    """One whose volume tells averaged light from infinitely thin rays."""
+    return pins(3)
 
 
 def reconstruct(scan, settings=None, **options):
@@ -37,9 +47,9 @@ def reconstruct(scan, settings=None, **options):
 
 
 @cache
-def told_of_small():
+def told_of(scan):
     """A run that asks, which several tests compare with."""
-    told = reconstruct(small())
+    told = reconstruct(scan())
     assert "averaged light leaves" in told.plan["pixel_rays"].why
     return told
 
@@ -48,22 +58,16 @@ def error(result, scan):
     return float(np.sqrt(np.mean((result.volume - scan.truth) ** 2)))
 
 
-@pytest.mark.parametrize(("subrays", "taken", "other"), [(1, 1, 2), (3, 2, 1)])
-def test_the_rays_at_metal_tell_it(subrays, taken, other):
-    scan = pins(subrays)
-    told = reconstruct(scan)
-    assert told.plan["pixel_rays"].value == taken and "averaged light leaves" in told.plan["pixel_rays"].why
-    wrong = reconstruct(scan, {"pixel_rays": other})
-    assert wrong.plan["pixel_rays"].status is Status.GIVEN
-    assert error(told, scan) < 0.7 * error(wrong, scan)
+@pytest.mark.parametrize(("scan", "taken", "other"), [(thin, 1, 2), (large, 2, 1)])
+def test_the_rays_at_metal_tell_it(scan, taken, other):
+    told, wrong = told_of(scan), reconstruct(scan(), {"pixel_rays": other})
+    assert told.plan["pixel_rays"].value == taken and wrong.plan["pixel_rays"].status is Status.GIVEN
+    assert error(told, scan()) < 0.7 * error(wrong, scan())
 
 
 def test_the_loser_leaves_no_trace_of_itself():
     """Infinitely thin rays that were asked about are those that were asked for."""
-    scan = pins(size=48, views=45)
-    told, wanted = reconstruct(scan), reconstruct(scan, {"pixel_rays": 1})
-    assert "averaged light leaves" in told.plan["pixel_rays"].why
-    assert np.array_equal(told.volume, wanted.volume)
+    assert np.array_equal(told_of(thin).volume, reconstruct(thin(), {"pixel_rays": 1}).volume)
 
 
 @pytest.mark.parametrize(
@@ -82,7 +86,7 @@ def test_nobody_asks_where_it_cannot_be_told(metal, changes, options, words):
 
 
 def test_a_budget_with_time_to_spare_does_not_hinder_it():
-    told, hurried = told_of_small(), reconstruct(small(), time_budget=3600.0)
+    told, hurried = told_of(small), reconstruct(small(), time_budget=3600.0)
     assert told.plan["pixel_rays"] == hurried.plan["pixel_rays"]
     assert np.array_equal(told.volume, hurried.volume)
 
@@ -126,7 +130,7 @@ def test_each_way_has_steps_enough_to_get_used_to_it_but_no_more_than_a_fifth_of
 
 def test_a_run_resumed_around_the_question_is_the_uninterrupted_one(tmp_path, monkeypatch):
     monkeypatch.setattr("tomo_polysplat.plan.checkpoint._LARGEST_SHARE", 1e9)
-    scan, whole = small(), told_of_small()
+    scan, whole = small(), told_of(small)
     for share in (0.3, 0.4, 0.6):
         run = partial(reconstruct, scan)
         assert_same(resumed_after(share, run, tmp_path / f"{share}.npz"), whole, share)

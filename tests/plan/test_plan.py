@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from docs_examples import DOCS
 from planned import ball, plan, problem, why
 
 from tomo_polysplat.fit.problem import Problem
@@ -220,6 +221,17 @@ def test_the_order_keeps_what_each_decision_needs():
         assert set(kind.needs) <= set(ORDER[:place]), kind
     names = [kind.name for kind in ORDER]
     assert len(set(names)) == len(names) and all(names)
+
+
+def test_a_decision_has_one_name_for_its_file_its_page_and_its_setting():
+    """But for those that no setting of their own answers, which the docs name."""
+    without = {"soft_reference", "optical_depth", "detector_blur", "scatter"}
+    way = (DOCS / "way.md").read_text(encoding="utf-8")
+    for kind in ORDER:
+        assert kind.__module__ == f"tomo_polysplat.plan.decisions.{kind.name}"
+        assert (DOCS / "decisions" / f"{kind.name}.md").exists(), kind
+        assert hasattr(Settings(), kind.name) == (kind.name not in without), kind
+    assert all(f"`{name}`" in way for name in without)
 
 
 def test_an_answer_that_a_decision_does_not_name_cannot_be_read():

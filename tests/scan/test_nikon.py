@@ -68,16 +68,14 @@ def test_measured_angles_are_taken_where_they_are_not_even(folder):
     np.testing.assert_allclose(found - found[0], measured, atol=1e-3)
 
 
-def test_what_is_not_used_is_said(folder):
+def test_what_is_guessed_is_said(folder):
     change(
         folder,
-        ("ObjectTilt=0", "ObjectTilt=3"),
         ("Projections=48", "Projections=60"),
         ("WhiteLevel=60000.0", ""),
     )
     guesses = " | ".join(tps.load_scan(folder).notes["scanner"]["guessed"])
     for words in (
-        "ObjectTilt = 3 is not used",
         "48 pictures are there, the .xtekct tells of 60",
         "no flat field",
     ):
@@ -96,3 +94,53 @@ def test_the_marker_s_ray_through_the_moved_turntable(folder):
     geometry, _ = from_astra(scan.proj_geom, scan.vol_geom)
     column = geometry.project_points(np.zeros((1, 3)))[:, 0, 0]
     np.testing.assert_allclose(column, 18 - 0.9 * 2.5 / 1.6)
+
+
+def test_a_detector_that_was_moved_and_an_axis_that_leans_towards_it(folder):
+    """As the reader of the Core Imaging Library puts them: by minus the offset in x, by it in z; the axis' top in y."""
+    change(
+        folder,
+        ("ObjectOffsetX=0.9", "ObjectOffsetX=0"),
+        ("ObjectTilt=0", "ObjectTilt=3"),
+        ("DetectorOffsetX=0", "DetectorOffsetX=3.2"),
+        ("DetectorOffsetY=0", "DetectorOffsetY=1.6"),
+    )
+    scan = tps.load_scan(folder)
+    geometry, _ = from_astra(scan.proj_geom, scan.vol_geom)
+    lean = np.deg2rad(3.0)
+    for height in (0.0, 10.0):
+        column, row = geometry.project_points(np.array([[0.0, 0.0, height]]))[:, 0].T
+        up = height * np.cos(lean) * 250 / (100 + height * np.sin(lean))
+        np.testing.assert_allclose(column, 18 + 3.2 / 1.6, atol=1e-6)
+        np.testing.assert_allclose(row, 16 + (up - 1.6) / 1.6, atol=1e-6)
+
+
+def test_missing_pictures_keep_the_angles_of_the_others(folder):
+    even = source_degrees(tps.load_scan(folder))
+    left = np.delete(np.arange(48), [0, 6, 7])
+    for k in (1, 7, 8):
+        (folder / f"marker_{k:04d}.tif").unlink()
+    found = source_degrees(scan := tps.load_scan(folder))
+    np.testing.assert_allclose(found - found[0], even[left] - even[1], atol=1e-4)
+    assert "jump (6 to 9)" in " | ".join(scan.notes["scanner"]["guessed"])
+
+
+def test_a_head_of_numbers_above_the_angles_and_another_country_s_decimal_sign(folder):
+    """The head of a _ctdata.txt has a line of numbers; angles may be counted modulo 360."""
+    measured = np.arange(48) * 7.5 + np.where(np.arange(48) > 20, 2.0, 0.0)
+    lines = [f"{k + 1}\t{(angle + 300) % 360:.3f}\t{k}" for k, angle in enumerate(measured)]
+    head = ["Projs\tFrames\tExposure(ms)", "48\t1\t1000", "Projection\tAngle(deg)\tTime(s)"]
+    (folder / "_CTDATA.TXT").write_text("\r\n".join([*head, *lines, ""]).replace(".", ","), newline="")
+    found = source_degrees(tps.load_scan(folder))
+    np.testing.assert_allclose(found - found[0], measured, atol=2e-3)
+
+
+def test_texts_of_another_country(folder):
+    """Decimal commas, Windows' line ends and its Western encoding say the same."""
+    exact = tps.load_scan(folder)
+    text = (folder / "marker.xtekct").read_text().replace(".", ",").replace("[CTPro]", "[CTPro]\nBy=Núria µ")
+    (folder / "marker.xtekct").write_bytes(text.replace("\n", "\r\n").encode("cp1252"))
+    scan = tps.load_scan(folder)
+    np.testing.assert_array_equal(scan.proj_geom["Vectors"], exact.proj_geom["Vectors"])
+    assert scan.notes["scanner"]["filter"] == "1 mm Aluminium"
+    assert scan.notes["scanner"]["keys"]["CTPro/By"] == "Núria µ"

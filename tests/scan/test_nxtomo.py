@@ -67,3 +67,13 @@ def test_an_unknown_unit_is_refused(path):
         ValueError, match="units of instrument/detector/distance: expected one of m, .*furlong"
     ):
         tps.load_scan(path)
+
+
+def test_an_entry_within_an_entry(path):
+    """As a beamline of Diamond's writes it: entry1/tomo_entry."""
+    exact = tps.load_scan(path)
+    with h5py.File(path, "a") as file:
+        file.move("entry0000", "later")
+        file.create_group("entry1/before_scan")
+        file.move("later", "entry1/tomo_entry")
+    np.testing.assert_array_equal(tps.load_scan(path).projections, exact.projections)

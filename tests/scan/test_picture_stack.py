@@ -49,6 +49,34 @@ def test_arguments_say_what_the_toml_file_says(bare, folder):
     assert scan.spectrum is None  # the tube stands in the file only
 
 
+def test_a_pixel_of_another_unit_goes_around_the_source(bare):
+    with pytest.raises(ValueError, match=r"pixel: expected a detector within 130 degrees.*one unit"):
+        tps.load_scan(bare, scanner=STATED | {"pixel": 1600.0})
+    wide = tps.load_scan(bare, scanner=STATED | {"pixel": 16.0, "offset": (0.0, 0.0)})
+    assert "the source sees the detector under 100 degrees" in " | ".join(wide.notes["scanner"]["guessed"])
+
+
+def test_pictures_that_are_missing_are_said(bare):
+    names = sorted(file.name for file in bare.iterdir())
+    (bare / [name for name in names if name.startswith("proj")][7]).unlink()
+    gap = " | ".join(tps.load_scan(bare, scanner=STATED).notes["scanner"]["guessed"])
+    assert "the numbers of the pictures jump (6 to 8): steps are taken to be even" in gap
+
+
+def test_angles_that_are_stated_stand_over_the_arc_of_the_file(folder):
+    told = tps.load_scan(folder)
+    scan = tps.load_scan(folder, scanner={"degrees": np.arange(48) * 7.5})
+    np.testing.assert_allclose(scan.proj_geom["Vectors"], told.proj_geom["Vectors"], atol=1e-9)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_toml_file_of_a_windows_program(bare, folder, encoding):
+    told = tps.load_scan(folder)
+    text = (folder / "scan.toml").read_text()
+    (bare / "scan.toml").write_bytes(text.replace("\n", "\r\n").encode(encoding))
+    np.testing.assert_array_equal(tps.load_scan(bare).proj_geom["Vectors"], told.proj_geom["Vectors"])
+
+
 def test_pictures_sorted_into_folders_and_angles_from_a_file(tmp_path):
     pictures = pictures_of(marked())
     for name, frames in (
@@ -162,6 +190,7 @@ def test_what_does_not_fit_is_refused(bare, stated, message):
     [
         ({"rows": (5, 99)}, "rows: expected first < end, from 0 to 33, got 5, 99"),
         ({"views": 0}, "views: expected a positive whole number"),
+        ({"views": 48}, "views: expected a step that leaves some of 48 views, got 48; 2 takes every other"),
         ({"binning": 50}, "binning: expected at most the 33 rows"),
         ({"columns": 7}, "columns: expected two whole numbers"),
     ],

@@ -1,5 +1,7 @@
 """RTK's geometries: against the matrices that RTK itself writes, and what does not fit."""
 
+import re
+
 import numpy as np
 import pytest
 import tifffile
@@ -103,6 +105,15 @@ def test_geometries_that_do_not_fit(folder, old, new, message):
     assert old in text
     (folder / "geometry.xml").write_text(text.replace(old, new, 1))
     with pytest.raises((ValueError, TypeError), match=message):
+        tps.load_scan(folder)
+
+
+def test_matrices_alone_are_no_angles(folder):
+    text = (folder / "geometry.xml").read_text()
+    (folder / "geometry.xml").write_text(
+        re.sub("<GantryAngle>.*?</GantryAngle>", "<Matrix>1 0 0 0</Matrix>", text)
+    )
+    with pytest.raises(ValueError, match="the GantryAngle of each view, got none in"):
         tps.load_scan(folder)
 
 

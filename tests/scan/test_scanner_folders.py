@@ -43,6 +43,19 @@ def test_another_library_opens_the_volume_of_a_folder(kind, tmp_path):
     assert abs(error_db(10 * values, own.truth) - error_db(expected.volume, own.truth)) < 0.3
 
 
+def test_the_folder_above_that_of_the_scan(tmp_path):
+    """As scanners' users keep them: the pictures in one folder, the reconstruction in another beside it."""
+    own = write_folder("skyscan", tmp_path / "tooth" / "proj", marked())
+    write_folder("skyscan", tmp_path / "tooth" / "tooth_rec", marked())
+    (tmp_path / "tooth" / "tooth_rec").rename(tmp_path / "tooth" / "rec")
+    scan = tps.load_scan(tmp_path / "tooth")
+    assert scan.projections.shape == own.projections.shape
+    assert "what is read is proj in tooth" in scan.notes["scanner"]["guessed"]
+    write_folder("nikon", tmp_path / "tooth" / "again", marked())
+    with pytest.raises(ValueError, match="one scan in the folder, got again, proj; name one"):
+        tps.load_scan(tmp_path / "tooth")
+
+
 def test_a_folder_is_not_written_over(tmp_path):
     (tmp_path / "mine.txt").write_text("keep me")
     with pytest.raises(FileExistsError, match="a new or empty folder"):

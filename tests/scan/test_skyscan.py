@@ -117,13 +117,18 @@ def test_what_the_log_leaves_open_is_said(folder):
         ),
         ("Object to Source (mm)=100.000", "Object to Source (mm)=far", "a number as 'Object to Source"),
         ("Camera to Source (mm)=250.000", "Camera to Source (mm)=50", "at least source_object"),
+        ("Step (deg)=7.500", "Step (deg)=0.000", None),  # a full turn
+        ("Step (deg)=7.500\nUse 360 Rotation=YES", "Use 360 Rotation=NO", "Rotation Step .deg.: expected"),
         ("Prefix=marker_", "Prefix=no", None),
     ],
 )
 def test_logs_that_cannot_be_meant(folder, old, new, message):
     change(folder, (old, new))
-    if message is None:  # the log's own name says which pictures are meant
-        assert tps.load_scan(folder).views == 48
+    if message is None:  # what is missing, such as which pictures are meant, is told otherwise
+        write_folder("skyscan", folder.parent / "untouched", marked())
+        expected = tps.load_scan(folder.parent / "untouched")
+        found = tps.load_scan(folder)
+        np.testing.assert_allclose(found.proj_geom["Vectors"], expected.proj_geom["Vectors"], atol=1e-9)
         return
     with pytest.raises(ValueError, match=message):
         tps.load_scan(folder)
@@ -152,6 +157,12 @@ def test_pictures_of_another_size_in_between(folder):
         ("0.5 mm Cu", {"Cu": 0.05}),
         ("Al 0.5mm + Cu 0.038mm", {"Al": 0.05, "Cu": 0.0038}),
         ("brass 250um", {"brass": 0.025}),
+        ("Al 0,5mm", {"Al": 0.05}),
+        ("Al 500 \u00b5m", {"Al": 0.05}),
+        ("Al 500 \u03bcm", {"Al": 0.05}),
+        ("Al 0.5mm / Cu 0.038mm", {"Al": 0.05, "Cu": 0.0038}),
+        ("Al 0,5mm, Cu 0,04 mm filter", {"Al": 0.05, "Cu": 0.004}),
+        ("Al (0.5mm)", {"Al": 0.05}),
         ("No Filter", {}),
         ("", {}),
         ("Al+Cu", None),
@@ -162,3 +173,96 @@ def test_pictures_of_another_size_in_between(folder):
 def test_filters_as_scanners_write_them(text, filters):
     found = filters_of(text)
     assert found == (None if filters is None else pytest.approx(filters))
+
+
+def written_again(folder, replace, encoding="utf-8"):
+    log = folder / "marker_.log"
+    log.write_bytes(replace(log.read_bytes().decode("utf-8")).encode(encoding))
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "cp1252", "utf-16"])
+def test_logs_of_another_country_say_the_same(folder, encoding):
+    """Decimal commas, and paths of letters that are not ASCII, in what a Windows program may write."""
+    exact = tps.load_scan(folder)
+    written_again(
+        folder, lambda text: text.replace(".", ",").replace("[Acq", "User=Núria µ\r\n[Acq"), encoding
+    )
+    scan = tps.load_scan(folder)
+    np.testing.assert_array_equal(scan.proj_geom["Vectors"], exact.proj_geom["Vectors"])
+    assert scan.notes["scanner"]["tube_kv"] == "90.0" and scan.notes["scanner"]["filter"] == "1 mm Al"
+    assert scan.notes["scanner"]["keys"]["System/User"] == "Núria µ"
+
+
+def test_numbers_with_two_signs_are_none(folder):
+    change(folder, ("Object to Source (mm)=100.000", "Object to Source (mm)=1,100.5"))
+    with pytest.raises(ValueError, match="a number as 'Object to Source"):
+        tps.load_scan(folder)
+
+
+def test_pictures_with_capital_endings_eight_digits_and_some_missing(folder):
+    change(folder, ("Index Length=4", "Index Length=8"))
+    even = tps.load_scan(folder)  # the log is wrong about the digits
+    for file in folder.glob("marker_*.tif"):
+        if (number := file.stem.split("_")[-1]) != "spr0":
+            file.rename(folder / f"marker_{int(number):08d}.TIF")
+    for k in (7, 8):
+        (folder / f"marker_{k:08d}.TIF").unlink()
+    scan = tps.load_scan(folder)
+    left = np.delete(np.arange(48), [7, 8])
+    np.testing.assert_allclose(scan.proj_geom["Vectors"], even.proj_geom["Vectors"][left], atol=1e-9)
+    assert "jump (6 to 9)" in guesses(scan) and "46 pictures are there" in guesses(scan)
+
+
+@pytest.mark.parametrize("more", [1, 24])
+def test_views_beyond_a_full_turn(folder, more):
+    """A scanner that ends where it has begun takes one more picture than there are steps."""
+    for k in range(more):
+        (folder / f"marker_{48 + k:04d}.tif").write_bytes((folder / f"marker_{k:04d}.tif").read_bytes())
+    change(folder, ("Files=  48", f"Files=  {48 + more}"))
+    scan = tps.load_scan(folder)
+    assert scan.views == 48 + more and len(scan.notes["scanner"]["guessed"]) == 1
+    np.testing.assert_allclose(scan.proj_geom["Vectors"][48], scan.proj_geom["Vectors"][0], atol=1e-9)
+    require_the_same_volume(scan, marked())
+
+
+def test_the_log_of_a_reconstruction_beside_that_of_the_scan(folder):
+    """NRecon writes a log with the axis' shift, which that of the scan may lack."""
+    exact = tps.load_scan(folder)
+    text = (folder / "marker_.log").read_text()
+    (folder / "marker__rec.log").write_text(text + "[File name convention]\nFilename Prefix=marker__rec\n")
+    change(folder, ("[Reconstruction]\nPostalignment=-1.50\n", ""))
+    scan = tps.load_scan(folder)
+    np.testing.assert_array_equal(scan.proj_geom["Vectors"], exact.proj_geom["Vectors"])
+    with pytest.raises(
+        ValueError, match="a scan, got .*the log of a reconstruction; name the folder of the proj"
+    ):
+        tps.load_scan(folder / "marker__rec.log")
+
+
+def test_a_part_of_connected_scans(folder):
+    """Its own shift of the axis stands in the log of them all, beside those of the parts."""
+    exact = tps.load_scan(folder)
+    for file in folder.glob("marker_0*.tif"):
+        file.rename(folder / file.name.replace("marker_", "marker~01"))
+    connected = "Number of connected scans=2\nCurrent scan number=2\n[Reconstruction]"
+    change(folder, ("Prefix=marker_", "Prefix=marker~01"), ("[Reconstruction]", connected))
+    text = (folder / "marker_.log").read_text()
+    (folder / "marker~01.log").write_text(text.replace("Postalignment=-1.50\n", ""))
+    own = text.replace("marker~01", "marker~00").replace("number=2", "number=1")
+    shifts = "Sub-scan post alignment [0]=3.000000\nSub-scan post alignment [1]=-1.500000\n"
+    (folder / "marker_.log").write_text(own.replace("Postalignment=-1.50\n", shifts))
+    scan = tps.load_scan(folder / "marker~01.log")
+    np.testing.assert_array_equal(scan.proj_geom["Vectors"], exact.proj_geom["Vectors"])
+    assert "this is part 2 of 2 connected scans" in guesses(scan)
+
+
+def test_pictures_that_have_moved_and_a_log_without_what_can_be_told_otherwise(folder):
+    exact = tps.load_scan(folder)
+    moved = "Maximum vertical TS=9.0\nTS modified according to=D:\\a b\\marker_TS.csv\n[Reconstruction]"
+    change(folder, ("[Reconstruction]", moved), ("Image Pixel Size (um)=640.000000\n", ""))
+    change(folder, ("Source Voltage (kV)=  90\n", ""))
+    scan = tps.load_scan(folder)
+    np.testing.assert_allclose(scan.proj_geom["Vectors"], exact.proj_geom["Vectors"], rtol=1e-6)
+    for words in ("by at most 9.0 rows and ? columns (marker_TS.csv)", "no Image Pixel Size", "the voltage"):
+        assert words in guesses(scan)
+    assert scan.spectrum is None

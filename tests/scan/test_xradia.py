@@ -8,6 +8,7 @@ from folders import marked, require_the_same_volume
 import tomo_polysplat as tps
 from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.scan.readers.compound import CompoundFile
+from tomo_polysplat.scan.readers.xradia_frames import picture_names
 from tomo_polysplat.simulate.folders.compound_file import compound_file
 from tomo_polysplat.simulate.folders.scene import pictures_of
 from tomo_polysplat.simulate.folders.xradia import single_views, streams_of
@@ -97,6 +98,55 @@ def test_several_references_and_those_of_another_file(write, streams):
     write(one, "open.xrm")
     given = tps.load_scan(without.parent, scanner={"flats": "open.xrm"})
     np.testing.assert_array_equal(given.projections, exact.projections)
+
+
+def test_references_that_only_their_names_and_bytes_tell_of(write, streams):
+    """Neither their number nor their type is told in every file; their exposure stands in several places."""
+    exact = tps.load_scan(write())
+    flat = np.frombuffer(streams["ReferenceData/Image"], "<f4")
+    bare = {name: None for name in streams if name.startswith("ReferenceData")}
+    several = {
+        f"MultiReferenceData/Image{k + 1}": floats(*(part * flat)) for k, part in enumerate((0.5, 1.5))
+    }
+    halved = {"MultiReferenceData/ImageInfo/ExpTimes": floats(0.25, 0.25)}
+    scan = tps.load_scan(write(bare | several | halved))
+    np.testing.assert_allclose(scan.projections, exact.projections + np.log(2), atol=1e-5)
+    smaller = {
+        "ReferenceData/ImageInfo/ImageWidth": b"\x05\0\0\0",
+        "ReferenceData/ImageInfo/ImageHeight": b"\x05\0\0\0",
+    }
+    assert "no flat field" in guesses(tps.load_scan(write(smaller)))
+
+
+def test_what_else_real_files_may_lack_or_say_otherwise(write):
+    exact = tps.load_scan(write())
+    missing = dict.fromkeys(
+        ("ImageInfo/NoOfImages", "ImageInfo/ImagesTaken", "ImageInfo/DataType", "ImageInfo/ExpTimes")
+    )
+    microns = {
+        "PositionInfo/AxisNames": b"Sample X\0Source Z\0",
+        "PositionInfo/AxisUnits": b"um\0um\0",
+        "ImageInfo/StoRADistance": floats(-1e5),
+        "ImageInfo/DtoRADistance": floats(1.5e5),
+        "ImageInfo/ExpTime": floats(0.5),
+        "AutoRecon/CenterShift": floats(2.5),
+    }
+    scan = tps.load_scan(write(missing | microns))
+    np.testing.assert_allclose(scan.proj_geom["Vectors"], exact.proj_geom["Vectors"], rtol=1e-6, atol=1e-9)
+    np.testing.assert_array_equal(scan.projections, exact.projections)
+    assert "1.5 columns off, as ReconSettings tells; AutoRecon tells 2.5" in guesses(scan)
+
+
+def test_a_zone_plate_makes_a_parallel_beam(write):
+    changes = {"ImageInfo/XrayGeometry": None, "ConfigZonePlates/ZonePlate0/Name": b"LFOV\0"}
+    scan = tps.load_scan(write(changes), views=4)
+    assert from_astra(scan.proj_geom, scan.vol_geom)[0].beam == "parallel"
+
+
+def test_pictures_lie_in_folders_of_a_hundred(tmp_path):
+    names = [f"ImageData{1 + k // 100}/Image{k + 1}" for k in range(202)]
+    (tmp_path / "many.txrm").write_bytes(compound_file(dict.fromkeys(names, b"12")))
+    assert picture_names(CompoundFile(tmp_path / "many.txrm")) == names
 
 
 def test_a_scan_that_was_broken_off_and_what_is_not_known(write):

@@ -277,7 +277,8 @@ def test_a_gpu_makes_the_same_volume(kind):
 
     import torch
 
-    from tomo_polysplat.start.astra_fdk import fdk_cuda, suits_fdk_cuda
+    from tomo_polysplat.start.astra_fdk import suits_fdk_cuda
+    from tomo_polysplat.start.slabs import fdk_cuda
 
     geometry, grid = from_astra(_KINDS[kind], VOLUME)
     if not torch.cuda.is_available():
@@ -304,7 +305,7 @@ def test_a_gpu_makes_the_same_volume(kind):
 @pytest.mark.gpu
 @pytest.mark.parametrize("filter_name", FILTERS)
 def test_rows_are_filtered_as_astra_filters_them(filter_name):
-    from tomo_polysplat.start.astra_fdk import fdk_cuda
+    from tomo_polysplat.start.slabs import fdk_cuda
 
     geometry, grid = from_astra(cone(), VOLUME)
     projections = chords(geometry, SPHERES)

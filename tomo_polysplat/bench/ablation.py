@@ -11,11 +11,11 @@ from tomo_polysplat.bench.ablation_affine import affine_errors
 from tomo_polysplat.bench.ablation_variants import DEFAULT, GROUPS, Variant
 from tomo_polysplat.bench.accuracy_measures import Regions, accuracy_errors
 from tomo_polysplat.bench.environment import environment
-from tomo_polysplat.bench.methods import Task
 from tomo_polysplat.bench.recon import ReconBench
 from tomo_polysplat.bench.recon_report import machine
 from tomo_polysplat.bench.runs import Progress, Record, timed_runs, warm_up, with_errors, without_figures
 from tomo_polysplat.bench.tables import Column, cell, grouped, markdown_table, text_table
+from tomo_polysplat.bench.task import Task
 from tomo_polysplat.checks import fail, require_choice
 
 __all__ = ["AblationBench", "as_markdown", "as_text", "run_ablation"]

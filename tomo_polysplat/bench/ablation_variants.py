@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from tomo_polysplat.bench.methods import WHOLE, Method, Options, Outcome, Task
+from tomo_polysplat.bench.methods import WHOLE, Method
+from tomo_polysplat.bench.task import Options, Outcome, Task
 from tomo_polysplat.physics.materials import MaterialLike
 from tomo_polysplat.reconstruction import reconstruct
 

@@ -13,9 +13,10 @@ import numpy as np
 from tomo_polysplat.bench.accuracy_measures import Regions, accuracy_errors
 from tomo_polysplat.bench.accuracy_stopping import stopping
 from tomo_polysplat.bench.environment import environment
-from tomo_polysplat.bench.methods import METHODS, Task
+from tomo_polysplat.bench.methods import METHODS
 from tomo_polysplat.bench.recon import ReconBench
 from tomo_polysplat.bench.runs import Progress, Record, curves, timed_runs, warm_up, with_errors
+from tomo_polysplat.bench.task import Task
 from tomo_polysplat.checks import fail
 from tomo_polysplat.scan.scan import Scan
 

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from tomo_polysplat.bench.methods import Method, Options, Task
+from tomo_polysplat.bench.methods import Method
 from tomo_polysplat.bench.peers import Skipped
+from tomo_polysplat.bench.task import Options, Task
 from tomo_polysplat.fit.optimise import FitState
 from tomo_polysplat.result.metrics import psnr
 from tomo_polysplat.scan.scan import Scan

@@ -10,12 +10,11 @@ from __future__ import annotations
 import contextlib
 import io
 import warnings
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from tomo_polysplat.bench.methods import Options, Outcome, Task
+from tomo_polysplat.bench.task import Options, Outcome, Task
 
 __all__ = ["Skipped", "mbirtorch_mar", "mbirtorch_plastic_metal", "mbirtorch_recon"]
 

@@ -12,8 +12,8 @@ from tomo_polysplat.bench.ablation_variants import DEFAULT, Variant
 from tomo_polysplat.bench.accuracy_stopping import stopping
 from tomo_polysplat.bench.environment import environment
 from tomo_polysplat.bench.measure import error_history
-from tomo_polysplat.bench.methods import Task
 from tomo_polysplat.bench.runs import Progress, Record, timed_runs, warm_up, with_errors
+from tomo_polysplat.bench.task import Task
 from tomo_polysplat.checks import fail
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.scan.scan import Scan

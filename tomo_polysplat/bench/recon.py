@@ -11,9 +11,10 @@ from typing import Any
 import torch
 
 from tomo_polysplat.bench.environment import environment
-from tomo_polysplat.bench.methods import METHODS, Task
+from tomo_polysplat.bench.methods import METHODS
 from tomo_polysplat.bench.runs import Record, curves, timed_runs, warm_up, with_errors
 from tomo_polysplat.bench.scenes import cached_scan, require_scene
+from tomo_polysplat.bench.task import Task
 from tomo_polysplat.checks import fail, require_choice
 from tomo_polysplat.scan.scan import Scan
 

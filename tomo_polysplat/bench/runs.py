@@ -6,8 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from tomo_polysplat.bench.measure import Run, error_history, measure
-from tomo_polysplat.bench.methods import Method, Options, Task
+from tomo_polysplat.bench.methods import Method
 from tomo_polysplat.bench.scenes import fewer_views
+from tomo_polysplat.bench.task import Options, Task
 from tomo_polysplat.fit.stopping import BY_TIME
 from tomo_polysplat.free_memory import available_memory
 from tomo_polysplat.parallel import run_tasks

@@ -12,8 +12,9 @@ import numpy as np
 import torch
 
 from tomo_polysplat.bench.environment import environment
-from tomo_polysplat.bench.methods import METHODS, Task
+from tomo_polysplat.bench.methods import METHODS
 from tomo_polysplat.bench.runs import Progress, Record, plain_errors, timed_runs, warm_up, with_errors
+from tomo_polysplat.bench.task import Task
 from tomo_polysplat.checks import fail, require_choice
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.scan.scan import Scan

@@ -18,16 +18,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the script."""
-    from tomo_polysplat.cli.main import build_parser
-
     try:
         import shtab
     except ImportError as error:
         remedy = "python -m pip install 'tomo-polysplat[completion]'"
         raise fail("completion", "shtab, which writes the script", "none", remedy, ImportError) from error
-    parser = build_parser()
-    _complete_files(parser, shtab.FILE)
-    print(shtab.complete(parser, shell=arguments.shell))
+    _complete_files(arguments.whole, shtab.FILE)
+    print(shtab.complete(arguments.whole, shell=arguments.shell))
     return 0
 
 

@@ -73,7 +73,7 @@ def build_parser() -> Parser:
             description=f"{module.HELP[0].upper()}{module.HELP[1:]}.",
         )
         module.add_arguments(child)
-        child.set_defaults(run=module.run, parser=child)
+        child.set_defaults(run=module.run, parser=child, whole=parser)
     return parser
 
 

@@ -9,6 +9,7 @@ import torch
 from tomo_polysplat.fit.led_step import LedStep
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.setup import FitSetup
+from tomo_polysplat.fit.shares import Part
 from tomo_polysplat.fit.step import EagerStep, Step
 from tomo_polysplat.ranks import ALONE, Ranks, current_ranks
 from tomo_polysplat.settings import Settings
@@ -48,16 +49,16 @@ def make_step(setup: FitSetup, *, batch: int, beside: Step | None = None) -> Ste
         Where a GPU has no room for the graph: operation by operation would need more.
     """
     ranks = current_ranks()
-    if ranks.count == 1 or setup.settings.ssim_weight:
-        if ranks.count > 1:
-            logger.warning("One device makes the steps: structural similarity is of whole steps.")
+    if ranks.count == 1 or len(setup.gaussians) < ranks.count:
         return own_step(setup, batch, beside=beside)
     led = beside if isinstance(beside, LedStep) else None
     return LedStep(own_step, setup, batch, ranks, led)
 
 
-def own_step(setup: FitSetup, batch: int, ranks: Ranks = ALONE, beside: Step | None = None) -> Step:
-    """This process's step, or its part of that of ``ranks``, which all make theirs; see `make_step`."""
+def own_step(
+    setup: FitSetup, batch: int, ranks: Ranks = ALONE, beside: Step | None = None, part: Part | None = None
+) -> Step:
+    """This process's step, of all Gaussians or of its ``part`` where all ``ranks`` make theirs; see `make_step`."""
     reason, full = why_eager(setup.scene, setup.settings), ""
     graph: Step | None = None
     if not reason:
@@ -65,7 +66,7 @@ def own_step(setup: FitSetup, batch: int, ranks: Ranks = ALONE, beside: Step | N
 
         try:
             shared = beside if isinstance(beside, GraphStep) else None
-            graph = GraphStep(setup, batch, ranks, shared)
+            graph = GraphStep(setup, batch, part, shared)
         # Of compiler or driver, of any kind: the slower way gives the same result.
         except Exception as problem:
             logger.debug("no CUDA graph", exc_info=True)
@@ -82,7 +83,7 @@ def own_step(setup: FitSetup, batch: int, ranks: Ranks = ALONE, beside: Step | N
     # What the two forms add up over ranks is not the same.
     if ranks.same(graph is not None) and graph is not None:
         return graph
-    return EagerStep(setup, ranks)
+    return EagerStep(setup, part)
 
 
 def _of_memory(problem: BaseException | None) -> bool:

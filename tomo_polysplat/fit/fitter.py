@@ -126,6 +126,8 @@ class Fitter:
 
     @torch.no_grad()
     def _end_pass(self, share: float) -> tuple[float, float, int]:
+        # Before anything is changed: what several ranks hold is put together here.
+        told = self.step.read()
         # Once a pass does: in its few steps a Gaussian does not get far beyond the volume.
         self.scene.keep_within(self.gaussians)
         # What is not finite any more is nowhere to look at, and `Watch` ends the run.
@@ -133,7 +135,7 @@ class Fitter:
             flatten(self.gaussians, self.scene, self.settings, share)
             number_metals(self.gaussians, self.scene, self.settings, share)
             tell_light(self.gaussians, self.scene, share)
-        return self.step.read()
+        return told
 
     def snapshot(self, best: Gaussians | None, numbers: dict[str, Any]) -> Snapshot:
         """Where the fit stands between two passes; ``numbers`` of the run are kept with it."""

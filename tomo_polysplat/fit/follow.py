@@ -13,13 +13,14 @@ import torch
 import torch.distributed as dist
 
 from tomo_polysplat.fit.choose_step import NoRoom, own_step
-from tomo_polysplat.fit.led_step import fingerprint, state_of
+from tomo_polysplat.fit.led_step import of_all, of_all_moments, of_each, of_each_moment
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.setup import FitSetup
+from tomo_polysplat.fit.shares import Part
 from tomo_polysplat.fit.step import Step
 from tomo_polysplat.kernels.device import one_torch_thread, pick_device, usual_modes
 from tomo_polysplat.kernels.views import DetectorViews
-from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.model.gaussians import OF_ALL, Gaussians
 from tomo_polysplat.parallel import kept_threads
 from tomo_polysplat.rank_processes import here, rank_of_torchrun
 from tomo_polysplat.ranks import Ranks, join, join_here, leave
@@ -28,33 +29,50 @@ __all__ = ["follow", "follow_torchrun"]
 
 
 class _Followed:
-    """A step as this rank makes it."""
+    """A step of this rank's part of the Gaussians."""
 
     def __init__(
         self,
         number_of_rays: int,
         projections: torch.Tensor,
-        parts: dict[str, Any],
+        about: dict[str, Any],
         ranks: Ranks,
         beside: Step | None = None,
     ) -> None:
-        self.number_of_rays = number_of_rays
-        self.gaussians: Gaussians = parts["gaussians"]
+        self.number_of_rays, self.ranks = number_of_rays, ranks
+        self.gaussians = _received(about["gaussians"], about["counts"][ranks.rank], ranks)
         streamed = ranks.device if projections.device.type != ranks.device.type else None
-        photons, model_error, held_out, dimmed = parts["rays"]
-        views = DetectorViews(*parts["views"])
+        photons, model_error, held_out, dimmed = about["rays"]
+        views = DetectorViews(*about["views"])
         self.rays = Rays(projections, views, photons, model_error, held_out, streamed, dimmed)
-        setup = FitSetup(self.gaussians, parts["spacing"], self.rays, parts["scene"], parts["settings"])
-        self.step: Step = own_step(setup, parts["batch"], ranks, beside)
+        setup = FitSetup(self.gaussians, about["spacing"], self.rays, about["scene"], about["settings"])
+        part = Part(ranks, about["planes"][ranks.rank], max(about["counts"]), ranks.device)
+        self.step: Step = own_step(setup, about["batch"], ranks, beside, part)
 
     @torch.no_grad()
-    def restore(self, state: list[torch.Tensor], done: int, rates: Any) -> None:
+    def restore(self, done: int, rates: Any, common: list[list[torch.Tensor]], of_moments: bool) -> None:
         """Go on from where rank 0 is."""
-        for own, told in zip(state_of(self.gaussians, self.step.moments), state):
+        moments = self.step.moments
+        for own, told in zip([*of_all(self.gaussians), *of_all_moments(moments)], sum(common, [])):
             own.copy_(told)
+        self.ranks.receive([*of_each(self.gaussians), self.step.pull])
+        if of_moments:
+            self.ranks.receive(of_each_moment(moments))
         self.step.done = done
         if rates is not None:
             self.step.set_rates(rates)
+
+    def read(self) -> None:
+        """Tell rank 0 what has become of the Gaussians."""
+        self.step.read()
+        self.ranks.send([*of_each(self.gaussians), self.step.pull])
+
+
+def _received(kinds: Gaussians, count: int, ranks: Ranks) -> Gaussians:
+    """Gaussians that rank 0 sends, of whose ``kinds`` it has told."""
+    each = {name: tensor.new_empty((count, *tensor.shape[1:])) for name, tensor in kinds.each().items()}
+    ranks.receive(each.values())
+    return Gaussians(**each, **{name: getattr(kinds, name) for name in OF_ALL})
 
 
 def follow(ranks: Ranks) -> None:
@@ -87,12 +105,11 @@ def _follow(ranks: Ranks) -> None:
         elif what == "state":
             steps[number].restore(*parts)
         elif what == "step":
-            views, share, compared = parts
-            steps[number].step(views, share)
-            if compared:
-                ranks.same(fingerprint(steps[number].gaussians))
+            steps[number].step(*parts)
         elif what == "read":
-            steps[number].step.read()
+            steps[number].read()
+        elif what == "moments":
+            ranks.send(of_each_moment(steps[number].step.moments))
 
 
 def _take(

@@ -7,8 +7,9 @@ tensor, so that the same launches do for every step (`graph_step.py` records the
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ import torch
 from tomo_polysplat.fit.adam import EPSILON, new_moments
 from tomo_polysplat.fit.feed import feed
 from tomo_polysplat.fit.setup import FitSetup
+from tomo_polysplat.fit.shares import Part
 from tomo_polysplat.fit.step import (
     held_out_mean,
     log_scale_bounds,
@@ -28,11 +30,10 @@ from tomo_polysplat.kernels.project import triton_backward as rays_backward
 from tomo_polysplat.kernels.project import triton_forward as rays_forward
 from tomo_polysplat.kernels.project.triton_pull_back import pull_back as rays_pull_back
 from tomo_polysplat.kernels.project.triton_setup import footprints
-from tomo_polysplat.kernels.step.faint import HALO
 from tomo_polysplat.kernels.step.triton_activate import activate
 from tomo_polysplat.kernels.step.triton_detector import detected_misfit_gradient
 from tomo_polysplat.kernels.step.triton_misfit import Measurement, Splat, misfit_gradient
-from tomo_polysplat.kernels.step.triton_update import FIRST_DECAY, SECOND_DECAY, Bounds, update
+from tomo_polysplat.kernels.step.triton_update import FIRST_DECAY, SECOND_DECAY, Bounds, update, update_shared
 from tomo_polysplat.kernels.step.triton_variation import variation_gradient
 from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.kernels.voxelise import triton_backward as box_backward
@@ -40,10 +41,9 @@ from tomo_polysplat.kernels.voxelise import triton_forward as box_forward
 from tomo_polysplat.kernels.voxelise.triton_setup import box_table, ellipsoids
 from tomo_polysplat.physics.detector_blur import LARGEST_BLUR
 from tomo_polysplat.physics.transmission import nodes_on
-from tomo_polysplat.ranks import ALONE, Ranks
 from tomo_polysplat.render.renderer import VOXEL_CUTOFF
 
-__all__ = ["FusedStep", "Gradients"]
+__all__ = ["FusedStep"]
 
 # Numbers of the control tensor, in its order: of the update, and of each view its number and slot, and its geometry.
 # Every part begins at 16 bytes whatever the batch: elsewhere the kernels would be compiled once more.
@@ -53,12 +53,11 @@ _HEAD, _CHOSEN, _VIEW = 4, 2, 21
 _Drawn = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
 
-class Gradients(NamedTuple):
-    """Deviations as they are drawn, and gradients by position, deviation, rotation and weights."""
+class _Seen(NamedTuple):
+    """Footprints of Gaussians in some views, and the images of these."""
 
-    scale: torch.Tensor
-    of_rays: tuple[torch.Tensor, ...]
-    of_volume: tuple[torch.Tensor, ...]
+    record: torch.Tensor
+    splat: Splat
 
 
 class FusedStep:
@@ -69,28 +68,28 @@ class FusedStep:
     setup : FitSetup
     batch : int
         Views of a step.
-    ranks : Ranks
-        Of several each takes its part of the views and of the volume; they add up their gradients.
+    part : Part, optional
+        With it the Gaussians are those of one rank of several, whose images and volumes are added up.
     """
 
     # What differs between scenes is set up once, for kernels that are given addresses.
-    def __init__(self, setup: FitSetup, batch: int, ranks: Ranks = ALONE) -> None:
+    def __init__(self, setup: FitSetup, batch: int, part: Part | None = None) -> None:
         gaussians, spacing, rays, scene, settings = setup
         self.gaussians, self.rays, self.scene, self.settings = gaussians, rays, scene, settings
-        self.done, self._unread, self.ranks = 0, 0, ranks
-        self._batch, self._mine = batch, ranks.mine(batch)
-        of_mine = len(range(batch)[self._mine])
+        self.done, self._unread = 0, 0
+        self._batch, self.part = batch, part
         parameters, device = gaussians.parameters(), gaussians.position.device
         self.pull, self.moments = torch.zeros_like(gaussians.attenuation), new_moments(parameters)
-        self.feed = feed(rays.projections, rays.target, max(of_mine, 1))
+        self.feed = feed(rays.projections, rays.target, batch)
         rates = step_rates(settings, spacing)
         self._rates = torch.tensor([rates[k] for k in parameters], dtype=torch.float32, device=device)
         bounds = log_scale_bounds(scene, spacing, gaussians.planar, settings)
         self._bounds = Bounds(bounds, (scene.least_u, 1.0), LARGEST_BLUR, EPSILON)
         fine = scene.fine(rays.views)
         self._table = fine.host_table()
-        # Only the shape of these views counts.
-        self._portions = portions(fine.select(np.arange(of_mine)), len(gaussians)) if of_mine else []
+        # Only the shape of these views counts. All ranks have as many portions.
+        most = len(gaussians) if part is None else part.most
+        self._portions = portions(fine.select(np.arange(batch)), most)
         self._parts = (fine.rows // rays.views.rows, fine.columns // rays.views.columns)
         self._sums = torch.zeros(3, dtype=torch.float64, device=device)
         self._skipped = torch.zeros((), dtype=torch.int64, device=device)
@@ -104,12 +103,7 @@ class FusedStep:
         if scene.reference_curve is not None and scene.output_curve is not None:
             self._curves = torch.cat([scene.reference_curve, scene.output_curve])
         self._measurement = self._measure()
-        self._planes = ranks.mine(scene.box.shape[0])
-        # With the planes beside them, which their differences and what counts as faint need.
-        first, end = self._planes.start - HALO, self._planes.stop + HALO
-        self._slab = slice(max(first, 0), min(end, scene.box.shape[0]))
-        depth = self._slab.stop - self._slab.start
-        self._box = scene.box.part((self._slab.start, 0, 0), (depth, *scene.box.shape[1:]))
+        self._box = scene.box if part is None else part.box(scene.box)
         self._box_table = box_table(self._box, device)
         self._not_smoothed = tuple(
             torch.zeros(shape, device=device) for shape in ((len(gaussians), 3),) * 2 + ((len(gaussians), 4),)
@@ -169,7 +163,9 @@ class FusedStep:
     def read(self) -> tuple[float, float, int]:
         """Means since the last call; see `Step`."""
         sums = (*self._sums.tolist(), int(self._skipped))
-        fitted, held_out, weight, skipped = self.ranks.total(*sums)
+        fitted, held_out, weight, skipped = sums
+        if self.part is not None:
+            (skipped,) = self.part.ranks.total(skipped)
         steps = self._unread
         self._sums.zero_()
         self._skipped.zero_()
@@ -184,23 +180,27 @@ class FusedStep:
         rate = self.settings.final_rate**share / (1 - FIRST_DECAY**self.done)
         root = math.sqrt(1 - SECOND_DECAY**self.done)
         head = [rate, root, float(share >= self.settings.material_from), turns]
-        slots = np.zeros(len(views), int)
-        slots[self._mine] = self.feed.place(views[self._mine])
+        slots = self.feed.place(views)
         return np.concatenate([head, views, slots, self._table[views].ravel()])
 
     def _enqueue(self, smooth: float) -> None:
         """All kernels of a step that smooths with this weight; what else they read of it is in the control tensor."""
-        made = self._gradients(smooth)
-        self._add_up(made)
-        self._update(made)
+        for summands in self._stages(smooth):
+            self._add_up(summands)
+
+    def _add_up(self, summands: tuple[torch.Tensor, ...]) -> None:
+        assert self.part is not None
+        self.part.ranks.sum_(*summands)
 
     def _parts_of_control(self) -> tuple[torch.Tensor, ...]:
         return self._control.split([_HEAD, self._batch * _CHOSEN, self._batch * _VIEW])
 
-    def _gradients(self, smooth: float) -> Gradients:
-        """Those of this rank's part."""
-        gaussians = self.gaussians
+    # The order of a step and what each part leaves to the next: cut up it would be passed around.
+    def _stages(self, smooth: float) -> Iterator[tuple[torch.Tensor, ...]]:
+        """The same in stages; each but the last ends with what ranks add up, where there are several."""
+        gaussians, part = self.gaussians, self.part
         _, chosen, table = self._parts_of_control()
+        table, chosen = table.view(self._batch, _VIEW), chosen.view(_CHOSEN, self._batch)
         scale, weight, output = activate(
             gaussians.log_scale,
             gaussians.attenuation,
@@ -210,78 +210,103 @@ class FusedStep:
             self._curves,
         )
         drawn = (gaussians.position, scale, gaussians.rotation)
-        smoothed = smooth and self._planes.start < self._planes.stop
-        of_volume = self._volume_gradients(*drawn, output, smooth) if smoothed else self._not_smoothed
-        if smooth and not smoothed:  # to which the other ranks' are added
-            of_volume = tuple(tensor.clone() for tensor in of_volume)
-        of_rays = self._of_rays(
-            (*drawn, weight), table.view(self._batch, _VIEW), chosen.view(_CHOSEN, self._batch)
-        )
-        if smoothed:
-            self._join()
-        return Gradients(scale, of_rays, of_volume)
+        of_volume = self._not_smoothed
+        lent: tuple[torch.Tensor, ...] = ()
+        if smooth:
+            with self._beside():
+                voxels = self._voxelised((*drawn, output))
+                if part is not None:
+                    lent = (part.lent(voxels[1][0]),)
+                else:
+                    of_volume = self._volume_gradients((*drawn, output), *voxels, smooth)
+                    del voxels
+        of_rays: tuple[torch.Tensor, ...] = ()
+        first = 0
+        for views in self._portions:
+            seen = self._splatted((*drawn, weight), table, chosen, views, first)
+            if part is not None:
+                self._join()
+                yield (seen.splat.raw, *(lent if not first else ()))
+            if part is not None and smooth and not first:
+                with self._beside():
+                    part.take(lent[0], voxels[1][0])
+                    of_volume = self._volume_gradients((*drawn, output), *voxels, smooth)
+                    del voxels
+            of_portion = self._of_portion((*drawn, weight), seen)
+            for total, gradient in zip(of_rays, of_portion):
+                total += gradient
+            of_rays, first = of_rays or of_portion, first + len(views)
+            del seen, of_portion
+        self._join()
+        self._update((scale, self._curves), of_rays, of_volume)
+        if part is not None and self._curves is not None:
+            yield (self._grad_shared,)
+        self._update_shared()
 
-    def _add_up(self, made: Gradients) -> None:
-        """Make the gradients those of all ranks."""
-        if self.ranks.count > 1:
-            smoothed = made.of_volume is not self._not_smoothed
-            self.ranks.sum_(*made.of_rays, *(made.of_volume if smoothed else ()))
-            if self.scene.blurring:
-                self.ranks.sum_(self._grad_blur)
-
-    def _update(self, made: Gradients) -> None:
+    def _update(self, drawn, of_rays, of_volume) -> None:
         gaussians, (head, _, _) = self.gaussians, self._parts_of_control()
+        state = (self._grad_shared, self.pull, self._rates, head)
         update(
             gaussians.parameters(),
             gaussians.group,
             self.moments,
-            (made.scale, self._curves),
-            made.of_rays,
-            made.of_volume,
-            (self._grad_shared, self._grad_blur, self.pull, self._rates, head),
+            drawn,
+            of_rays,
+            of_volume,
+            state,
             self._bounds,
-            self.scene.blurring,
         )
 
-    def _of_rays(self, drawn: _Drawn, table, chosen) -> tuple[torch.Tensor, ...]:
-        """Gradients of the misfit by position, deviation, rotation and weights, a portion of the views at a time."""
-        if not self._portions:
-            return tuple(torch.zeros_like(tensor) for tensor in drawn)
-        totals: tuple[torch.Tensor, ...] = ()
-        first = self._mine.start
-        for views in self._portions:
-            of_portion = self._of_portion(drawn, table, chosen, views, first)
-            for total, gradient in zip(totals, of_portion):
-                total += gradient
-            totals, first = totals or of_portion, first + len(views)
-        return totals
+    def _update_shared(self) -> None:
+        update_shared(
+            self.gaussians.parameters(),
+            self.moments,
+            None if self._curves is None else self._grad_shared,
+            self._grad_blur if self.scene.blurring else None,
+            self._rates,
+            self._parts_of_control()[0],
+            self._bounds,
+        )
 
-    def _of_portion(
-        self, drawn: _Drawn, table, chosen, views: DetectorViews, first: int
-    ) -> tuple[torch.Tensor, ...]:
-        """The same of the views from the ``first`` of the step on."""
-        cutoff, channels, largest = self.scene.cutoff, len(drawn[-1]), self._largest[0]
+    def _splatted(self, drawn: _Drawn, table, chosen, views: DetectorViews, first: int) -> _Seen:
+        """Images of the views from the ``first`` of the step on."""
+        cutoff, largest = self.scene.cutoff, self._largest[0]
         table = table[first : first + len(views)]
         record = footprints(*drawn, views, table, cutoff, self._skipped)
-        image = rays_forward.splat(record, channels, views, cutoff, largest)
-        seen = Splat(image, table, chosen, views, self._parts, self._measurement, self._sums, largest, first)
+        image = rays_forward.splat(record, len(drawn[-1]), views, cutoff, largest)
+        measurement = self._measurement
+        return _Seen(
+            record, Splat(image, table, chosen, views, self._parts, measurement, self._sums, largest, first)
+        )
+
+    def _of_portion(self, drawn: _Drawn, seen: _Seen) -> tuple[torch.Tensor, ...]:
+        """Gradients of the misfit of such images by position, deviation, rotation and weights."""
+        record, splat = seen
         if self.scene.blurring or max(self._parts) > 1:
             blur = self.gaussians.blur if self.scene.blurring else self._no_blur
-            pixels = detected_misfit_gradient(seen, blur, self._grad_blur)
+            pixels = detected_misfit_gradient(splat, blur, self._grad_blur)
         else:
-            pixels = misfit_gradient(seen)
-        moments = rays_backward.sum_moments(record, pixels, channels, views)
-        return rays_pull_back(*drawn, table, views, moments)
+            pixels = misfit_gradient(splat)
+        moments = rays_backward.sum_moments(record, pixels, len(drawn[-1]), splat.views)
+        return rays_pull_back(*drawn, splat.table, splat.views, moments)
+
+    def _beside(self) -> AbstractContextManager[Any]:
+        """Where the volume's part of a step is made, which needs nothing of that of the rays."""
+        return nullcontext()
 
     def _join(self) -> None:
-        """Wait for the volume's gradients, where they are made beside those of the rays."""
+        """Wait for what is made there."""
 
-    def _volume_gradients(self, position, scale, rotation, output, smooth) -> tuple[torch.Tensor, ...]:
+    def _voxelised(self, drawn: _Drawn) -> tuple[torch.Tensor, torch.Tensor]:
+        """Ellipsoids and their volume (1, nz, ny, nx), of the rank's planes."""
+        record = ellipsoids(*drawn, self._box_table, VOXEL_CUTOFF)
+        return record, box_forward.splat(record, 1, self._box, VOXEL_CUTOFF, self._largest[1])
+
+    def _volume_gradients(
+        self, drawn: _Drawn, record: torch.Tensor, volume: torch.Tensor, smooth: float
+    ) -> tuple[torch.Tensor, ...]:
         """Gradients of the volume's total variation, likewise, times ``smooth``."""
-        drawn, box, table = (position, scale, rotation, output), self._box, self._box_table
-        record = ellipsoids(*drawn, table, VOXEL_CUTOFF)
-        volume = box_forward.splat(record, 1, box, VOXEL_CUTOFF, self._largest[1])
-        chosen = self.settings
+        chosen, planes = self.settings, self.scene.box.shape[0]
         slope = variation_gradient(
             volume,
             chosen.tv_clip,
@@ -289,10 +314,7 @@ class FusedStep:
             chosen.bone_level,
             smooth,
             self._largest[1],
-            self.scene.box.shape[0],
+            planes,
         )
-        # Each plane's slope is told by the rank that it belongs to.
-        slope[:, : self._planes.start - self._slab.start] = 0.0
-        slope[:, self._planes.stop - self._slab.start :] = 0.0
-        moments = box_backward.sum_moments(record, slope, box, VOXEL_CUTOFF)
-        return box_backward.pull_back(*drawn, table, moments)
+        moments = box_backward.sum_moments(record, slope, self._box, VOXEL_CUTOFF)
+        return box_backward.pull_back(*drawn, self._box_table, moments)

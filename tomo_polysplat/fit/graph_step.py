@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import suppress
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
 
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.fused_step import FusedStep, Gradients
+from tomo_polysplat.fit.fused_step import FusedStep
 from tomo_polysplat.fit.setup import FitSetup
+from tomo_polysplat.fit.shares import Part
 from tomo_polysplat.fit.step import smoothing
-from tomo_polysplat.free_memory import give_back, recording
+from tomo_polysplat.free_memory import give_back, keeps_more_than, recording
 from tomo_polysplat.model.gaussians import Gaussians
-from tomo_polysplat.ranks import ALONE, Ranks
 
 __all__ = ["GraphStep"]
 
@@ -29,17 +29,12 @@ def _give_back(device: torch.device) -> None:
 
     While a graph is recorded nothing can be given back, and no other graph can use what was kept for one.
     """
-    unused = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    if unused > _UNUSED * torch.cuda.mem_get_info(device)[1]:
+    if keeps_more_than(_UNUSED, device):
         give_back()
 
 
-class _Recorded(NamedTuple):
-    """A step, or its gradients and, where ranks add them up, the update from them."""
-
-    gradients: torch.cuda.CUDAGraph
-    made: Any = None
-    update: torch.cuda.CUDAGraph | None = None
+# Parts of a step in their order, and what ranks add up after each: nothing after the last.
+_Recorded = list[tuple[torch.cuda.CUDAGraph, tuple[torch.Tensor, ...]]]
 
 
 class GraphStep(FusedStep):
@@ -49,16 +44,16 @@ class GraphStep(FusedStep):
 
     Parameters
     ----------
-    setup, batch, ranks
+    setup, batch, part
         As for `FusedStep`.
     beside : GraphStep, optional
         One of the same run, never replayed at the same time: both use the same memory for what a step makes on its way.
     """
 
     def __init__(
-        self, setup: FitSetup, batch: int, ranks: Ranks = ALONE, beside: GraphStep | None = None
+        self, setup: FitSetup, batch: int, part: Part | None = None, beside: GraphStep | None = None
     ) -> None:
-        super().__init__(setup, batch, ranks)
+        super().__init__(setup, batch, part)
         self._recording = True
         device = setup.gaussians.position.device
         self._side, self._forked = torch.cuda.Stream(device), False
@@ -79,10 +74,10 @@ class GraphStep(FusedStep):
         values = self._next(views, share)
         self._waiting[turn].numpy()[:] = values
         self._control.copy_(self._waiting[turn], non_blocking=True)
-        graphs.gradients.replay()
-        if graphs.update is not None:
-            self._add_up(graphs.made)
-            graphs.update.replay()
+        for graph, summands in graphs:
+            graph.replay()
+            if summands:
+                self._add_up(summands)
         # On another GPU than the current one, the usual stream would say nothing about this one's work.
         self._passed[turn].record(torch.cuda.current_stream(self._control.device))
         self.feed.used()
@@ -105,18 +100,18 @@ class GraphStep(FusedStep):
             stream = torch.cuda.Stream(device)
             return {smooth: self._recorded(smooth, stream) for smooth in weights}
 
-    def _add_up(self, made: Gradients) -> None:
+    def _add_up(self, summands: tuple[torch.Tensor, ...]) -> None:
         # Ranks record at their own pace, and what they add up is no part of a graph.
         if not self._recording:
-            super()._add_up(made)
+            super()._add_up(summands)
 
     def _recorded(self, smooth: float, stream: torch.cuda.Stream) -> _Recorded:
-        """A step as one graph, or as two between which ranks add up their gradients."""
-        if self.ranks.count == 1:
-            return _Recorded(self._captured(lambda: self._enqueue(smooth), stream)[0])
-        first, made = self._captured(lambda: self._gradients(smooth), stream)
-        second, _ = self._captured(lambda: self._update(made), stream)
-        return _Recorded(first, made, second)
+        """A step as one graph, or as several between which ranks add up what they have made."""
+        stages = self._stages(smooth)
+        graphs: _Recorded = []
+        while not graphs or graphs[-1][1]:
+            graphs.append(self._captured(lambda: next(stages, ()), stream))
+        return graphs
 
     def _captured(
         self, make: Callable[[], Any], stream: torch.cuda.Stream
@@ -158,22 +153,23 @@ class GraphStep(FusedStep):
             tensor.zero_()
         self.done = self._unread = 0
 
-    def _gradients(self, smooth: float) -> Gradients:
+    def _stages(self, smooth: float) -> Iterator[tuple[torch.Tensor, ...]]:
         try:
-            return super()._gradients(smooth)
+            yield from super()._stages(smooth)
         except BaseException:
             # A recording ends with an error of its own, which would hide this one, where its streams stay apart.
-            if self._forked:
-                self._join()
+            self._join()
             raise
 
-    def _volume_gradients(self, position, scale, rotation, output, smooth) -> tuple[torch.Tensor, ...]:
-        """Beside those of the rays: each alone leaves much of a GPU idle."""
+    @contextmanager
+    def _beside(self) -> Iterator[None]:
+        """On another stream: the rays' part and the volume's each leave much of a GPU idle."""
         self._side.wait_stream(torch.cuda.current_stream())
         self._forked = True
         with torch.cuda.stream(self._side):
-            return super()._volume_gradients(position, scale, rotation, output, smooth)
+            yield
 
     def _join(self) -> None:
-        torch.cuda.current_stream().wait_stream(self._side)
-        self._forked = False
+        if self._forked:
+            torch.cuda.current_stream().wait_stream(self._side)
+            self._forked = False

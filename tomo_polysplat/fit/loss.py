@@ -7,6 +7,7 @@ import math
 import torch
 
 from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.fit.shares import Part
 from tomo_polysplat.kernels.step.faint import BESIDE, EDGE, FAINT
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
@@ -14,9 +15,9 @@ from tomo_polysplat.settings import Settings
 __all__ = [
     "away_from_edges",
     "misfit",
-    "part_of_variation",
     "roughness",
     "total_variation",
+    "variation_of_slab",
     "weighted_huber",
     "weighted_l1",
 ]
@@ -50,14 +51,14 @@ def weighted_huber(
 
 
 def roughness(
-    gaussians: Gaussians, scene: FitScene, settings: Settings, planes: slice | None = None
+    gaussians: Gaussians, scene: FitScene, settings: Settings, part: Part | None = None
 ) -> torch.Tensor:
-    """Total variation of the volume, or the part of it that some planes of z hold: all parts add up to it."""
-    # All of it in any case: in a box of these planes voxels come out with other roundings, and where neighbours are as
-    # good as equal these tell the sign of the slope.
-    volume = scene.attenuation(gaussians, scene.box)
+    """Total variation of the volume; with a rank's ``part`` of the fit, that of its planes in the sum over ranks."""
     chosen = settings.tv_clip, scene.tv_corners, settings.bone_level
-    return total_variation(volume, *chosen) if planes is None else part_of_variation(volume, planes, *chosen)
+    if part is None:
+        return total_variation(scene.attenuation(gaussians, scene.box), *chosen)
+    volume = part.volume_of_all(scene.attenuation(gaussians, part.box(scene.box)))
+    return variation_of_slab(volume, scene.box.shape[0], *chosen)
 
 
 def total_variation(
@@ -95,25 +96,24 @@ def total_variation(
     return total
 
 
-def part_of_variation(
-    volume: torch.Tensor,
-    planes: slice,
+def variation_of_slab(
+    slab: torch.Tensor,
+    planes: int,
     ceiling: float,
     corners: tuple[float, float] = (0.0, 0.0),
     dense: float = math.inf,
 ) -> torch.Tensor:
-    """What some planes (nz) add to the `total_variation` of a volume, with the step to the plane behind them."""
-    clipped = volume.clamp(max=ceiling)
-    away = (
-        away_from_edges(clipped, corners[0], dense)[planes.start : planes.stop + 1] if any(corners) else None
-    )
-    clipped = clipped[planes.start : planes.stop + 1]
-    depth = planes.stop - planes.start
-    total = volume.new_zeros(())
-    for axis, length in enumerate(volume.shape):
-        if length > 1 and depth:
-            heights = _heights(clipped, away, axis, corners, dense)[:depth]
-            total = total + heights.sum() / (volume.numel() // length * (length - 1))
+    """What a slab (nz, ny, nx) adds to the `total_variation` of a volume of so many ``planes``.
+
+    Its slope is that of the whole, except within ``faint.HALO`` planes of where the slab ends and the volume does not.
+    """
+    clipped, whole = slab.clamp(max=ceiling), (planes, *slab.shape[1:])
+    away = away_from_edges(clipped, corners[0], dense) if any(corners) else None
+    total = slab.new_zeros(())
+    for axis, length in enumerate(whole):
+        if length > 1:
+            heights = _heights(clipped, away, axis, corners, dense)
+            total = total + heights.sum() / (math.prod(whole) // length * (length - 1))
     return total
 
 

@@ -16,7 +16,7 @@ from tomo_polysplat.ranks import current_ranks
 
 __all__ = [
     "free_bytes",
-    "most_gaussians",
+    "has_room",
     "projections_stay",
     "require_machine",
     "require_room",
@@ -31,12 +31,10 @@ __all__ = [
 logger = logging.getLogger(__name__)
 
 # Bytes a Gaussian takes: 330 for parameters, moments, the best copy, pull and no smoothing's gradients, and what a step
-# makes of it on its way; its footprint and sums in each view of a step; and what ranks add up, kept between graphs
-# (2.8e6 Gaussians, 192^3 voxels and 6 views a step on an H100: 330 and, with the footprints of three views, 780).
-_GAUSSIAN, _FOOTPRINT, _ADDED_UP = 680, 144, 110
-# Runs of a large cloud at once, while the rays are asked which of two models explains them. The second's step is tried
-# before it is recorded into the memory of the first, so that for a moment all of a step is there twice.
-_RUNS = 2
+# makes of it on its way; its footprint and sums in each view of a step (2.8e6 Gaussians, 192^3 voxels and 6 views a
+# step on an H100: 330 and, with the footprints of three views, 780). Of several ranks each has these of its part, and
+# the first one between passes parameters, moments, pull, the best copy and a place in a part of all of them.
+_GAUSSIAN, _FOOTPRINT, _WHOLE = 680, 144, 220
 # Bytes a pixel of a step takes: image and gradient of four channels, projections and their slopes.
 _PIXEL = 48
 # Bytes a voxel takes at once, by torch's own count on 40^3 to 64^3 (tests/fit/test_counted_memory.py): while a start is
@@ -137,6 +135,11 @@ def step_bytes(
     )
 
 
+def has_room(device: torch.device, **needed: int) -> bool:
+    """Whether a CUDA device has the memory that `step_bytes` tells; others are not asked."""
+    return device.type == "cpu" or sum(step_bytes(device, **needed).values()) <= _SHARE * free_bytes(device)
+
+
 # All that a step takes, and the words of two kinds of device.
 def require_room(
     device: torch.device,
@@ -207,16 +210,9 @@ def room_for_gaussians(device: torch.device, *, views: int, pixels: int, voxels:
         return math.inf
     left = max(_SHARE * free - sum(_of_all(views, pixels, voxels, runs, device).values()), 0.0)
     few = left / (runs * _of_a_gaussian(views))
-    if few < MANY or device.type == "cpu":
+    if few < _many() or device.type == "cpu":
         return few
     return left / (runs * _of_a_gaussian(min(views, FEW_VIEWS)))
-
-
-def most_gaussians(device: torch.device) -> float:
-    """How many Gaussians of a large cloud a CUDA device holds in its free memory; infinity without one."""
-    if device.type == "cpu" or not torch.cuda.is_available():
-        return math.inf
-    return _SHARE * free_bytes(device) / (_RUNS * _of_a_gaussian(FEW_VIEWS))
 
 
 @contextmanager
@@ -240,18 +236,23 @@ def told_of_lack() -> Iterator[None]:
 
 
 def _of_gaussians(count: int, views: int, runs: int, device: torch.device) -> int:
-    """Bytes of so many Gaussians in each run."""
+    """Bytes of so many Gaussians in each run, on the first rank."""
     whole = runs * count * _of_a_gaussian(views)
     if device.type == "cpu":
-        return whole
+        return math.ceil(whole)
     # A GPU holds the footprints of fewer views at once of a large cloud, which may have grown from a smaller one.
     few = runs * count * _of_a_gaussian(min(views, FEW_VIEWS))
-    return max(few, min(whole, runs * MANY * _of_a_gaussian(views)))
+    return math.ceil(max(few, min(whole, runs * _many() * _of_a_gaussian(views))))
 
 
-def _of_a_gaussian(views: int) -> int:
-    added_up = _ADDED_UP if current_ranks().count > 1 else 0
-    return _GAUSSIAN + _FOOTPRINT * views + added_up
+def _many() -> int:
+    """How many Gaussians of all ranks make a large cloud on each."""
+    return MANY * current_ranks().count
+
+
+def _of_a_gaussian(views: int) -> float:
+    ranks = current_ranks().count
+    return (_WHOLE if ranks > 1 else 0) + (_GAUSSIAN + _FOOTPRINT * views) / ranks
 
 
 def _of_all(views: int, pixels: int, voxels: int, runs: int, device: torch.device) -> dict[str, int]:

@@ -50,6 +50,7 @@ class _Known:
     agreement: list[float | None] | None = None
     photons: float | None = None
     solid: bool = False
+    hardening: float | None = None
     taken: list[Step] = field(default_factory=list)
 
 
@@ -160,9 +161,14 @@ class Problem:
         """Whether the start volume was made as that of an object of one solid."""
         return self._known.solid
 
-    def remember_solid(self, whether: bool) -> None:
-        """Keep whether it is, for those who look at that volume."""
-        self._known.solid = whether
+    @property
+    def hardening(self) -> float | None:
+        """Of the hardening by a solid of its density, the share that an object of one solid shows, where it does."""
+        return self._known.hardening
+
+    def remember_solid(self, whether: bool, hardening: float | None = None) -> None:
+        """Keep whether it is, and how it hardens the beam, for those who look at that volume."""
+        self._known.solid, self._known.hardening = whether, hardening
 
     @property
     def dimensions(self) -> int:

@@ -96,16 +96,21 @@ class FitScene:
         return views if self.pixel_rays == 1 else views.finer(self.pixel_rays)
 
     def projections(
-        self, gaussians: Gaussians, views: DetectorViews, vectors: torch.Tensor | None = None
+        self,
+        gaussians: Gaussians,
+        views: DetectorViews,
+        vectors: torch.Tensor | None = None,
+        of_all: Callable[[torch.Tensor], torch.Tensor] | None = None,
     ) -> tuple[torch.Tensor, int]:
         """(views, rows, columns) predicted -log(I/I0), and the pairs skipped at the source plane.
 
         ``vectors`` of these views, as `render.renderer.project_gaussians` takes them, go with one ray a pixel only.
+        ``of_all`` adds to the line integrals those of Gaussians that other ranks hold.
         """
         weights = gaussians.weights(self.reference_curve)
         rays = self.fine(views)
         areal, skipped = project_gaussians(gaussians, weights, rays, self.kernel, self.cutoff, vectors)
-        areal = areal * self.areal_scale
+        areal = (areal if of_all is None else of_all(areal)) * self.areal_scale
         sharp = self._seen(areal)
         if self.pixel_rays > 1:
             sharp = averaged_light(sharp, views.rows, views.columns)

@@ -13,10 +13,10 @@ from tomo_polysplat.fit.adam import Adam, Moments
 from tomo_polysplat.fit.loss import misfit, roughness
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.setup import FitSetup
+from tomo_polysplat.fit.shares import Part
 from tomo_polysplat.fit.similarity import dissimilarity
 from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.physics.detector_blur import LARGEST_BLUR
-from tomo_polysplat.ranks import ALONE, Ranks
 from tomo_polysplat.settings import Settings
 
 __all__ = [
@@ -49,9 +49,11 @@ class Step(Protocol):
     """
 
     pull: torch.Tensor
-    moments: Moments
     done: int
     largest: list[float]
+
+    @property
+    def moments(self) -> Moments: ...
 
     def __call__(self, views: np.ndarray, share: float) -> None:
         """Step towards the rays of these views and a smooth volume; ``share`` of the run is done, 0 to 1."""
@@ -109,13 +111,13 @@ def held_out_mean(total: float, weight: float, typical: float) -> float:
 class EagerStep:
     """The step as torch runs it, operation by operation; see `Step`.
 
-    Of several ``ranks`` each takes its part of the views and of the volume; they add up their gradients.
+    With a ``part`` the Gaussians are those of one rank of several, whose images and volumes are added up.
     """
 
-    def __init__(self, setup: FitSetup, ranks: Ranks = ALONE) -> None:
+    def __init__(self, setup: FitSetup, part: Part | None = None) -> None:
         gaussians, spacing, self.rays, scene, settings = setup
         self.gaussians, self.scene, self.settings = gaussians, scene, settings
-        self.ranks = ranks
+        self.part = part
         self.bounds = log_scale_bounds(scene, spacing, gaussians.planar, settings)
         self.pull = torch.zeros_like(gaussians.attenuation)
         self.rates = step_rates(settings, spacing)
@@ -139,17 +141,9 @@ class EagerStep:
         """One step; see `Step`."""
         rates = {name: rate * self.settings.final_rate**share for name, rate in self.rates.items()}
         rates["rotation"] *= turning(self._done)
-        # One of more ranks than views looks at a view that does not count.
-        mine = views[self.ranks.mine(len(views))]
-        some = mine if len(mine) else views[:1]
-        chosen, measured, weight, aside = self.rays.batch(some)
-        predicted, skipped = self._predict(some, chosen)
-        if not len(mine):
-            weight, aside, skipped = 0 * weight, 0 * aside, 0 * skipped
+        chosen, measured, weight, aside = self.rays.batch(views)
+        predicted, skipped = self._predict(views, chosen)
         fitted = misfit(predicted, measured, weight, self.settings)
-        if self.ranks.count > 1:
-            # A mean over the rays of all ranks.
-            fitted = fitted * weight.sum() / self.rays.totals[views].sum().clamp(min=1e-12)
         loss = fitted + self._regularisation(predicted, measured, weight)
         self.adam.forget_gradients()
         # On this thread: autograd's own would be woken and waited for at every step.
@@ -168,19 +162,15 @@ class EagerStep:
             self._sums.append((fitted.detach(), held_out, weight, skipped))
 
     def _add_up(self) -> None:
-        """Make the gradients those of all ranks."""
-        if self.ranks.count == 1:
-            return
-        gradients = []
-        for tensor in self.gaussians.parameters().values():
-            # Without views of its own a rank has none, to which those of others are added.
-            tensor.grad = torch.zeros_like(tensor) if tensor.grad is None else tensor.grad
-            gradients.append(tensor.grad)
-        self.ranks.sum_(*gradients)
+        """Make the gradient of what all Gaussians share that of all ranks; each has the blur's, of the whole images."""
+        shared = self.gaussians.shared_material.grad
+        if self.part is not None and shared is not None:
+            self.part.ranks.sum_(shared)
 
     def _predict(self, views: np.ndarray, chosen: DetectorViews) -> tuple[torch.Tensor, int]:
         """What the ``views`` of these numbers, which are ``chosen``, would measure, and the pairs skipped."""
-        return self.scene.projections(self.gaussians, chosen)
+        of_all = None if self.part is None else self.part.of_all
+        return self.scene.projections(self.gaussians, chosen, of_all=of_all)
 
     @torch.no_grad()
     def _bound(self) -> None:
@@ -197,7 +187,9 @@ class EagerStep:
     def read(self) -> tuple[float, float, int]:
         """Means since the last call; see `Step`."""
         sums = (float(sum(values)) for values in zip(*self._sums))
-        fitted, held_out, weight, skipped = self.ranks.total(*sums)
+        fitted, held_out, weight, skipped = sums
+        if self.part is not None:
+            (skipped,) = self.part.ranks.total(skipped)
         steps, self._sums = len(self._sums), []
         return fitted / steps, held_out_mean(held_out, weight, self.rays.typical_weight), round(skipped)
 
@@ -208,9 +200,7 @@ class EagerStep:
         settings = self.settings
         total: torch.Tensor | float = 0.0
         if weight_now := smoothing(settings, self.scene, self._done):
-            planes = self.ranks.mine(self.scene.box.shape[0]) if self.ranks.count > 1 else None
-            if planes is None or planes.start < planes.stop:
-                total = total + weight_now * roughness(self.gaussians, self.scene, settings, planes)
+            total = total + weight_now * roughness(self.gaussians, self.scene, settings, self.part)
         if settings.ssim_weight:
             total = total + settings.ssim_weight * dissimilarity(predicted, measured, weight)
         return total

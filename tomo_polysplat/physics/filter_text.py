@@ -16,7 +16,7 @@ logger = logging.getLogger(__name__)
 FILTER_REMEDY = (
     "write a material and its thickness with a unit, such as 'Al 1mm' or 'Al 0.5mm + Cu 0.1mm', or 'none'"
 )
-_NUMBER = r"(?P<size>\d+(?:[.,]\d+)?)\s*(?P<unit>mm|um|µm|cm)"
+_NUMBER = r"(?P<size>\d+(?:[.,]\d+)?)\s*(?P<unit>mm|um|[µ\u03bc]m|cm)"
 _NAME = r"(?P<name>[A-Za-z][A-Za-z0-9 ]*?)"
 _EITHER = (re.compile(rf"{_NAME}\s*[:=]?\s*{_NUMBER}"), re.compile(rf"{_NUMBER}\s*(?:of\s+)?{_NAME}"))
 _BARE = re.compile(r"(?P<name>[^:]+):(?P<size>[^:]+)")
@@ -31,7 +31,7 @@ def filters_of(text: str) -> dict[str, float] | None:
     Parameters
     ----------
     text : str
-        One or more filters, joined by ``+``, ``;``, ``&`` or ``and``.
+        One or more filters, joined by ``+``, ``;``, ``&``, ``/``, a comma or ``and``.
     """
     plain = text.strip().strip('"').lower()
     if plain in _NONE:
@@ -41,7 +41,7 @@ def filters_of(text: str) -> dict[str, float] | None:
         match = next((m for pattern in _EITHER if (m := pattern.fullmatch(one))), None)
         if match is None:
             return None
-        name, unit = match["name"].strip(), match["unit"].replace("µ", "u")
+        name, unit = match["name"].strip(), match["unit"].replace("µ", "u").replace("\u03bc", "u")
         try:
             composition(name)
         except ValueError:
@@ -70,7 +70,9 @@ def require_filters(argument: str, text: str) -> dict[str, float]:
 
 
 def _apart(text: str) -> list[str]:
-    return [one.strip() for one in re.split(r"\s*(?:\+|;|&|\band\b)\s*", text.strip().strip('"'))]
+    # A comma before a digit is a decimal sign.
+    plain = re.sub(r"[()]|\bfilter\s*$", " ", text.strip().strip('"'), flags=re.I)
+    return [one.strip() for one in re.split(r"\s*(?:\+|;|&|/|,(?!\d)|\band\b)\s*", plain)]
 
 
 def _in_cm(argument: str, one: str) -> dict[str, float]:

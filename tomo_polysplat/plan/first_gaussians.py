@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.memory import most_gaussians, require_room, room_for_gaussians, start_stays
+from tomo_polysplat.fit.memory import has_room, require_room, room_for_gaussians, start_stays
 from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.free_memory import MUCH, give_back, keeps_more_than
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.model.seed import Spacing, seed_gaussians
 from tomo_polysplat.plan.costs import work
@@ -18,7 +19,7 @@ from tomo_polysplat.plan.resolution import finest_spacing, most_seeds
 from tomo_polysplat.ranks import current_ranks
 from tomo_polysplat.settings import Settings
 
-__all__ = ["AVERAGED_RAYS", "first_gaussians", "room_to_grow"]
+__all__ = ["AVERAGED_RAYS", "first_gaussians", "room_for_seeds", "room_to_grow", "why_one_run"]
 
 # Rays a pixel and axis where the light is averaged: with three pins of 36^3 are no better than with two (45.4 and 48.4
 # dB everywhere).
@@ -65,19 +66,26 @@ def first_gaussians(
         problem.planar,
     )
     gaussians = gaussians if stays else gaussians.to(device)
+    if keeps_more_than(MUCH, device):
+        # As the start volume is moved (`plan.first_volume`).
+        gaussians = gaussians.to(torch.device("cpu"))
+        give_back()
+        gaussians = gaussians.to(device)
     free = int((gaussians.group < 0).sum())
     kinds = "none with a material number of its own"
     if several:
         kinds = f"the material number free for {free} and for {len(gaussians.shared_material) - 1} pieces of metal"
     values = problem.measured(device)
+    many = math.ceil(_times(settings.growth or 1.0, plan) * len(gaussians))
+    runs = 1 if why_one_run(many, plan, problem, device) else _runs(plan)
     memory = require_room(
         device,
-        gaussians=math.ceil(_times(settings.growth or 1.0, plan) * len(gaussians)),
-        **_all_else(plan, problem, device),
+        gaussians=many,
+        **_all_else(plan, problem, runs),
         projections=values.nbytes if values.device.type == device.type else 0,
     )
     if (ranks := current_ranks().count) > 1:
-        memory = f"on each of {ranks} devices {memory}"
+        memory = f"on the first of {ranks} devices {memory}"
     return gaussians, {
         "gaussians": (len(gaussians), kinds),
         "work": ("", work(plan, problem, settings, len(gaussians))),
@@ -95,11 +103,30 @@ def room_to_grow(gaussians: int, plan: Plan, problem: Problem, device: torch.dev
     problem : Problem
     device : torch.device
     """
-    room = room_for_gaussians(device, **_all_else(plan, problem, device))
+    room = room_for_gaussians(device, **_all_else(plan, problem, _runs(plan)))
     room /= _GROWING if _runs(plan) == 1 else 1.0
     if device.type != "cpu":
-        room = min(room, most_gaussians(device), _OF_SEEDS * most_seeds(problem))
+        room = min(room, _OF_SEEDS * most_seeds(problem))
     return room / max(gaussians, 1)
+
+
+def room_for_seeds(views: int, problem: Problem, device: torch.device) -> float:
+    """How many Gaussians a GPU has memory for in one run, whose steps have so many views; infinity without one.
+
+    A second run, which only questions need, is not made where there is no room for it (`why_one_run`).
+    """
+    if device.type == "cpu" or not torch.cuda.is_available():
+        return math.inf
+    pixels, voxels = problem.geometry.rows * problem.geometry.columns, math.prod(problem.grid.shape)
+    return room_for_gaussians(device, views=views, pixels=pixels, voxels=voxels)
+
+
+def why_one_run(gaussians: int, plan: Plan, problem: Problem, device: torch.device) -> str:
+    """Why no second run is made beside the first, to ask the rays which of two models explains them, if so."""
+    needed = _all_else(plan, problem, _runs(plan))
+    if has_room(device, gaussians=gaussians, **needed):
+        return ""
+    return "there is no room on the GPU for a second run beside it"
 
 
 def _times(growth: float, plan: Plan) -> float:
@@ -116,16 +143,17 @@ def _runs(plan: Plan) -> int:
     return 1 if plan.pixel_rays and plan.fat is not None else 2
 
 
-def _all_else(plan: Plan, problem: Problem, device: torch.device) -> dict[str, int]:
-    """What memory is needed for besides Gaussians, as `fit.memory` asks, on each of the ranks that share the steps."""
-    ranks, (planes, *slice_shape) = current_ranks().count, problem.grid.shape
-    if ranks > 1 and device.type == "cuda":
-        # A slab each, with the planes beside it.
-        planes = min(-(-planes // ranks) + 2, planes)
-    rays = _runs(plan) * plan.pixel_rays**2 if plan.pixel_rays else 1 + AVERAGED_RAYS**2
+def _all_else(plan: Plan, problem: Problem, runs: int) -> dict[str, int]:
+    """What memory is needed for besides Gaussians, as `fit.memory` asks.
+
+    On each rank that is for all images of a step, and the voxels that its Gaussians reach, which may be all.
+    """
+    rays = runs * (plan.pixel_rays or 1) ** 2
+    if runs > 1 and not plan.pixel_rays:
+        rays = 1 + AVERAGED_RAYS**2
     return {
-        "views": -(-plan.views_per_step // ranks),
+        "views": plan.views_per_step,
         "pixels": rays * problem.geometry.rows * problem.geometry.columns,
-        "voxels": planes * math.prod(slice_shape),
-        "runs": _runs(plan),
+        "voxels": math.prod(problem.grid.shape),
+        "runs": runs,
     }

@@ -6,9 +6,11 @@ import torch
 
 from tomo_polysplat.fit.memory import start_stays
 from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.free_memory import MUCH, give_back, keeps_more_than
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.physics.water import areal_density, transmitted_energy
 from tomo_polysplat.plan.decisions.soft_reference import soft_reference
+from tomo_polysplat.plan.hardening import coarse, hardening_of
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.bridged import bridged_start
 from tomo_polysplat.start.initial import initial_volume_on
@@ -26,20 +28,36 @@ def first_volume(problem: Problem, device: torch.device, settings: Settings) -> 
     times ``problem.depth``. Rays through what shows as metal are bridged where that helps. It is on the host where the
     device has no room for what looks at it.
     """
+    volume, how = _made(problem, device, settings)
+    if keeps_more_than(MUCH, volume.device):
+        # Anew: amid what copies of the rays took it would keep all of that from being given back.
+        on_host = volume.cpu()
+        del volume
+        give_back()
+        volume = on_host.to(device)
+    return volume, how
+
+
+def _made(problem: Problem, device: torch.device, settings: Settings) -> tuple[torch.Tensor, str]:
+    """The same where it was made."""
     primary = problem.primary(device)
     values = _as_if_soft(problem, primary)
     volume, done = initial_volume_on(values, problem.geometry, problem.grid, device)
     reference = soft_reference(_looked_at(volume, device), problem, settings)
     problem.remember_solid(reference.value != reference.first)
+    soft = coarse(volume) if problem.solid else None
     for _ in range(_TIMES if problem.solid else 0):
         values = _as_if_solid(problem, primary, reference.number)
         volume, done = initial_volume_on(values, problem.geometry, problem.grid, device)
         reference = soft_reference(_looked_at(volume, device), problem, settings, problem.solid)
+    if soft is not None:
+        problem.remember_solid(problem.solid, hardening_of(soft, coarse(volume)))
     metal = reference.adapted(settings).metal_level * problem.depth * reference.value
     if not values.is_cuda:
         volume = volume.cpu()
+    spare = values is not primary
     volume, bridged = bridged_start(
-        values, volume, done["method"], problem.geometry, problem.grid, metal=metal
+        values, volume, done["method"], problem.geometry, problem.grid, metal=metal, spare=spare
     )
     return _looked_at(volume, device), f"{done['method'].upper()}: {done['reason']}{bridged}"
 

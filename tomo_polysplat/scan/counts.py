@@ -99,9 +99,24 @@ class _MadeWhenLookedAt(np.lib.mixins.NDArrayOperatorsMixin, ABC):
         remedy = "change numpy.asarray of it, or pass valid="
         raise fail("projections", "no change of what stays where it is", "an assignment", remedy, TypeError)
 
+    def swapaxes(self, first: int, second: int) -> Any:
+        """As of an array; with views before rows nothing is made before that is looked at."""
+        return _ViewsFirst(self) if {first, second} == {0, 1} else np.asarray(self).swapaxes(first, second)
+
     @abstractmethod
     def _made(self, rows: np.ndarray, views: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """What is where these rows, views and columns meet, each of them rising."""
+
+
+class _ViewsFirst:
+    """The same (views, rows, columns), for who looks at parts of it by two slices or lists."""
+
+    def __init__(self, stored: _MadeWhenLookedAt) -> None:
+        self._stored = stored
+
+    def __getitem__(self, key: tuple[Any, Any]) -> np.ndarray:
+        views, rows = key
+        return self._stored[rows, views].swapaxes(0, 1)
 
 
 class Counts(_MadeWhenLookedAt):

@@ -18,12 +18,12 @@ import numpy as np
 from tomo_polysplat.checks import fail, visible
 from tomo_polysplat.files import existing_file
 from tomo_polysplat.json_text import parse_json
-from tomo_polysplat.scan.hdf5_array import StoredArray, dtype_of
+from tomo_polysplat.scan.hdf5_array import StoredArray
 from tomo_polysplat.scan.hdf5_child import text_apart
 from tomo_polysplat.scan.hdf5_chunks import chunk_bytes
 from tomo_polysplat.scan.hdf5_headers import attribute_bytes, layout
 from tomo_polysplat.scan.hdf5_heaps import referred_text, require_plain_start
-from tomo_polysplat.scan.hdf5_links import held_files, member
+from tomo_polysplat.scan.hdf5_links import dtype_of, held_files, member
 
 if TYPE_CHECKING:
     import h5py

@@ -20,7 +20,7 @@ from tomo_polysplat.scan.hdf5_chunks import UNPACKED_HERE, Box, chunk_table, fil
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["StoredArray", "dtype_of"]
+__all__ = ["StoredArray"]
 
 _ADDRESS_BYTES = 8
 # Of a chunk that is larger than the whole dataset, as in one that was made to grow.
@@ -120,7 +120,7 @@ class StoredArray:
         if not self._unpacked_here():
             from tomo_polysplat.scan.hdf5_child import read_apart
 
-            return read_apart(self, box)
+            return read_apart(self.dataset, box, self.where)
         out = self.filled([len(part) for part in box])
         read_chunks(self.dataset, self.where, self._table, box, out)
         return out
@@ -156,15 +156,3 @@ class StoredArray:
             raise fail(
                 self.where, f"at most {most} chunks in a file of this size", f"{chunks}", "damaged file"
             )
-
-
-def dtype_of(dataset: Any) -> np.dtype | None:
-    """NumPy's type of a dataset; None for anything else and for types that NumPy does not have."""
-    import h5py
-
-    if not isinstance(dataset, h5py.Dataset):
-        return None
-    try:
-        return dataset.dtype
-    except (TypeError, ValueError):
-        return None

@@ -23,7 +23,8 @@ import numpy as np
 from tomo_polysplat.checks import fail
 
 if TYPE_CHECKING:
-    from tomo_polysplat.scan.hdf5_array import StoredArray
+    import h5py
+
     from tomo_polysplat.scan.hdf5_chunks import Box
 
 __all__ = ["main", "read_apart", "text_apart"]
@@ -39,24 +40,24 @@ _REMEDY = (
 )
 
 
-def read_apart(array: StoredArray, box: Box) -> np.ndarray:
-    """A part of a dataset.
+def read_apart(dataset: h5py.Dataset, box: Box, where: str) -> np.ndarray:
+    """A part of a dataset, which errors call ``where``.
 
     Raises
     ------
     ValueError
         If the process ends, or takes longer or more memory than this part may need.
     """
-    out = np.empty([len(part) for part in box], array.dtype)
-    chunk = math.prod(array.dataset.chunks or (1,)) * array.dtype.itemsize
+    out = np.empty([len(part) for part in box], dataset.dtype)
+    chunk = math.prod(dataset.chunks or (1,)) * dataset.dtype.itemsize
     task = {
-        "file": array.file.filename,
-        "name": array.name,
+        "file": dataset.file.filename,
+        "name": dataset.name,
         "box": [[part.start, part.stop, part.step] for part in box],
-        "dtype": array.dtype.str,
+        "dtype": dataset.dtype.str,
         "memory": 2 * out.nbytes + 4 * chunk,
     }
-    _ask(task, out, array.where)
+    _ask(task, out, where)
     return out
 
 

@@ -13,6 +13,8 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from tomo_polysplat.checks import fail
 from tomo_polysplat.scan.hdf5_headers import layout
 from tomo_polysplat.scan.hdf5_heaps import heap_object, require_plain_start
@@ -20,7 +22,7 @@ from tomo_polysplat.scan.hdf5_heaps import heap_object, require_plain_start
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["MOST_LINKS", "beside", "held_files", "member", "opened_beside"]
+__all__ = ["MOST_LINKS", "beside", "dtype_of", "held_files", "member", "opened_beside"]
 
 MOST_LINKS = 16
 # Names on the way to the data, those in the links included.
@@ -149,3 +151,15 @@ def beside(main: str, other: str, where: str) -> Path:
         f"a link to {other}, which is not there or not in this folder",
         f"put {last} (the file itself, not a link) into {folder}",
     )
+
+
+def dtype_of(dataset: Any) -> np.dtype | None:
+    """NumPy's type of a dataset; None for anything else and for types that NumPy does not have."""
+    import h5py
+
+    if not isinstance(dataset, h5py.Dataset):
+        return None
+    try:
+        return dataset.dtype
+    except (TypeError, ValueError):
+        return None

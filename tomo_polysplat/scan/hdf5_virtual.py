@@ -7,18 +7,16 @@ where it finds none. Here they are looked for in one place, and a missing one is
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
 from tomo_polysplat.checks import fail
 from tomo_polysplat.scan.hdf5_chunks import Box
-from tomo_polysplat.scan.hdf5_links import member, opened_beside
+from tomo_polysplat.scan.hdf5_links import dtype_of, member, opened_beside
 
 if TYPE_CHECKING:
     import h5py
-
-    from tomo_polysplat.scan.hdf5_array import StoredArray
 
 __all__ = ["Source", "read_sources", "sources_of"]
 
@@ -28,6 +26,24 @@ _REMEDY = (
     "read it with h5py where its other files are, and write the array that you get into a file: "
     "h5py.File(NEW, 'w')[NAME] = h5py.File(OLD)[NAME][()]"
 )
+
+
+class Stored(Protocol):
+    """What is asked of an array in a file; `hdf5_array.StoredArray` is one."""
+
+    dataset: h5py.Dataset
+    where: str
+    depth: int
+    shape: tuple[int, ...]
+    file: h5py.File
+
+    def __init__(self, dataset: h5py.Dataset, where: str, depth: int = 0) -> None: ...
+
+    def __getitem__(self, key: Any) -> np.ndarray: ...
+
+    def filled(self, shape: list[int]) -> np.ndarray:
+        """An array of what stands where a file has nothing."""
+        ...
 
 
 class Source(NamedTuple):
@@ -52,7 +68,7 @@ class Source(NamedTuple):
     size: int
 
 
-def sources_of(array: StoredArray) -> list[Source]:
+def sources_of(array: Stored) -> list[Source]:
     """What a virtual dataset is made of.
 
     Raises
@@ -102,7 +118,7 @@ def _unsigned(numbers: Any) -> list[int]:
     return [int(number) % 2**64 for number in numbers]
 
 
-def read_sources(array: StoredArray, sources: list[Source], box: Box) -> np.ndarray:
+def read_sources(array: Stored, sources: list[Source], box: Box) -> np.ndarray:
     """The part `box` of a virtual dataset."""
     out = array.filled([len(axis) for axis in box])
     if box and box[0].step > 1:
@@ -129,7 +145,7 @@ def _within(axis: range, asked: range) -> range:
     return range(first, last)
 
 
-def _copy(array: StoredArray, source: Source, wanted: list[range], box: Box, out: np.ndarray) -> None:
+def _copy(array: Stored, source: Source, wanted: list[range], box: Box, out: np.ndarray) -> None:
     """Copy the positions `wanted` of a part into `out`, which has the indices `box`."""
     targets = []
     for axis, positions, asked in zip(source.target, wanted, box):
@@ -143,15 +159,13 @@ def _copy(array: StoredArray, source: Source, wanted: list[range], box: Box, out
     out[tuple(targets)] = values.reshape([len(positions) for positions in wanted])
 
 
-def _values(array: StoredArray, file: h5py.File, source: Source, wanted: list[range]) -> np.ndarray:
-    from tomo_polysplat.scan.hdf5_array import StoredArray, dtype_of
-
+def _values(array: Stored, file: h5py.File, source: Source, wanted: list[range]) -> np.ndarray:
     found = member(file, "/" + source.name.lstrip("/"))
     dtype = dtype_of(found)
     where = f"{array.where} ({source.file}: {source.name})"
     if dtype is None or dtype.kind not in "fiub" or found.shape is None:
         raise fail(where, "a dataset of numbers", type(found).__name__, _REMEDY)
-    stored = StoredArray(found, where, array.depth + 1)
+    stored = type(array)(found, where, array.depth + 1)
     axes = source.source or tuple(range(length) for length in stored.shape)
     # A frame may be a dataset of its own: axes of one number come and go.
     long = [positions for positions, axis in zip(wanted, source.target) if len(axis) > 1]

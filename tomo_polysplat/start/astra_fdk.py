@@ -22,7 +22,7 @@ from tomo_polysplat.start.weights import ray_arcs
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["fdk_cuda", "fdk_cuda_tensor", "suits_fdk_cuda", "weights_on"]
+__all__ = ["fdk_cuda_tensor", "suits_fdk_cuda", "weights_on"]
 
 # Numbers, with what rows are padded by, that are filtered at once.
 _FILTERED_AT_ONCE = 1 << 24
@@ -42,28 +42,10 @@ def suits_fdk_cuda(geometry: Geometry) -> tuple[bool, str]:
     return True, "a 3D scan"
 
 
-def fdk_cuda(
-    projections: np.ndarray,
-    geometry: Geometry,
-    grid: VolumeGrid,
-    orbit: Orbit,
-    *,
-    filter_name: str = "ram-lak",
-    device: str = "cuda",
-) -> np.ndarray:
-    """`fdk` on a GPU for a scan that `suits_fdk_cuda`; parameters and result are the same."""
-    import torch
-
-    from tomo_polysplat.start.slabs import fdk_on_device
-
-    values = torch.from_numpy(np.ascontiguousarray(projections, dtype=np.float32))
-    return fdk_on_device(values, geometry, grid, orbit, filter_name, torch.device(device)).cpu().numpy()
-
-
 def fdk_cuda_tensor(
     projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid, orbit: Orbit, filter_name: str
 ) -> torch.Tensor:
-    """The same of (views, rows, columns) float32 projections on a CUDA device, where the volume stays.
+    """`fdk` of (views, rows, columns) float32 projections on a CUDA device, where the volume stays.
 
     Corners of the volume beyond the ellipse inscribed in its window, and off the detector, miss a part.
 

@@ -35,10 +35,11 @@ _MOST_OF_RAYS = 0.5
 _JUDGES = 24
 # Steps along all rays beyond which the two more projections would take minutes on two CPU cores.
 _MOST_STEPS = 1e10
-# Rays on the host that are looked at together.
-_AT_ONCE = 1 << 22
+# Rays that are looked at together: the memory is not to hold copies of all.
+_AT_ONCE = {"cuda": 1 << 28, "cpu": 1 << 22}
 
 
+# A scan, its first volume and how that was made: nothing else holds these together.
 def bridged_start(
     values: torch.Tensor,
     volume: torch.Tensor,
@@ -47,6 +48,7 @@ def bridged_start(
     grid: VolumeGrid,
     *,
     metal: float,
+    spare: bool = False,
 ) -> tuple[torch.Tensor, str]:
     """The start volume, made anew without the rays through metal if that explains the other rays better.
 
@@ -64,6 +66,8 @@ def bridged_start(
     geometry, grid : Geometry, VolumeGrid
     metal : float
         Attenuation above which a voxel holds metal.
+    spare : bool
+        Whether nobody needs the ``values`` afterwards, so that they may be overwritten.
 
     Returns
     -------
@@ -84,7 +88,7 @@ def bridged_start(
         return volume, "; metal not bridged: it would take a CPU minutes"
     try:
         with projector_pair(geometry, grid, volume.device) as pair:
-            return _better(values, volume, mask, geometry, grid, pair, metal)
+            return _better(values if spare else values.clone(), volume, mask, geometry, grid, pair, metal)
     except RuntimeError as problem:
         if not on_gpu:
             raise
@@ -95,7 +99,7 @@ def bridged_start(
 
 # A volume and its rays, and what is known of both: nothing else holds these together.
 def _better(
-    values: torch.Tensor,
+    rays: torch.Tensor,
     volume: torch.Tensor,
     mask: torch.Tensor,
     geometry: Geometry,
@@ -103,22 +107,17 @@ def _better(
     pair: ProjectorPair,
     metal: float,
 ) -> tuple[torch.Tensor, str]:
-    """The volume or the bridged one, whichever explains the rays beside metal, and words that say so."""
-    # Half a voxel: less is the blur of the threshold's edge, and a wider trace loses more than it heals.
-    wide, dense = 0.5 * float(grid.voxel_size.min()), mask.float()
-    least, beside = THIN * float(largest_finite(values)), values.clone()
-    through, rays = 0, 0
-    for some in _portions(values):
-        trace = pair.forward(dense, some) > wide
-        part = beside[some[0] : some[-1] + 1]
-        matter = part > least
-        through, rays = through + int((trace & matter).sum()), rays + int(matter.sum())
-        part.masked_fill_(trace, math.nan)
-    covered = through / max(rays, 1)
+    """The volume or the bridged one, whichever explains the rays beside metal, and words that say so.
+
+    The rays are overwritten: copies of all of a large scan would not fit on a GPU.
+    """
+    covered = _blank(rays, mask.float(), 0.5 * float(grid.voxel_size.min()), pair)
     if covered > _MOST_OF_RAYS:
         return volume, f"; metal not bridged: {covered:.0%} of the object's rays pass through it"
-    bridged = torch.where(mask, volume, _made_without(beside, mask, geometry, grid, pair, metal))
-    before, after = (_misfit(each, beside, pair) for each in (volume, bridged))
+    views = np.unique(np.linspace(0, len(rays) - 1, min(_JUDGES, len(rays))).astype(int))
+    beside = rays[torch.from_numpy(views).to(rays.device)]
+    bridged = torch.where(mask, volume, _made_without(rays, mask, geometry, grid, pair, metal))
+    before, after = (_misfit(each, views, beside, pair) for each in (volume, bridged))
     words = f"misses the rays beside it by {after:.2g}, a start with all rays by {before:.2g}"
     if after < before:
         return (
@@ -126,6 +125,21 @@ def _better(
             f"; the {covered:.0%} of the object's rays that pass through metal bridged, which {words}",
         )
     return volume, f"; metal not bridged, which {words}"
+
+
+def _blank(rays: torch.Tensor, dense: torch.Tensor, wide: float, pair: ProjectorPair) -> float:
+    """Make rays through metal NaN, and tell which share of the object's rays they are.
+
+    ``wide`` is half a voxel: less is the blur of the threshold's edge, and a wider trace loses more than it heals.
+    """
+    least, through, known = THIN * float(largest_finite(rays)), 0, 0
+    for some in _portions(rays):
+        trace = pair.forward(dense, some) > wide
+        part = rays[some[0] : some[-1] + 1]
+        matter = part > least
+        through, known = through + int((trace & matter).sum()), known + int(matter.sum())
+        part.masked_fill_(trace, math.nan)
+    return through / max(known, 1)
 
 
 def normalising_volume(volume: torch.Tensor, mask: torch.Tensor, soft: float, metal: float) -> torch.Tensor:
@@ -150,40 +164,39 @@ def normalising_volume(volume: torch.Tensor, mask: torch.Tensor, soft: float, me
 
 
 def _made_without(
-    beside: torch.Tensor,
+    rays: torch.Tensor,
     mask: torch.Tensor,
     geometry: Geometry,
     grid: VolumeGrid,
     pair: ProjectorPair,
     metal: float,
 ) -> torch.Tensor:
-    """The volume of rays of which those through metal, NaN, are bridged."""
-    first, _ = initial_volume_on(beside, geometry, grid)
-    main = mass_level(first[~mask])
-    prior = pair.forward(normalising_volume(first, mask, main, metal), np.arange(geometry.views))
-    least = THIN * float(prior.max())
-    for some in _portions(beside):
+    """The volume of rays of which those through metal, NaN, are bridged in place."""
+    first, _ = initial_volume_on(rays, geometry, grid)
+    main = mass_level(first.masked_fill_(mask, 0.0))
+    prior, thickness = normalising_volume(first, mask, main, metal), torch.empty_like(rays)
+    for some in _portions(rays):
+        thickness[some[0] : some[-1] + 1] = pair.forward(prior, some)
+    least = THIN * float(thickness.max())
+    for some in _portions(rays):
         whole = slice(some[0], some[-1] + 1)
-        part, known = prior[whole], beside[whole]
+        part, known = thickness[whole], rays[whole]
         thick = part > least
         ratio = torch.where(thick, known / part.clamp(min=1e-12), 0.0)
-        prior[whole] = torch.where(thick, fill_rows(ratio) * part, fill_rows(known))
-    # What was bridged, in the memory of the prior.
-    second, _ = initial_volume_on(prior, geometry, grid)
+        rays[whole] = torch.where(thick, fill_rows(ratio) * part, fill_rows(known))
+    del first, prior, thickness, part, known
+    second, _ = initial_volume_on(rays, geometry, grid)
     return second
 
 
 def _portions(rays: torch.Tensor) -> Iterator[np.ndarray]:
-    """Views that are looked at together: all on a GPU, some on the host, whose memory is not to hold copies of all."""
-    views = len(rays)
-    at_once = views if rays.is_cuda else max(1, _AT_ONCE // rays[0].numel())
+    """Views that are looked at together."""
+    views, at_once = len(rays), max(1, _AT_ONCE[rays.device.type] // rays[0].numel())
     for first in range(0, views, at_once):
         yield np.arange(first, min(first + at_once, views))
 
 
-def _misfit(volume: torch.Tensor, beside: torch.Tensor, pair: ProjectorPair) -> float:
-    """Mean absolute misfit of some views, metal's rays left out."""
-    views = np.unique(np.linspace(0, len(beside) - 1, min(_JUDGES, len(beside))).astype(int))
-    wanted = beside[torch.from_numpy(views).to(beside.device)]
-    error = (pair.forward(volume.clamp(min=0), views) - wanted).abs()
+def _misfit(volume: torch.Tensor, views: np.ndarray, beside: torch.Tensor, pair: ProjectorPair) -> float:
+    """Mean absolute misfit of these views, metal's rays left out."""
+    error = (pair.forward(volume.clamp(min=0), views) - beside).abs()
     return float(error[torch.isfinite(error)].mean())

@@ -99,7 +99,8 @@ def fdk(
     if orbit is None or not fits:
         raise ValueError(f"filtered backprojection does not fit this scan: {reason}; use sirt instead")
     if device.startswith("cuda"):
-        from tomo_polysplat.start.astra_fdk import fdk_cuda, suits_fdk_cuda
+        from tomo_polysplat.start.astra_fdk import suits_fdk_cuda
+        from tomo_polysplat.start.slabs import fdk_cuda
 
         if suits_fdk_cuda(geometry)[0]:
             return fdk_cuda(projections, geometry, grid, orbit, filter_name=filter_name, device=device)

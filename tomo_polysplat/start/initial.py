@@ -32,6 +32,8 @@ _SOURCE_MARGIN = 2.0
 # Steps along rays in one pass of SIRT beyond which a coarser volume and detector do for a start: a few
 # seconds for all passes on two CPU cores.
 _MOST_STEPS = 4e7
+# Rays that are counted at once.
+_COUNTED = 1 << 26
 # Rows of the detector, and slices, that a coarse one keeps at least.
 _FEWEST_ROWS = 4
 
@@ -59,7 +61,8 @@ def initial_volume_on(
     if volume is None:
         found, done = initial_volume(projections.cpu().numpy(), geometry, grid, device=where)
         return torch.from_numpy(np.ascontiguousarray(found)).to(projections.device), done
-    invalid = int((~torch.isfinite(projections)).sum())
+    # In parts: to add up what is true takes 8 bytes a ray.
+    invalid = sum(int((~torch.isfinite(part)).sum()) for part in projections.reshape(-1).split(_COUNTED))
     _log.info("Start from FDK: %s; %d invalid pixels.", reason, invalid)
     beyond, near = _beyond_sources(geometry, grid)
     if beyond is not None:

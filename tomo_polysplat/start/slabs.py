@@ -16,7 +16,7 @@ from tomo_polysplat.start.shadow import corners_of, ellipse_of, margins
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["fdk_of_slabs", "fdk_on_device", "rows_of", "slab_of", "slabs"]
+__all__ = ["fdk_cuda", "fdk_of_slabs", "fdk_on_device", "rows_of", "slab_of", "slabs"]
 
 logger = logging.getLogger(__name__)
 
@@ -77,6 +77,22 @@ def fdk_of_slabs(
         slab = slab_of(grid, first, last)
         rows = rows_of(geometry, slab)
         whole[wanted] = make(rows, geometry.cropped(rows, (0, geometry.columns)), slab)
+
+
+def fdk_cuda(
+    projections: np.ndarray,
+    geometry: Geometry,
+    grid: VolumeGrid,
+    orbit: Orbit,
+    *,
+    filter_name: str = "ram-lak",
+    device: str = "cuda",
+) -> np.ndarray:
+    """`fdk` on a GPU for a scan that `suits_fdk_cuda`; parameters and result are the same."""
+    import torch
+
+    values = torch.from_numpy(np.ascontiguousarray(projections, dtype=np.float32))
+    return fdk_on_device(values, geometry, grid, orbit, filter_name, torch.device(device)).cpu().numpy()
 
 
 def fdk_on_device(

@@ -16,7 +16,7 @@ import triton.language as tl  # noqa: TID253
 from tomo_polysplat.kernels.step.triton_activate import material, mixture
 from tomo_polysplat.kernels.triton_maths import SIZES, dot, on_device
 
-__all__ = ["FIRST_DECAY", "SECOND_DECAY", "WHOLE", "WHOLE_OF_BLUR", "Bounds", "update"]
+__all__ = ["FIRST_DECAY", "SECOND_DECAY", "WHOLE", "WHOLE_OF_BLUR", "Bounds", "update", "update_shared"]
 
 FIRST_DECAY, SECOND_DECAY = 0.9, 0.999
 _KEEP_FIRST, _KEEP_SECOND = tl.constexpr(FIRST_DECAY), tl.constexpr(SECOND_DECAY)
@@ -164,9 +164,8 @@ def update(
     of_volume: tuple[torch.Tensor, ...],
     state: tuple[torch.Tensor, ...],
     bounds: Bounds,
-    blurring: bool,
 ) -> None:
-    """Change parameters and moments in place.
+    """Change parameters and moments of each Gaussian in place.
 
     Parameters
     ----------
@@ -180,16 +179,14 @@ def update(
         Gradients of position, deviation, rotation and weights, as the projection's and the voxeliser's
         adjoints give them.
     state : tuple of tensors
-        Gradients of the shared numbers (groups,) and of the blur (1,), int64 and left at zero; pull (n,), to
+        Gradients of the shared numbers (groups,), int64, to which those of these Gaussians are added; pull (n,), to
         which the lengths of the gradients by position are added; rates (7,) in the order of the parameters;
         control (4,) float64: the share of the rates over Adam's first bias correction, the root of its second
         one, whether the metals' shared numbers may move, and whether Gaussians may turn.
     bounds : Bounds
-    blurring : bool
-        Whether the blur is fitted.
     """
     names = ("position", "log_scale", "rotation", "attenuation", "own_material")
-    grad_shared, grad_blur, pull, rates, control = state
+    grad_shared, pull, rates, control = state
     (scale, curves), (low, high), (least, most) = drawn, bounds.log_scale, bounds.material
     count = len(group)
     with on_device(group):
@@ -201,11 +198,32 @@ def update(
             DIMS=parameters["log_scale"].shape[1], CHANNELS=1 if curves is None else 3, BLOCK=_BLOCK,
             num_warps=4,
         )  # fmt: skip
-        # The soft matter's number is held, and the metals' until the control lets them go.
-        common = [("shared_material", grad_shared, WHOLE, 5, 1, least, most)] if curves is not None else []
-        common += [("blur", grad_blur, WHOLE_OF_BLUR, 6, 0, 0.0, bounds.blur)] if blurring else []
-        for name, gradient, units, k, held, low, high in common:
-            parameter = parameters[name]
+
+
+def update_shared(
+    parameters: dict[str, torch.Tensor],
+    moments: dict[str, tuple[torch.Tensor, torch.Tensor]],
+    grad_shared: torch.Tensor | None,
+    grad_blur: torch.Tensor | None,
+    rates: torch.Tensor,
+    control: torch.Tensor,
+    bounds: Bounds,
+) -> None:
+    """Change what all Gaussians share, in place, by its gradients, which are left at zero.
+
+    Parameters
+    ----------
+    parameters, moments, rates, control, bounds
+        As for `update`.
+    grad_shared, grad_blur : (groups,) and (1,) int64 tensors, or None
+        None for what is not fitted.
+    """
+    # The soft matter's number is held, and the metals' until the control lets them go.
+    common = [] if grad_shared is None else [("shared_material", grad_shared, WHOLE, 5, 1, *bounds.material)]
+    common += [] if grad_blur is None else [("blur", grad_blur, WHOLE_OF_BLUR, 6, 0, 0.0, bounds.blur)]
+    for name, gradient, units, k, held, low, high in common:
+        parameter = parameters[name]
+        with on_device(parameter):
             _common_kernel[(triton.cdiv(len(parameter), _BLOCK),)](
                 parameter, *moments[name], gradient, rates[k:], control, len(parameter), held, low, high,
                 bounds.epsilon, UNITS=units.value, FREED=name == "shared_material", BLOCK=_BLOCK, num_warps=4,

@@ -25,6 +25,7 @@ from tomo_polysplat.plan.decision import Decision, Known, When
 from tomo_polysplat.plan.decisions.curves import Curves
 from tomo_polysplat.plan.decisions.passes import Passes
 from tomo_polysplat.plan.decisions.soft_reference import SoftReference
+from tomo_polysplat.plan.first_gaussians import why_one_run
 from tomo_polysplat.plan.lab import Lab, Untold
 
 __all__ = ["Light"]
@@ -75,7 +76,8 @@ class Light(Decision):
             return "fat is told from water only"
         if problem.planar or max(problem.grid.shape) < _FEWEST_VOXELS:
             return f"slices, and volumes of fewer than {_FEWEST_VOXELS} voxels along an edge, do not tell"
-        return why_no_fork(known[Passes], problem.geometry.views)
+        why = why_no_fork(known[Passes], problem.geometry.views)
+        return why or why_one_run(len(lab.gaussians), lab.plan, problem, lab.device)
 
     def ask(self, known: Known, lab: Lab) -> Answer:
         """The run is made both ways for some passes, and goes on as it explains the rays."""

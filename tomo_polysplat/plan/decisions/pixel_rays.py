@@ -21,7 +21,7 @@ from tomo_polysplat.nuisances.pixel_light import PixelLight
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.decision import Decision, Known, When
 from tomo_polysplat.plan.decisions.passes import Passes
-from tomo_polysplat.plan.first_gaussians import AVERAGED_RAYS
+from tomo_polysplat.plan.first_gaussians import AVERAGED_RAYS, why_one_run
 from tomo_polysplat.plan.lab import Lab, Untold
 from tomo_polysplat.render.renderer import project_gaussians
 
@@ -64,7 +64,8 @@ class PixelRays(Decision):
             return "one energy tells no metal from other matter"
         if not bool((lab.gaussians.group > 0).any()):
             return "without metal it matters little"
-        return why_no_fork(known[Passes], lab.problem.geometry.views)
+        why = why_no_fork(known[Passes], lab.problem.geometry.views)
+        return why or why_one_run(len(lab.gaussians), lab.plan, lab.problem, lab.device)
 
     def ask(self, known: Known, lab: Lab) -> Answer:
         """The run is made both ways for some passes, and goes on as it explains the rays at metal."""

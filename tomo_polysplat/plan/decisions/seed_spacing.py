@@ -7,11 +7,12 @@ import math
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.memory import most_gaussians
+from tomo_polysplat.kernels.portions import FEW_VIEWS
 from tomo_polysplat.model.seed_samples import box_mean, widened
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.decision import Decision, Known
 from tomo_polysplat.plan.decisions.support_level import SupportLevel
+from tomo_polysplat.plan.first_gaussians import room_for_seeds
 from tomo_polysplat.plan.lab import Lab
 from tomo_polysplat.plan.resolution import cells, finest_spacing, most_seeds
 
@@ -59,7 +60,8 @@ def _most_gaussians(lab: Lab) -> tuple[int, str]:
     problem, settings, start = lab.problem, lab.settings, lab.start
     if settings.max_gaussians or lab.device.type == "cpu":
         return settings.max_gaussians or _MOST_ON_CPU, ""
-    room = _SHARE_OF_SEEDS * most_gaussians(lab.device)
+    views = settings.views_per_step or FEW_VIEWS
+    room = _SHARE_OF_SEEDS * room_for_seeds(views, problem, lab.device)
     # Few voxels hold more seeds than one each: rays tell what is inside them.
     worth = min(max(math.prod(start.shape), _NOT_TOO_MANY), most_seeds(problem))
     most = max(round(min(room, worth)), 1)

@@ -218,7 +218,8 @@ class SoftReference(Decision):
         """From the start volume."""
         found = soft_reference(lab.start, lab.problem, lab.settings, lab.problem.solid)
         unit = "g/cm3" if lab.problem.polychromatic else "per unit of length"
-        doubt = lengths_in_doubt(found.level, lab.problem) if lab.problem.polychromatic else None
+        level = found.level or found.value / found.first
+        doubt = lengths_in_doubt(level, lab.problem) if lab.problem.polychromatic else None
         if doubt is not None and doubt.impossible and lab.settings.density_check == "refuse":
             raise refuse_lengths(doubt)
         if doubt is not None:

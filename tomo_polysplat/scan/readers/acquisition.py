@@ -36,6 +36,8 @@ class Setup:
     axis : float
         How far to the right of the line from the source to the foot the axis stands, source and detector facing each
         other. A turntable that was moved aside is that; a detector that was, `offset`.
+    tilt : float
+        Degrees by which the axis leans from the source towards the detector, as its upper end goes.
     """
 
     degrees: np.ndarray
@@ -45,6 +47,7 @@ class Setup:
     offset: tuple[float, float] = (0.0, 0.0)
     roll: float = 0.0
     axis: float = 0.0
+    tilt: float = 0.0
 
     def geometry(self, rows: int, columns: int) -> Geometry:
         """Of a detector whose rows ascend with z."""
@@ -55,7 +58,29 @@ class Setup:
         else:
             known |= {"source_object": self.source_object, "source_detector": self.source_detector}
             proj_geom, _ = cone_geometry(**known)
-        return _rolled(_moved(geometry_from_astra(proj_geom), -self.axis), self.roll)
+        upright = _tilted(geometry_from_astra(proj_geom), -self.tilt)
+        return _rolled(_moved(upright, -self.axis), self.roll)
+
+
+def _tilted(geometry: Geometry, degrees: float) -> Geometry:
+    """Source and detector turned together about the line through the middle along the columns.
+
+    Positive where what is above leans from the source to the detector.
+    """
+    if not degrees:
+        return geometry
+    right = geometry.u / np.linalg.norm(geometry.u, axis=1, keepdims=True)
+    sine, cosine = np.sin(np.deg2rad(degrees)), np.cos(np.deg2rad(degrees))
+
+    def turned(vectors: np.ndarray) -> np.ndarray:
+        # Rodrigues' formula; what leans from z towards the detector turns about minus `right`.
+        along = (vectors * right).sum(axis=1, keepdims=True) * right
+        return along + cosine * (vectors - along) - sine * np.cross(right, vectors)
+
+    u, v, corner, origin = (
+        turned(part) for part in (geometry.u, geometry.v, geometry.corner, geometry.origin)
+    )
+    return replace(geometry, origin=origin, corner=corner, u=u, v=v)
 
 
 def _moved(geometry: Geometry, right: float) -> Geometry:

@@ -98,7 +98,8 @@ def _told(path: Path, entry: h5py.Group) -> Acquisition:
     data = find_array(entry, "data/data")
     if data is None:
         raise fail("path", f"pictures in {_ENTRY}/data/data", f"none in {path}")
-    labels = tuple(text_attribute(data, f"dim{k}") or "?" for k in range(data.ndim))
+    # Where labels are members of an enumeration, some Pythons write its name before theirs.
+    labels = tuple(_label(text_attribute(data, f"dim{k}") or "?") for k in range(data.ndim))
     if set(labels) not in ({"angle", "horizontal"}, set(_AXES)) or len(set(labels)) != len(labels):
         raise fail("dim0, dim1, ...", f"the axes {', '.join(_AXES)}", ", ".join(labels), "select one channel")
     scale, offset = number_attribute(data, "scale"), number_attribute(data, "offset")
@@ -135,13 +136,17 @@ def _geometry(entry: h5py.Group, shape: tuple[int, int, int], pixel: tuple[float
     return Geometry("cone" if cone else "parallel", origins, corners, us, vs, rows, columns)
 
 
+def _label(text: str) -> str:
+    return text.rpartition(".")[2].lower()
+
+
 def _turns(entry: h5py.Group, views: int) -> np.ndarray:
     """Of source and detector about z, (views, 3, 3)."""
     angles = read_numbers(entry, "config/angles", (views,)).astype(np.float64)
     dataset = find_array(entry, "config/angles")
     assert dataset is not None  # it was just read
     angles = -(angles + (number_attribute(dataset, "initial_angle") or 0.0))
-    if not (text_attribute(dataset, "angle_unit") or "degree").lower().startswith("rad"):
+    if not _label(text_attribute(dataset, "angle_unit") or "degree").startswith("rad"):
         angles = np.deg2rad(angles)
     turns = np.zeros((views, 3, 3))
     turns[:, 0, 0] = turns[:, 1, 1] = np.cos(angles)

@@ -60,7 +60,14 @@ class CompoundFile:
             file.close()
 
     def __contains__(self, name: str) -> bool:
-        return self.size(name) is not None
+        """Whether there is a stream of that name, or a folder of streams."""
+        return self.size(name) is not None or self._is_folder(name)
+
+    def _is_folder(self, name: str) -> bool:
+        try:
+            return bool(self._file.get_type(name) == 1)
+        except Exception:  # its parser raises whatever it meets
+            return False
 
     def size(self, name: str) -> int | None:
         """Bytes of a stream, or None where there is none."""
@@ -92,7 +99,7 @@ class CompoundFile:
 
     def numbers(self, name: str, dtype: str = "<f4") -> np.ndarray:
         """All numbers of a stream, none where there is no such stream."""
-        if name not in self:
+        if self.size(name) is None:
             return np.zeros(0, dtype)
         content, size = self.stream(name), np.dtype(dtype).itemsize
         return np.frombuffer(content[: len(content) - len(content) % size], dtype)
@@ -104,9 +111,15 @@ class CompoundFile:
 
     def text(self, name: str) -> str:
         """The text of a stream up to its first zero; nothing where there is none."""
-        if name not in self:
+        if self.size(name) is None:
             return ""
         return self.stream(name).split(b"\0")[0].decode("latin-1").strip()
+
+    def texts(self, name: str) -> list[str]:
+        """The texts of a stream, a zero after each; none where there is no such stream."""
+        if self.size(name) is None:
+            return []
+        return [text.decode("latin-1").strip() for text in self.stream(name).split(b"\0") if text.strip()]
 
     def _unreadable(self, error: Any) -> Exception:
         got = f"{self.path} ({str(error)[:120]})"

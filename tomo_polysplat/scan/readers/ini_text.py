@@ -7,12 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from tomo_polysplat.checks import fail, require_number, visible
-from tomo_polysplat.files import file_content
+from tomo_polysplat.scan.readers.text import number_of, text_of
 
 __all__ = ["IniText"]
 
 _MOST_BYTES = 1 << 22
-_NUMBER = re.compile(r"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
 
 
 class IniText:
@@ -28,7 +27,7 @@ class IniText:
         self._values: dict[str, tuple[str, str]] = {}
         self._asked: set[str] = set()
         section = ""
-        for line in file_content(path, _MOST_BYTES).decode("utf-8", "replace").splitlines():
+        for line in text_of(path, _MOST_BYTES).splitlines():
             text = line.strip()
             if text.startswith("[") and text.endswith("]"):
                 section = text[1:-1].strip()
@@ -57,9 +56,9 @@ class IniText:
             If there is none, unless `otherwise` is given.
         """
         text = self.text(*keys)
-        match = _NUMBER.match(text.strip())
-        if match is not None:
-            return require_number(keys[0], match[0])
+        number = number_of(text)
+        if number is not None:
+            return require_number(keys[0], number)
         if otherwise is not None:
             return otherwise
         got = f"{text!r}" if text else "none"

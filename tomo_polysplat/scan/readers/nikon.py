@@ -1,7 +1,7 @@
 """Nikon (X-Tek): an .xtekct file, TIFFs with one white level, and the measured angles.
 
-The sense of rotation, the side from which the pictures are seen and the signs of ``ObjectOffsetX`` and ``ObjectRoll``
-are those that the reader of the Core Imaging Library has found.
+The sense of rotation, the side from which the pictures are seen and the signs of ``ObjectOffsetX``, ``ObjectRoll``,
+``ObjectTilt`` and ``DetectorOffsetX`` are those that the reader of the Core Imaging Library has found.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 
 from tomo_polysplat.checks import fail, require_number
-from tomo_polysplat.files import file_content
 from tomo_polysplat.physics.filter_text import filters_of
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
 from tomo_polysplat.scan.readers.files_of_scans import the_one
 from tomo_polysplat.scan.readers.frames import TiffFrames
 from tomo_polysplat.scan.readers.ini_text import IniText
-from tomo_polysplat.scan.readers.picture_names import has_word, in_order, tiffs_in
+from tomo_polysplat.scan.readers.picture_names import gaps_in, has_word, in_order, numbers_of, tiffs_in
 from tomo_polysplat.scan.readers.stated import require_known, stated_over
+from tomo_polysplat.scan.readers.text import NUMBER, text_of
 
 __all__ = ["KIND", "read", "recognises"]
 
@@ -42,12 +42,15 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     file = the_one(_texts(path), remedy="name its .xtekct file")
     folder, text = file.parent, IniText(file)
     name = text.text("Name", otherwise=file.stem)
-    frames = TiffFrames(_pictures(folder, text, name))
+    files = _pictures(folder, text, name)
+    frames, numbers = TiffFrames(files), numbers_of(files)
     expected = int(text.number("Projections", otherwise=frames.shape[0]))
     said = []
     if frames.shape[0] != expected:
         said.append(f"{frames.shape[0]} pictures are there, the .xtekct tells of {expected}")
-    setup, more = _setup(text, folder, frames.shape[0])
+    if gaps := gaps_in(files):
+        said.append(f"the numbers of the pictures jump ({gaps}): each keeps the angle of its number")
+    setup, more = _setup(text, folder, np.arange(len(files)) if numbers is None else numbers)
     told = Acquisition(
         KIND,
         frames,
@@ -81,7 +84,8 @@ def _pictures(folder: Path, text: IniText, name: str) -> list[Path]:
     raise fail("path", f"TIFFs named {name}_0001.tif and so on", f"none in {folder}")
 
 
-def _setup(text: IniText, folder: Path, views: int) -> tuple[Setup, list[str]]:
+def _setup(text: IniText, folder: Path, numbers: np.ndarray) -> tuple[Setup, list[str]]:
+    """Of pictures of these numbers, from 0 on."""
     near, far = text.number("SrcToObject"), text.number("SrcToDetector")
     require_number("SrcToDetector", far, above=0.0)
     pixel = (text.number("DetectorPixelSizeX"), text.number("DetectorPixelSizeY"))
@@ -95,41 +99,54 @@ def _setup(text: IniText, folder: Path, views: int) -> tuple[Setup, list[str]]:
         said.append(
             "no centre of rotation: the axis is taken to fall on the detector's middle; give offset= otherwise"
         )
-    for key in ("ObjectTilt", "DetectorOffsetX", "DetectorOffsetY"):
-        if text.number(key, otherwise=0.0):
-            said.append(f"{key} = {text.text(key)} is not used")
-    degrees, more = _degrees(text, folder, views)
-    return Setup(degrees, pixel, near, far, roll=roll, axis=-aside), said + more
+    right, up = (text.number(f"DetectorOffset{axis}", otherwise=0.0) for axis in "XY")
+    tilt = text.number("ObjectTilt", otherwise=0.0)
+    degrees, more = _degrees(text, folder, numbers)
+    setup = Setup(degrees, pixel, near, far, (-right, up), roll=roll, axis=-aside, tilt=tilt)
+    return setup, said + more
 
 
-def _degrees(text: IniText, folder: Path, views: int) -> tuple[np.ndarray, list[str]]:
+def _degrees(text: IniText, folder: Path, numbers: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """Even steps, unless angles were measured that differ from them; the steps tell the sense."""
-    step = text.number("AngularStep", otherwise=360.0 / views)
+    said = []
+    if "AngularStep" not in text:
+        said.append(f"no AngularStep: {numbers[-1] + 1} views are taken to make one full turn")
+    step = text.number("AngularStep", otherwise=360.0 / (numbers[-1] + 1))
     start = text.number("InitialAngle", otherwise=0.0)
-    even = step * np.arange(views)
-    for file in [*sorted(folder.glob("*_ctdata.txt")), *sorted(folder.glob("*.ang"))]:
+    even = step * numbers
+    for file in _angle_files(folder):
         measured = _measured(file)
-        if len(measured) != views:
-            return start + even, [
-                f"{file.name} has {len(measured)} angles for {views} pictures: even steps are taken"
-            ]
-        from_first = measured - measured[0]
+        if len(measured) <= numbers[-1]:
+            said.append(
+                f"{file.name} has {len(measured)} angles for {len(numbers)} pictures: even steps are taken"
+            )
+            break
+        from_first = np.rad2deg(np.unwrap(np.deg2rad(measured[numbers])))
+        from_first -= from_first[0]
         if from_first[-1] * even[-1] < 0:
             from_first = -from_first
         if np.abs(from_first - even).max() > _EVEN:
-            return start + from_first, []
+            return start + from_first, said
         break
-    said = [] if "AngularStep" in text else [f"no AngularStep: {views} views are taken to make one full turn"]
     return start + even, said
 
 
+def _angle_files(folder: Path) -> list[Path]:
+    files = sorted(file for file in folder.iterdir() if file.is_file())
+    tables = [file for file in files if file.name.lower().endswith("_ctdata.txt")]
+    return tables + [file for file in files if file.suffix.lower() == ".ang"]
+
+
 def _measured(file: Path) -> np.ndarray:
-    """The second number of each line that begins with the number of a picture."""
-    found = []
-    for line in file_content(file, _MOST_BYTES).decode("utf-8", "replace").splitlines():
-        match = re.match(r"\s*(\d{1,9})\s*[:,;\s]\s*([-+]?\d{1,9}(?:\.\d*)?)", line)
+    """The second number of each line that begins with the number of a picture, after the last line of words."""
+    found: list[tuple[int, float]] = []
+    for line in text_of(file, _MOST_BYTES).splitlines():
+        match = re.match(rf"\s*(\d{{1,9}})\s*[:;\s,]\s*({NUMBER})(?![.,\d])", line)
         if match is not None:
-            found.append((int(match[1]), float(match[2])))
+            found.append((int(match[1]), float(match[2].replace(",", "."))))
+        elif line.strip():
+            # A head of words and numbers stands before the words above the columns.
+            found = []
     return np.array([angle for _, angle in sorted(found)])
 
 

@@ -18,8 +18,8 @@ from tomo_polysplat.scan.readers.acquisition import Acquisition
 from tomo_polysplat.scan.readers.files_of_scans import the_one
 from tomo_polysplat.scan.readers.frames import ArrayFrames
 from tomo_polysplat.scan.readers.picture_names import pictures_in
-from tomo_polysplat.scan.readers.picture_stack import full_turn, guessed, written_beside
-from tomo_polysplat.scan.readers.stated import require_known, stated_over
+from tomo_polysplat.scan.readers.picture_stack import full_turn, guessed, stated_beside, written_beside
+from tomo_polysplat.scan.readers.stated import stated_over
 
 __all__ = ["KIND", "read", "recognises"]
 
@@ -44,7 +44,7 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     file = the_one(_files(path))
     beside = file.with_suffix(".toml")
     written, other = written_beside(beside if beside.is_file() else file.parent)
-    known = written | require_known(stated, "scanner")
+    known = stated_beside(written, stated)
     arrays = _arrays(file)
     if "degrees" in arrays and not {"degrees", "arc"} & known.keys():
         known["degrees"] = _degrees(arrays["degrees"])

@@ -7,6 +7,7 @@ angles do.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,17 +57,32 @@ def _files(path: Path) -> list[Path]:
 
 
 def _entry(file: h5py.File) -> h5py.Group | None:
-    """The first group with pictures and their keys."""
+    """The first group with pictures and their keys, which may be one of an entry's."""
     for name in list(file)[:_MOST_ENTRIES]:
-        try:
-            entry = find_group(file, name)
-        except ValueError:
+        entry = _group(file, name)
+        if entry is None:
             continue
-        if entry is None or find_group(entry, _DETECTOR) is None:
-            continue
-        if any(find_array(entry, f"{_DETECTOR}/{key}") is not None for key in _KEYS):
+        if _is_entry(entry):
             return entry
+        for inner in list(entry)[:_MOST_ENTRIES]:
+            group = _group(entry, inner)
+            with suppress(ValueError):  # what is no entry may hold anything
+                if group is not None and _is_entry(group):
+                    return group
     return None
+
+
+def _group(parent: h5py.Group, name: str) -> h5py.Group | None:
+    try:
+        return find_group(parent, name)
+    except ValueError:
+        return None
+
+
+def _is_entry(group: h5py.Group) -> bool:
+    if find_group(group, _DETECTOR) is None:
+        return False
+    return any(find_array(group, f"{_DETECTOR}/{key}") is not None for key in _KEYS)
 
 
 def _told(path: Path, entry: h5py.Group) -> Acquisition:

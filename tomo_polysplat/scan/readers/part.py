@@ -54,6 +54,10 @@ class Part:
         given = (None, None, self.views) if np.ndim(self.views) == 0 else tuple(self.views)
         first, end, step = (*given, None)[:3]
         step = 1 if step is None else require_count("views", step)
+        if np.ndim(self.views) == 0 and 1 < views <= step:
+            raise fail(
+                "views", f"a step that leaves some of {views} views", f"{step}", "2 takes every other view"
+            )
         first, end = _ends("views", (0 if first is None else first, views if end is None else end), views)
         return np.arange(first, end, step)
 

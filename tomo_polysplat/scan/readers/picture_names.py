@@ -3,21 +3,47 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from tomo_polysplat.checks import fail
 
-__all__ = ["PICTURE_SUFFIXES", "has_word", "in_order", "named_files", "pictures_in", "tiffs_in"]
+__all__ = [
+    "PICTURE_SUFFIXES",
+    "gaps_in",
+    "has_word",
+    "in_order",
+    "named_files",
+    "numbers_of",
+    "pictures_in",
+    "tiffs_in",
+]
 
 TIFF_SUFFIXES = (".tif", ".tiff")
 # What a plain stack may be of.
 PICTURE_SUFFIXES = (*TIFF_SUFFIXES, ".npy", ".edf")
+_MOST_GAPS = 3
 # Words in a name that make a picture, or a folder of them, a flat or a dark one, or one with the object.
 _WORDS = {
-    "flats": ("flat", "flats", "white", "whites", "open", "bright", "ref", "gain", "ff", "i0"),
-    "darks": ("dark", "darks", "dk", "df", "background"),
+    "flats": (
+        *(
+            "flat",
+            "flats",
+            "flatfield",
+            "white",
+            "whites",
+            "whitefield",
+            "open",
+            "openbeam",
+            "bright",
+            "brightfield",
+        ),
+        *("ref", "refs", "reference", "gain", "ff", "i0", "io", "blank", "blanks"),
+    ),
+    "darks": ("dark", "darks", "darkfield", "darkcurrent", "dk", "df", "di", "background"),
     "projections": ("projections", "projection", "proj", "projs", "data", "tomo", "images", "raw"),
 }
 
@@ -29,6 +55,29 @@ def in_order(files: Iterable[Path]) -> list[Path]:
 
 def _part(text: str) -> tuple[int, str]:
     return (int(text), "") if text.isdecimal() else (-1, text)
+
+
+def numbers_of(files: Sequence[Path]) -> np.ndarray | None:
+    """Numbers at the end of names that differ in nothing else, from 0 on; None where they do not ascend."""
+    ends = [re.fullmatch(r"(.*?)(\d{1,15})", file.stem, re.S) for file in files]
+    if not files or None in ends or len({end[1].lower() for end in ends if end}) > 1:
+        return None
+    numbers = np.array([int(end[2]) for end in ends if end])
+    return numbers - numbers[0] if (np.diff(numbers) > 0).all() else None
+
+
+def gaps_in(files: Sequence[Path]) -> str:
+    """Where the numbers of pictures jump, such as ``7 to 9``; nothing where they do not."""
+    numbers = numbers_of(files)
+    if numbers is None or len(numbers) < 2:
+        return ""
+    steps = np.diff(numbers)
+    jumps = np.flatnonzero(steps != np.median(steps))[:_MOST_GAPS]
+    return ", ".join(f"{_end(files[k])} to {_end(files[k + 1])}" for k in jumps)
+
+
+def _end(file: Path) -> str:
+    return re.split(r"\D", file.stem)[-1].lstrip("0") or "0"
 
 
 def tiffs_in(folder: Path) -> list[Path]:

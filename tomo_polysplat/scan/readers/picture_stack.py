@@ -12,10 +12,16 @@ import numpy as np
 from tomo_polysplat.checks import fail
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup
 from tomo_polysplat.scan.readers.picture_files import frames_of
-from tomo_polysplat.scan.readers.picture_names import PICTURE_SUFFIXES, has_word, named_files, pictures_in
+from tomo_polysplat.scan.readers.picture_names import (
+    PICTURE_SUFFIXES,
+    gaps_in,
+    has_word,
+    named_files,
+    pictures_in,
+)
 from tomo_polysplat.scan.readers.stated import read_toml, require_known, stated_over
 
-__all__ = ["full_turn", "guessed", "read", "recognises", "written_beside"]
+__all__ = ["full_turn", "guessed", "read", "recognises", "stated_beside", "written_beside"]
 
 KIND = "stack of TIFFs, EDF or .npy files"
 _REMEDY = (
@@ -35,13 +41,18 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     """See `tomo_polysplat.load_scan`; `stated` has its ``scanner``."""
     folder = path if path.is_dir() else path.parent
     written, other = written_beside(path)
-    known = written | require_known(stated, "scanner")
+    known = stated_beside(written, stated)
     if path.suffix.lower() in PICTURE_SUFFIXES and path.is_file():
         known.setdefault("projections", path)
     files = _sorted_out(folder, known)
     frames = frames_of(files["projections"])
     known |= {name: files[name] for name in ("flats", "darks") if files[name]}
     told = Acquisition(KIND, frames, full_turn(frames.shape[0]), folder.name, other=other)
+    if "degrees" not in known and (gaps := gaps_in(files["projections"])):
+        told = told.saying(
+            f"the numbers of the pictures jump ({gaps}): steps are taken to be even over those that are there; give "
+            "degrees="
+        )
     return guessed(stated_over(told, known, folder), known)
 
 
@@ -62,6 +73,14 @@ def written_beside(path: Path) -> tuple[dict[str, Any], dict[str, str]]:
     aliased = {key: value for key, value in table.items() if _is_known(key)}
     other = {key: str(value) for key, value in table.items() if not _is_known(key)}
     return require_known(aliased, file.name), other
+
+
+def stated_beside(written: Mapping[str, Any], stated: Mapping[str, Any]) -> dict[str, Any]:
+    """What is written in a file, with what the user states in its place: angles as a list, or as an arc."""
+    said = require_known(stated, "scanner")
+    angles = {"degrees", "arc"}
+    kept = {key: value for key, value in written.items() if not (key in angles and said.keys() & angles)}
+    return kept | said
 
 
 def _is_known(key: str) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,9 +20,14 @@ from tomo_polysplat.scan.readers import (
     xradia,
 )
 from tomo_polysplat.scan.readers.acquisition import Acquisition
+from tomo_polysplat.scan.readers.files_of_scans import the_one
+from tomo_polysplat.scan.readers.picture_names import pictures_in
 
 __all__ = ["acquisition_of"]
 
+# Folders that hold reconstructions.
+_RECONSTRUCTED = re.compile(r"rec\w*|slices|volume", re.I)
+_MOST_FOLDERS = 100
 # The first one that recognises what it is shown reads it: what any folder of pictures is comes last.
 READERS = (skyscan, nikon, xradia, nxtomo, cil_nexus, rtk, npz_stack, picture_stack)
 _REMEDY = (
@@ -42,13 +49,28 @@ def acquisition_of(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     ValueError
         If no reader recognises it.
     """
-    for reader in READERS:
+    for reader in READERS[:-1]:
         if reader.recognises(path):
             return reader.read(path, stated)
-    kinds = ", ".join(reader.KIND for reader in READERS)
+    if path.is_dir() and not (pictures_in(path) or list(path.glob("*.toml"))):
+        inside = [(folder, reader) for folder in _folders_of_scans(path) for reader in READERS[:-1]]
+        scans = [(folder, reader) for folder, reader in inside if reader.recognises(folder)]
+        if scans:
+            folder = the_one([folder for folder, _ in scans], "one scan in the folder", "name one")
+            return scans[0][1].read(folder, stated).saying(f"what is read is {folder.name} in {path.name}")
+    if picture_stack.recognises(path):
+        return picture_stack.read(path, stated)
+    kinds = ", ".join(reader.KIND.split(" (")[0] for reader in READERS)
     raise fail(
         "path",
         f"a Data Exchange HDF5 file, an .npz scan, or one of: {kinds}",
         f"{path}, which is none of these",
         _REMEDY,
     )
+
+
+def _folders_of_scans(path: Path) -> list[Path]:
+    inside = sorted(
+        folder for folder in path.iterdir() if folder.is_dir() and os.access(folder, os.R_OK | os.X_OK)
+    )
+    return [folder for folder in inside if not _RECONSTRUCTED.fullmatch(folder.name)][:_MOST_FOLDERS]

@@ -131,9 +131,13 @@ def _table(path: Path) -> dict[str, np.ndarray]:
         raise fail(
             "RadiusCylindricalDetector", "0, a flat detector", f"{usual['RadiusCylindricalDetector']:g}"
         )
-    views = [usual | _numbers(view, usual) for view in root.iter("Projection")]
+    own = [_numbers(view, usual) for view in root.iter("Projection")]
+    views = [usual | view for view in own]
     if not views:
         raise fail("path", "views (Projection) in the geometry", f"none in {path}")
+    if len(views) > 1 and not any("GantryAngle" in view for view in own):
+        got = f"none in {path}, matrices perhaps"
+        raise fail("path", "the GantryAngle of each view", got, "write the file with RTK's own writer")
     table = {name: np.array([view[name] for view in views]) for name in (*_ANGLES, *_LENGTHS)}
     if not (table["SourceToDetectorDistance"] > 0).all():
         raise fail(

@@ -3,7 +3,8 @@
 What the keys mean is as NRecon, the maker's program, uses them: lengths in the object are those of ``Image Pixel
 Size`` at ``Object to Source``, binning included; lines are counted from the lowest; ``Postalignment`` is the axis'
 shift in columns. Its sign and the sense of rotation are those of the SkyScan parser of the ASTRA Toolbox's tools:
-pictures are as seen from the detector, and the object turns counterclockwise seen from above for ``CC``.
+pictures are as seen from the detector, and the object turns counterclockwise seen from above for ``CC``. TIGRE's
+reader has the same sense, and counts the lines as here.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +24,9 @@ from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
 from tomo_polysplat.scan.readers.files_of_scans import the_one
 from tomo_polysplat.scan.readers.frames import TiffFrames
 from tomo_polysplat.scan.readers.ini_text import IniText
-from tomo_polysplat.scan.readers.picture_names import has_word, in_order, tiffs_in
+from tomo_polysplat.scan.readers.picture_names import gaps_in, has_word, in_order, numbers_of, tiffs_in
 from tomo_polysplat.scan.readers.stated import require_known, stated_over
+from tomo_polysplat.scan.readers.text import text_of
 
 __all__ = ["KIND", "read", "recognises"]
 
@@ -31,6 +34,10 @@ KIND = "Bruker SkyScan (.log)"
 _START_BYTES = 4096
 _ROUND = 0.005
 _MOST_DIGITS = 20
+# Logs of a reconstruction, which NRecon may write beside the pictures.
+_RECONSTRUCTION = re.compile(r".*_rec", re.I)
+# By which the pixel of the log may be off that of the camera, rounded to 0.01 um.
+_PIXEL = 0.01
 
 
 def recognises(path: Path) -> bool:
@@ -42,40 +49,62 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     """See `tomo_polysplat.load_scan`; `stated` has its ``scanner``."""
     file = the_one(_logs(path), remedy="name its .log file")
     folder, log = file.parent, IniText(file)
-    files = _pictures(folder, log, file.stem)
-    expected = int(log.number("Number of Files", otherwise=len(files)))
-    said = []
-    if len(files) != expected:
-        said.append(
-            f"{len(files)} pictures are there, the log tells of {expected}: they are taken from the first on"
-        )
-    frames = TiffFrames(files[:expected])
+    prefix = log.text("Filename Prefix")
+    if _RECONSTRUCTION.fullmatch(file.stem) and not _RECONSTRUCTION.fullmatch(prefix):
+        remedy = f"name the folder of the projections, {prefix}0000.tif and so on"
+        raise fail("path", "a scan", f"{file}, the log of a reconstruction", remedy)
+    files, said = _counted(_pictures(folder, log, file.stem), log)
+    frames = TiffFrames(files)
     _require_size(log, frames)
-    setup, more = _setup(log, frames.shape)
+    numbers = numbers_of(files)
+    setup, more = _setup(log, np.arange(len(files)) if numbers is None else numbers, frames.shape[1])
+    shift, parts = _postalignment(log, folder)
+    width = setup.pixel[0]  # type: ignore[index]
+    # Counted from the other side, as the pictures are.
+    setup = replace(setup, offset=(-shift * width, setup.offset[1]))
     told = Acquisition(
         KIND,
         frames,
         setup,
-        name=log.text("Filename Prefix", otherwise=file.stem).rstrip("_~ "),
+        name=(prefix or file.stem).rstrip("_~ "),
         from_detector=True,
-        tube=Tube(log.number("Source Voltage (kV)"), _filters(log)),
+        tube=Tube(log.number("Source Voltage (kV)", otherwise=0.0) or None, _filters(log)),
         exposure=log.number("Exposure (ms)", otherwise=0.0) / 1000 or None,
     )
-    told = _with_open_beam(told, folder, log, set(files)).saying(*said, *more)
+    told = _with_open_beam(told, folder, log, set(files)).saying(*said, *more, *parts, *_drift(log))
     told = stated_over(told, require_known(stated, "scanner"), folder)
     return replace(told, other=log.others())
 
 
 def _logs(path: Path) -> list[Path]:
-    files = [path] if path.is_file() else [file for file in path.iterdir() if file.is_file()]
+    """Logs of scans; of a folder that has none, those of reconstructions, whose pictures will be refused."""
+    if path.is_file():
+        return [path] if path.suffix.lower() == ".log" and _is_skyscan(path) else []
+    every = _all_logs(path)
+    return [file for file in every if not _RECONSTRUCTION.fullmatch(file.stem)] or every
+
+
+def _all_logs(folder: Path) -> list[Path]:
+    files = [file for file in folder.iterdir() if file.is_file()]
     return sorted(file for file in files if file.suffix.lower() == ".log" and _is_skyscan(file))
 
 
 def _is_skyscan(file: Path) -> bool:
     with open(file, "rb") as stream:
-        start = stream.read(_START_BYTES).lower()
-    # Logs of a reconstruction, which lie beside its slices, go on with that section and have the same keys.
-    return b"[acquisition]" in start and b"object to source" in start
+        start = text_of(stream.read(_START_BYTES), _START_BYTES).lower()
+    return "[acquisition]" in start and "object to source" in start
+
+
+def _counted(files: list[Path], log: IniText) -> tuple[list[Path], list[str]]:
+    """As many of the pictures as the log tells of; what there is to say if they are not so many."""
+    expected = int(log.number("Number of Files", otherwise=len(files)))
+    said = []
+    if len(files) != expected:
+        said.append(f"{len(files)} pictures are there, the log tells of {expected}")
+    kept = files[:expected] if expected > 0 else files
+    if gaps := gaps_in(kept):
+        said.append(f"the numbers of the pictures jump ({gaps}): each keeps the angle of its number")
+    return kept, said
 
 
 def _pictures(folder: Path, log: IniText, stem: str) -> list[Path]:
@@ -83,8 +112,10 @@ def _pictures(folder: Path, log: IniText, stem: str) -> list[Path]:
     tiffs = tiffs_in(folder)
     length = log.number("Filename Index Length", otherwise=4)
     digits = int(require_number("Filename Index Length", length, at_least=0, at_most=_MOST_DIGITS))
-    for prefix in (log.text("Filename Prefix"), stem, ""):
-        name = re.compile(rf"{re.escape(prefix)}_*\d{{{digits}}}" if prefix else rf".*\d{{{digits}}}", re.I)
+    # Another number of digits than the log tells of is what a program that renamed them has left.
+    names = [name for name in (log.text("Filename Prefix"), stem) if name]
+    for prefix, end in (*product(names, (f"{{{digits}}}", "{3,}")), ("", "{3,}")):
+        name = re.compile(rf"{re.escape(prefix)}_*\d{end}" if prefix else rf".*\d{end}", re.I)
         chosen = [file for file in tiffs if name.fullmatch(file.stem)]
         if not prefix:
             chosen = [f for f in chosen if not (has_word(f.stem, "flats") or has_word(f.stem, "darks"))]
@@ -104,36 +135,91 @@ def _require_size(log: IniText, frames: TiffFrames) -> None:
         )
 
 
-def _setup(log: IniText, shape: tuple[int, int, int]) -> tuple[Setup, list[str]]:
-    views, rows, _ = shape
-    said = []
-    near, far = log.number("Object to Source (mm)"), log.number("Camera to Source (mm)")
+def _setup(log: IniText, numbers: np.ndarray, rows: int) -> tuple[Setup, list[str]]:
+    """Of pictures of these numbers, but for the axis' shift."""
+    near = require_number("Object to Source (mm)", log.number("Object to Source (mm)"), above=0.0)
+    far = log.number("Camera to Source (mm)")
+    object_pixel, said = _pixel(log, far / near)
     # Brought to the detector, where it is the camera's as far as the distances are exact.
-    width = 1e-3 * log.number("Image Pixel Size (um)") * far / near
+    width = object_pixel * far / near
     ratio = log.number("CameraXYRatio", "Camera X/Y Ratio", otherwise=1.0)
     if abs(ratio - 1) > _ROUND:
         said.append(
             f"pixels are taken to be {ratio:g} times as wide as high (CameraXYRatio); give pixel= otherwise"
         )
     height = width / (ratio if ratio > 0 else 1.0)
-    shift = log.number("Postalignment", "Post alignment", otherwise=0.0)
-    if shift == 0:
-        said.append(
-            "no Postalignment in the log: the axis is taken to fall on the detector's middle; give offset= else"
-        )
     line = log.number("Optical Axis (line)", otherwise=(rows - 1) / 2)
     tilt = log.number("Image Rotation", otherwise=0.0)
     if tilt:
         said.append(
-            f"the camera's rotation of {tilt:g} degrees is not undone; give roll={tilt:g} or roll={-tilt:g}"
+            f"the camera's rotation of {tilt:g} degrees is not undone; give roll={tilt:g} or roll={-tilt:g}, or "
+            "reconstruct with align=True (--align), which finds it"
         )
     if "ON" in log.text("Camera Offset").upper():
         said.append("the camera was offset: is that in the pictures? give offset= if it is not")
     sense, guess = _sense(log)
-    # Counted from the other side, as the pictures are.
-    offset = (-shift * width, ((rows - 1) / 2 - line) * height)
-    degrees = sense * log.number("Rotation Step (deg)") * np.arange(views)
-    return Setup(degrees, (width, height), near, far, offset), said + guess
+    degrees = sense * _step(log, numbers) * numbers
+    return Setup(degrees, (width, height), near, far, (0.0, ((rows - 1) / 2 - line) * height)), said + guess
+
+
+def _step(log: IniText, numbers: np.ndarray) -> float:
+    """Degrees from one picture to the next."""
+    step = log.number("Rotation Step (deg)", otherwise=0.0)
+    if step == 0 and log.text("Use 360 Rotation").upper() == "YES":
+        return 360.0 / (int(numbers[-1]) + 1)
+    return step or require_number("Rotation Step (deg)", step, above=0.0)
+
+
+def _pixel(log: IniText, magnification: float) -> tuple[float, list[str]]:
+    """The side of a pixel in the object, in mm, beside that of the camera."""
+    told = log.number("Image Pixel Size (um)", "Scaled Image Pixel Size (um)", otherwise=0.0)
+    binning = re.match(r"\d+", log.text("Camera binning"))
+    camera = log.number("Camera Pixel Size (um)", otherwise=0.0) * (int(binning[0]) if binning else 1)
+    said = []
+    scaled = log.number("Scaled Image Pixel Size (um)", otherwise=told)
+    if told and abs(scaled - told) > _ROUND * told:
+        said.append(f"the pictures were scaled: their pixel is taken to be {scaled:g} um, not {told:g}")
+        told = scaled
+    if not told > 0:
+        if not camera > 0:
+            raise fail("path", "a number as 'Image Pixel Size (um)' in the log", "none", "give pixel=")
+        said.append("no Image Pixel Size: it is taken to be the camera's, brought down to the axis")
+        return 1e-3 * camera / magnification, said
+    return 1e-3 * told, said
+
+
+def _postalignment(log: IniText, folder: Path) -> tuple[float, list[str]]:
+    """The axis' shift in columns: the log's, else what a log of the same scan beside it tells."""
+    part = int(log.number("Current scan number", otherwise=1))
+    parts = int(log.number("Number of connected scans", otherwise=1))
+    keys = [f"Sub-scan post alignment [{part - 1}]"] if parts > 1 else ["Postalignment", "Post alignment"]
+    said = [f"this is part {part} of {parts} connected scans, and read alone"] if parts > 1 else []
+    whole = log.text("Filename Prefix").split("~")[0]
+    beside = (text for text in map(IniText, _all_logs(folder)) if _of_scan(text, whole))
+    found = (text.number(*keys, otherwise=0.0) for text in (log, *beside))
+    shift = next((shift for shift in found if shift), log.number("Postalignment", otherwise=0.0))
+    if shift == 0:
+        said.append(
+            "no Postalignment in the log: the axis is taken to fall on the detector's middle; give offset= else"
+        )
+    return shift, said
+
+
+def _of_scan(text: IniText, whole: str) -> bool:
+    return bool(whole) and text.text("Filename Prefix").split("~")[0] == whole
+
+
+def _drift(log: IniText) -> list[str]:
+    """What NRecon takes from the TIFFs' headers or from a table beside them."""
+    most = [log.text(f"Maximum {side} TS") for side in ("vertical", "horizontal")]
+    table = log.text("TS modified according to").replace("\\", "/").split("/")[-1]
+    if not table:
+        return []
+    far = f"at most {most[0] or '?'} rows and {most[1] or '?'} columns"
+    return [
+        f"the pictures have moved, by {far} ({table}), which is not undone; reconstruct with align=True (--align), "
+        "which finds it"
+    ]
 
 
 def _sense(log: IniText) -> tuple[int, list[str]]:

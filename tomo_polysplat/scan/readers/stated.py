@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from tomo_polysplat.checks import did_you_mean, fail, require_array, require_choice, require_number
-from tomo_polysplat.files import file_content
 from tomo_polysplat.physics.filter_text import require_filters
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
+from tomo_polysplat.scan.readers.angle_text import angles_in, require_degrees
 from tomo_polysplat.scan.readers.picture_files import frames_of
 from tomo_polysplat.scan.readers.picture_names import named_files
+from tomo_polysplat.scan.readers.text import text_of
 from tomo_polysplat.scan.reading import INPUT_KINDS, ReadOptions
 from tomo_polysplat.units import LENGTH_UNITS
 
@@ -65,7 +66,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     ValueError
         If it is none, or large.
     """
-    text = file_content(path, _MOST_BYTES).decode("utf-8", "replace").replace("\r\n", "\n")
+    text = text_of(path, _MOST_BYTES).replace("\r\n", "\n")
     try:
         if sys.version_info >= (3, 11):
             import tomllib
@@ -160,16 +161,13 @@ def view_degrees(stated: Mapping[str, Any], folder: Path, views: int) -> np.ndar
     angles = require_array("degrees", given, 1).astype(np.float64)
     if len(angles) != views:
         raise fail("degrees", f"one angle for each of {views} pictures", f"{len(angles)}")
-    return angles
+    return require_degrees(angles)
 
 
 def _angle_file(name: str | Path, folder: Path) -> np.ndarray:
-    """The last number of each line."""
     path = folder / name if (folder / name).is_file() else Path(name)
-    lines = file_content(path, _MOST_BYTES, "degrees").decode("utf-8", "replace").splitlines()
     try:
-        fields = [line.replace(",", " ").replace(";", " ").split() for line in lines]
-        return np.array([float(words[-1]) for words in fields if words and not words[0].startswith("#")])
+        return angles_in(text_of(path, _MOST_BYTES, "degrees"))
     except ValueError as error:
         raise fail("degrees", "a text file with one angle a line", f"{path} ({error})") from None
 

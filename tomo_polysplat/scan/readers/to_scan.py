@@ -16,7 +16,7 @@ from tomo_polysplat.scan.defects import flat_and_dark
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, to_astra
 from tomo_polysplat.scan.in_blocks import line_integrals
 from tomo_polysplat.scan.layout import spatial_geometry
-from tomo_polysplat.scan.readers.acquisition import Acquisition
+from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup
 from tomo_polysplat.scan.readers.part import Part
 from tomo_polysplat.scan.readers.upright import Upright
 from tomo_polysplat.scan.reading import ReadOptions
@@ -31,6 +31,8 @@ logger = logging.getLogger(__name__)
 
 # Percent of the pixels of pictures without flats that are darker than what is taken for the open beam.
 _BRIGHT = 99.0
+# Degrees under which a source sees a detector: few scanners have 60, and none so many.
+_WIDE_VIEW, _NO_VIEW = 90.0, 130.0
 # A usual flat panel, where nothing tells of the detector.
 _PANEL = "csi:0.6mm"
 
@@ -55,6 +57,7 @@ def scan_from_acquisition(told: Acquisition, options: ReadOptions, part: Part) -
     limit = _limit(told, kind, options.saturation)
     pictures = Upright(told, part, limit)
     geometry = _geometry(told)
+    told = _in_view(told)
     told, flat, dark = _open_beam(told, kind, pictures)
     counts = Counts(lambda: nullcontext(pictures.views), pictures.shape, kind, flat, dark, limit)
     projections, valid, rays = line_integrals(counts, options.progress)
@@ -89,6 +92,24 @@ def _geometry(told: Acquisition) -> Geometry:
             got = f"{geometry.rows} x {geometry.columns} for pictures of {rows} x {columns} pixels"
         raise fail("path", "one angle for each picture, and a detector of their size", got)
     return geometry
+
+
+def _in_view(told: Acquisition) -> Acquisition:
+    """Refuse a detector that goes far around the source, as one does whose pixels are in another unit."""
+    setup = told.setup
+    if not isinstance(setup, Setup) or not setup.source_detector:
+        return told
+    sides = np.broadcast_to(np.asarray(setup.pixel, np.float64), 2) * told.frames.shape[:0:-1]
+    angle = 2 * float(np.rad2deg(np.arctan(0.5 * sides.max() / setup.source_detector)))
+    got = f"{angle:.0f} degrees for {sides.max():g} {told.unit} in a distance of {setup.source_detector:g} {told.unit}"
+    if angle > _NO_VIEW:
+        remedy = "give all lengths in one unit: the pixel, source_object and source_detector"
+        raise fail("pixel", f"a detector within {_NO_VIEW:g} degrees, seen from the source", got, remedy)
+    if angle > _WIDE_VIEW:
+        return told.saying(
+            f"the source sees the detector under {got}: are the pixel and the distances in one unit?"
+        )
+    return told
 
 
 def _open_beam(

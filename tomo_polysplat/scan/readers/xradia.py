@@ -20,8 +20,14 @@ from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
 from tomo_polysplat.scan.readers.compound import CompoundFile, is_compound
 from tomo_polysplat.scan.readers.files_of_scans import the_one
 from tomo_polysplat.scan.readers.stated import require_known, stated_over
-from tomo_polysplat.scan.readers.xradia_frames import XrmFrames, picture_names, reference_names
+from tomo_polysplat.scan.readers.xradia_frames import (
+    XrmFrames,
+    picture_names,
+    reference_names,
+    reference_seconds,
+)
 from tomo_polysplat.scan.readers.xradia_series import SeriesFrames, XrmSeries, sorted_out
+from tomo_polysplat.units import CM_PER_UNIT
 
 if TYPE_CHECKING:
     from tomo_polysplat.scan.readers.frames import Frames
@@ -31,6 +37,9 @@ __all__ = ["KIND", "read", "recognises"]
 KIND = "Zeiss Xradia (.txrm, .xrm)"
 # The first kind that is there is the scan; the others beside it are single pictures and reconstructions.
 _SUFFIXES = (".txrm", ".xrm", ".txm")
+# Columns by which two statements of the axis may differ.
+_CENTRES = 0.1
+_ZONE_PLATES = "ConfigZonePlates"
 # Relative changes of exposure or distance that count.
 _SAME = 1e-3
 _CONE = 1
@@ -47,6 +56,9 @@ _NUMBERS = {
     "ImageInfo/CameraBinning": "<i4",
     "ImageInfo/CameraNumberOfFramesPerImage": "<i4",
     "ImageInfo/ConeAngle": "<f4",
+    "ImageInfo/CameraOffset": "<f4",
+    "ReconSettings/RotationAngle": "<f4",
+    "ReconSettings/BeamHardening": "<f4",
 }
 
 
@@ -65,7 +77,7 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
         raise fail("path", "a scan", f"{chosen}, a reconstruction", "name the .txrm file of the projections")
     file = CompoundFile(chosen)
     names = picture_names(file)
-    light, exposure, said = _exposures(file, len(names), file.number("ReferenceData/ExpTime"))
+    light, exposure, said = _exposures(file, len(names), reference_seconds(file))
     frames = XrmFrames(file, names, "ImageInfo/DataType", light)
     planned = int(file.number("ImageInfo/NoOfImages", "<u4") or 0)
     if len(names) < planned:
@@ -115,6 +127,8 @@ def _exposures(
 ) -> tuple[np.ndarray | None, float | None, list[str]]:
     """What makes each picture's light that of the open beam, None where it is; seconds a picture; what to say."""
     seconds = file.numbers("ImageInfo/ExpTimes")[:views].astype(np.float64)
+    if not len(seconds) and (once := file.number("ImageInfo/ExpTime")):
+        seconds = np.full(views, once)
     if not 0 < views <= len(seconds) or not (np.isfinite(seconds).all() and (seconds > 0).all()):
         return None, None, []
     usual = float(np.median(seconds))
@@ -131,12 +145,14 @@ def _setup(file: CompoundFile | XrmSeries, views: int) -> tuple[Setup, np.ndarra
     pixel = 1e-3 * (file.number("ImageInfo/PixelSize") or 0.0)
     if not pixel > 0:
         raise fail("path", "the size of a pixel as ImageInfo/PixelSize", f"none in {file.path}")
-    near, far = (np.abs(file.numbers(f"ImageInfo/{end}toRADistance")[:views]) for end in "SD")
+    unit = _distance_unit(file)
+    near, far = (unit * np.abs(file.numbers(f"ImageInfo/{end}toRADistance")[:views]) for end in "SD")
     given = len(near) > 0 and len(far) > 0 and min(near[0], far[0]) > 0
     if given and max(np.ptp(near) / near[0], np.ptp(far) / far[0]) > _SAME:
         said.append("the distances change from view to view: those of the first are taken for all")
     beam = file.number("ImageInfo/XrayGeometry", "<i4")
-    cone = given if beam is None else beam == _CONE
+    # A zone plate makes parallel what it passes.
+    cone = given and _ZONE_PLATES not in file if beam is None else beam == _CONE
     if cone and not given:
         raise fail("path", "distances as ImageInfo/StoRADistance and DtoRADistance", f"none in {file.path}")
     magnified = (near[0] + far[0]) / near[0] if cone else 1.0
@@ -144,11 +160,23 @@ def _setup(file: CompoundFile | XrmSeries, views: int) -> tuple[Setup, np.ndarra
     setup = Setup(-degrees, float(pixel * magnified))
     if cone:
         setup = replace(setup, source_object=float(near[0]), source_detector=float(near[0] + far[0]))
-    centre = file.number("ReconSettings/CenterShift") or file.number("AutoRecon/CenterShift") or 0.0
+    centres = [file.number(f"{name}/CenterShift") for name in ("ReconSettings", "AutoRecon")]
+    centre = next((centre for centre in centres if centre), 0.0)
+    if all(centres) and abs(centres[0] - centres[1]) > _CENTRES:  # type: ignore[operator]
+        said.append(
+            f"the axis is {centre:g} columns off, as ReconSettings tells; AutoRecon tells {centres[1]:g}"
+        )
     if not centre:
         said.append("the axis is taken to fall on the detector's middle; give offset= if it does not")
     setup = replace(setup, offset=(centre * setup.pixel, 0.0))  # type: ignore[operator]
     return setup, _shifts(file, views), said
+
+
+def _distance_unit(file: CompoundFile | XrmSeries) -> float:
+    """Millimetres in the unit of the source's axis, which is that of the distances."""
+    names, units = (file.texts(f"PositionInfo/Axis{kind}") for kind in ("Names", "Units"))
+    named = dict(zip(names, units))
+    return 10 * CM_PER_UNIT.get(named.get("Source Z", "mm").replace("\u00b5", "u"), 0.1)
 
 
 def _shifts(file: CompoundFile | XrmSeries, views: int) -> np.ndarray | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,19 @@ import numpy as np
 from tomo_polysplat.checks import fail
 from tomo_polysplat.scan.readers.compound import CompoundFile
 
-__all__ = ["XrmFrames", "picture_names", "reference_names", "xrm_pictures"]
+__all__ = [
+    "XrmFrames",
+    "picture_names",
+    "picture_size",
+    "reference_names",
+    "reference_seconds",
+    "xrm_pictures",
+]
 
 # Numbers of the types of Xradia's that pictures come in.
 _TYPES = {3: "u1", 4: "<i2", 5: "<u2", 6: "<i4", 7: "<u4", 10: "<f4", 11: "<f8"}
+# The usual types of so many bytes.
+_USUAL = {1: 3, 2: 5, 4: 10, 8: 11}
 # Pictures in one folder of streams.
 _HUNDRED = 100
 _MOST_SIDE, _MOST_PICTURES = 1 << 16, 1 << 20
@@ -28,7 +38,7 @@ class XrmFrames:
     names : sequence of str
         Of their streams.
     kind : str
-        Of the stream that tells their type.
+        Of the stream that tells their type; where there is none, their bytes do.
     light : array, shape (pictures,), optional
         What the counts of each are multiplied by.
     """
@@ -36,8 +46,10 @@ class XrmFrames:
     def __init__(
         self, file: CompoundFile, names: Sequence[str], kind: str, light: np.ndarray | None = None
     ) -> None:
-        sides = [int(file.number(f"ImageInfo/Image{side}", "<u4") or 0) for side in ("Height", "Width")]
+        sides = picture_size(file)
         told = file.number(kind, "<i4")
+        if told is None and names and 0 < sides[0] < _MOST_SIDE and 0 < sides[1] < _MOST_SIDE:
+            told = _USUAL.get((file.size(names[0]) or 0) // (sides[0] * sides[1]))
         if not names or not all(0 < side < _MOST_SIDE for side in sides) or told not in _TYPES:
             got = f"{len(names)} of {sides[0]} x {sides[1]} pixels of type {told} in {file.path}"
             raise fail("path", "pictures of numbers", got, "name the .txrm file of the projections")
@@ -58,23 +70,45 @@ class XrmFrames:
         return picture if self._light is None else (picture * self._light[index]).astype(np.float32)
 
 
+def picture_size(file: CompoundFile, of: str = "") -> tuple[int, int]:
+    """Rows and columns of the pictures, or of those without the object."""
+    height, width = (
+        int(file.number(f"{of}ImageInfo/Image{side}", "<u4") or 0) for side in ("Height", "Width")
+    )
+    return height, width
+
+
 def picture_names(file: CompoundFile) -> list[str]:
     """Streams of the pictures that were taken, in folders of a hundred."""
-    planned = file.number("ImageInfo/NoOfImages", "<u4") or 0
-    taken = file.number("ImageInfo/ImagesTaken", "<u4")
-    count = int(min(planned, planned if taken is None else taken, _MOST_PICTURES))
-    names = [f"ImageData{k // _HUNDRED + 1}/Image{k + 1}" for k in range(count)]
-    missing = next((k for k, name in enumerate(names) if name not in file), len(names))
-    return names[:missing]
+    told = (file.number(f"ImageInfo/{name}", "<u4") for name in ("NoOfImages", "ImagesTaken"))
+    count = int(min([_MOST_PICTURES, *(number for number in told if number)]))
+    names = (f"ImageData{k // _HUNDRED + 1}/Image{k + 1}" for k in range(count))
+    return list(takewhile(lambda name: name in file, names))
 
 
 def reference_names(file: CompoundFile) -> tuple[list[str], str]:
-    """Streams of the pictures without the object, and the one that tells their type."""
-    if "ReferenceData/Image" in file:
-        return ["ReferenceData/Image"], "ReferenceData/DataType"
-    count = int(min(file.number("MultiReferenceData/TotalRefImages", "<i4") or 0, _MOST_PICTURES))
-    names = [f"MultiReferenceData/Image{k + 1}" for k in range(count)]
-    return [name for name in names if name in file], "MultiReferenceData/DataType"
+    """Streams of the pictures without the object, and the one that tells their type.
+
+    None if they are of another size than those of the object.
+    """
+    of = next(
+        (of for of in ("ReferenceData", "MultiReferenceData") if _references(file, of)), "ReferenceData"
+    )
+    size = picture_size(file, f"{of}/")
+    fits = 0 in size or size == picture_size(file)
+    return _references(file, of) if fits else [], f"{of}/DataType"
+
+
+def reference_seconds(file: CompoundFile) -> float | None:
+    """Exposure of the pictures without the object."""
+    names = ("ExpTime", "ImageInfo/ExpTimes", "ImageInfo/ExpTime")
+    found = (file.number(f"{of}/{name}") for of in ("ReferenceData", "MultiReferenceData") for name in names)
+    return next((seconds for seconds in found if seconds and seconds > 0), None)
+
+
+def _references(file: CompoundFile, of: str) -> list[str]:
+    names = ["Image"] if of == "ReferenceData" else (f"Image{k + 1}" for k in range(_MOST_PICTURES))
+    return list(takewhile(lambda name: name in file, (f"{of}/{name}" for name in names)))
 
 
 def xrm_pictures(files: Sequence[Path]) -> XrmFrames:

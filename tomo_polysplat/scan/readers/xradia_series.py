@@ -83,6 +83,10 @@ class XrmSeries:
         """The text of the first file."""
         return self._first.text(name)
 
+    def texts(self, name: str) -> list[str]:
+        """The texts of the first file."""
+        return self._first.texts(name)
+
 
 class SeriesFrames:
     """Pictures of files of one each, which are opened when they are asked for.

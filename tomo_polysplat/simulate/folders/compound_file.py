@@ -67,7 +67,7 @@ def _put(sectors: bytearray, chain: list[int], content: bytes, size: int) -> int
 
 def _directory(streams: Mapping[str, bytes], places: Mapping[str, int], mini: tuple[int, int]) -> bytes:
     """Entries of the root, the folders and the streams; those of a folder make a tree of sorted names."""
-    folders = sorted({name.rpartition("/")[0] for name in streams} - {""})
+    folders = sorted({name[:k] for name in streams for k, sign in enumerate(name) if sign == "/"})
     names = ["", *folders, *streams]
     links = {name: [_FREE, _FREE, _FREE] for name in names}
     for folder in ["", *folders]:
