@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from tomo_polysplat.fit.loss import misfit, total_variation, variation_of_slab, weighted_huber, weighted_l1
+from tomo_polysplat.fit.loss import (
+    away_from_edges,
+    misfit,
+    total_variation,
+    variation_of_slab,
+    weighted_huber,
+    weighted_l1,
+)
+from tomo_polysplat.kernels.step.faint import HALO
 from tomo_polysplat.settings import Settings
 
 
@@ -86,15 +94,16 @@ def test_total_variation_of_a_cube_is_its_surface():
     assert float(total_variation(volume, 10.0)) == pytest.approx(3 * 0.7 * 2 * 9 / (8 * 9 * 9))
 
 
-@pytest.mark.parametrize("corners", [(0.0, 0.0), (0.2, 0.05)])
-@pytest.mark.parametrize(("depth", "first", "last"), [(7, 0, 4), (7, 2, 6), (7, 0, 7), (1, 0, 1)])
+@pytest.mark.parametrize("corners", [(0.0, 0.0), (0.2, 0.05), (0.29, 0.05)])
+@pytest.mark.parametrize(("depth", "first", "last"), [(17, 0, 9), (17, 4, 14), (17, 0, 17), (1, 0, 1)])
 def test_the_slope_of_a_slab_is_that_of_the_whole_but_where_it_ends(depth, first, last, corners):
     generator = torch.Generator().manual_seed(1)
     volume = torch.rand((depth, 4, 5), generator=generator, dtype=torch.float64)
     whole, slab = volume.clone().requires_grad_(), volume[first:last].clone().requires_grad_()
     total_variation(whole, 0.9, corners, 0.6).backward()
     variation_of_slab(slab, depth, 0.9, corners, 0.6).backward()
-    inner = slice(first + (first > 0), last - (last < depth))
+    beside = HALO if any(corners) else 1
+    inner = slice(first + beside * (first > 0), last - beside * (last < depth))
     told = slab.grad[inner.start - first : inner.stop - first]
     torch.testing.assert_close(told, whole.grad[inner])
     assert bool(told.any())
@@ -107,27 +116,44 @@ def test_total_variation_of_one_slice_leaves_the_missing_axis_out():
     assert float(total_variation(torch.full((1, 1, 1), 3.0), 10.0)) == 0
 
 
-def test_with_a_corner_noise_counts_in_full_and_an_edge_by_its_logarithm():
-    noise = 1e-6 * torch.rand((5, 7, 4), generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    full, with_corner = (float(total_variation(noise, 10.0, (corner, corner))) for corner in (0.0, 0.1))
-    assert with_corner == pytest.approx(full, rel=1e-5)
-    edge = torch.zeros((1, 1, 4), dtype=torch.float64)
-    edge[..., 2:] = 0.7
-    assert float(total_variation(edge, 10.0, (0.1, 0.1))) == pytest.approx(0.1 * math.log(8.0) / 3)
+def test_with_a_corner_noise_beside_an_edge_counts_in_full_and_the_edge_by_its_logarithm():
+    edge = torch.tensor([1e-3, 0.0, 0.7], dtype=torch.float64)[None, None]
+    assert float(total_variation(edge, 10.0)) == pytest.approx((1e-3 + 0.7) / 2)
+    found = float(total_variation(edge, 10.0, (0.1, 0.1)))
+    assert found == pytest.approx((1e-3 + 0.1 * math.log(8.0)) / 2, rel=1e-4)
+
+
+@pytest.mark.parametrize(("wall", "faint"), [(8, 2), (7, 1), (6, 0)])
+def test_faint_differences_count_squared_unless_an_edge_is_within_three_voxels(wall, faint):
+    """By Huber's function with its corner at a half of theirs, in the logarithm; of two differences so many.
+
+    In a volume: a slice has nothing faint.
+    """
+    column, corner, height = torch.zeros((13, 1, 1), dtype=torch.float64), 0.1, 0.02
+    column[3], column[wall:] = height, 0.4
+    squared, full, edge = (
+        corner * math.log1p(counted / corner) for counted in (height**2 / corner, height, 0.4)
+    )
+    for some, values in ((faint, column), (0, column.transpose(0, 2))):
+        expected = (some * squared + (2 - some) * full + edge) / 12
+        assert float(total_variation(values, 10.0, (corner, corner))) == pytest.approx(expected, rel=1e-12)
+
+
+def test_nothing_dense_is_faint_nor_what_is_beside_it():
+    row = torch.full((1, 1, 9), 3.0)
+    assert not away_from_edges(row, 0.1, 2.2).any() and away_from_edges(row, 0.1, 3.0).all()
+    row[..., 4] = 3.2
+    assert away_from_edges(row, 0.1, 3.0)[0, 0].tolist() == [True] + [False] * 7 + [True]
 
 
 def test_the_pull_on_an_edge_falls_with_its_height():
     """The derivative of c log(1 + d / c) by d: 1 at a vanishing difference, a half at the corner."""
-    heights = torch.tensor([1e-9, 0.1, 0.9], dtype=torch.float64)
     pulls = []
-    for height in heights:
-        pair = torch.stack([torch.zeros_like(height), height])[None, None].requires_grad_()
-        total_variation(pair, 10.0, (0.1, 0.1)).backward()
-        pulls.append(pair.grad[0, 0].tolist())
-    expected = torch.tensor([1.0, 0.5, 0.1], dtype=torch.float64)
-    assert torch.tensor(pulls, dtype=torch.float64).numpy() == pytest.approx(
-        torch.stack([-expected, expected], 1).numpy()
-    )
+    for height in (1e-9, 0.1, 0.9):
+        row = torch.tensor([0.0, height, 9.0], dtype=torch.float64)[None, None].requires_grad_()
+        total_variation(row, 10.0, (0.1, 0.1)).backward()
+        pulls.append(-2 * float(row.grad[0, 0, 0]))
+    assert pulls == pytest.approx([1.0, 0.5, 0.1])
 
 
 def test_brightness_above_the_ceiling_is_free():

@@ -78,7 +78,7 @@ def test_room_for_gaussians_is_what_would_not_be_refused(monkeypatch):
 def test_counts_beyond_32_bits_are_counted(monkeypatch):
     with_free(monkeypatch, 1e13)
     said = memory.require_room(GPU, **(SCENE | {"voxels": 4096**3, "projections": 2**33}))
-    assert f"{(4096**3 * 12 + (12 << 25)) / 1e9:.2f} GB" in said and "on the GPU, 8.59 GB" in said
+    assert f"{(4096**3 * 13 + (12 << 25)) / 1e9:.2f} GB" in said and "on the GPU, 8.59 GB" in said
     assert "streamed" in memory.require_room(GPU, **(SCENE | {"projections": 0}))
 
 

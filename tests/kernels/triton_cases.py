@@ -30,7 +30,9 @@ def poison() -> None:
 def _poisoned(allocate):
     def wrapper(*args, **kwargs):
         tensor = allocate(*args, **kwargs)
-        return tensor.fill_(float("nan") if tensor.is_floating_point() else 1 << 30)
+        if tensor.is_floating_point():
+            return tensor.fill_(float("nan"))
+        return tensor.fill_(min(1 << 30, torch.iinfo(tensor.dtype).max))
 
     return wrapper
 

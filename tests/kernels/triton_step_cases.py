@@ -10,6 +10,7 @@ import torch
 from step_scenes import BATCH, compare_steps, fit_problem
 from triton_case import case
 
+from tomo_polysplat.fit.loss import away_from_edges, total_variation
 from tomo_polysplat.fit.shares import Part, parted, planes_of_all
 from tomo_polysplat.fit.step import EagerStep
 from tomo_polysplat.kernels import portions
@@ -59,6 +60,24 @@ def a_step_of_one_curve_under_a_spectrum(device):
         moved = compare_steps(_fused, device, ("cpu", "reference"), kind, **changes)
         assert bool(moved["attenuation"].any()) and bool(moved["blur"].any()) == blurring
         assert not any(bool(moved[name].any()) for name in ("own_material", "shared_material"))
+
+
+@case
+def smoothing_pulls_as_the_derivative_says(device):
+    """On noise and on faint steps, beside an edge, dense matter and metal and away from them."""
+    from tomo_polysplat.kernels.step.triton_variation import variation_gradient
+
+    generator = torch.Generator().manual_seed(4)
+    for shape, corners in (((9, 11, 7), (0.1, 0.03)), ((1, 7, 9), (0.1, 0.1)), ((3, 8, 8), (0.0, 0.0))):
+        volume = 1 + 0.15 * torch.rand(shape, generator=generator)
+        volume[:, -1], volume[0, 0, 0], volume[-1, 1, 1] = 0.2, 3.0, 9.0
+        asked = volume.clone().requires_grad_()
+        (0.3 * total_variation(asked, 5.0, corners, 2.2)).backward()
+        largest = torch.zeros(1, device=device)
+        found = variation_gradient(volume[None].to(device), 5.0, corners, 2.2, 0.3, largest, shape[0])
+        np.testing.assert_allclose(found[0].cpu(), asked.grad, rtol=1e-4, atol=1e-8)
+        away = away_from_edges(volume.clamp(max=5.0), corners[0], 2.2)
+        assert bool(away.any()) == (corners[0] > 0) and not bool(away.all()), "a case of each"
 
 
 @case

@@ -8,10 +8,19 @@ import torch
 
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.shares import Part
+from tomo_polysplat.kernels.step.faint import BESIDE, EDGE, FAINT
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
 
-__all__ = ["misfit", "roughness", "total_variation", "variation_of_slab", "weighted_huber", "weighted_l1"]
+__all__ = [
+    "away_from_edges",
+    "misfit",
+    "roughness",
+    "total_variation",
+    "variation_of_slab",
+    "weighted_huber",
+    "weighted_l1",
+]
 
 
 def misfit(
@@ -64,6 +73,10 @@ def total_variation(
     doubling above. So noise is smoothed as before, and edges and texture pay little for their height (the log-sum
     penalty: Candes, Wakin and Boyd 2008, doi:10.1007/s00041-008-9045-x).
 
+    A total variation takes from an inclusion what its surface is over its volume, however faint it is (Strong and Chan
+    2003, doi:10.1088/0266-5611/19/6/059). So `away_from_edges` |d| is Huber's function of d, squared up to `FAINT` c;
+    of a volume, not of a slice.
+
     Parameters
     ----------
     volume : (nz, ny, nx) tensor
@@ -76,10 +89,11 @@ def total_variation(
         Below ``ceiling``, for the second corner to matter.
     """
     clipped = volume.clamp(max=ceiling)
+    away = _away(clipped, len(volume), corners, dense)
     total = volume.new_zeros(())
     for axis in range(volume.ndim):
         if volume.shape[axis] > 1:
-            total = total + _heights(clipped, axis, corners, dense).mean()
+            total = total + _heights(clipped, away, axis, corners, dense).mean()
     return total
 
 
@@ -92,23 +106,75 @@ def variation_of_slab(
 ) -> torch.Tensor:
     """What a slab (nz, ny, nx) adds to the `total_variation` of a volume of so many ``planes``.
 
-    Its slope is that of the whole, except in planes beside which the slab ends and the volume does not.
+    Its slope is that of the whole, except within ``faint.HALO`` planes of where the slab ends and the volume does not.
     """
     clipped, whole = slab.clamp(max=ceiling), (planes, *slab.shape[1:])
+    away = _away(clipped, planes, corners, dense)
     total = slab.new_zeros(())
     for axis, length in enumerate(whole):
         if length > 1:
-            heights = _heights(clipped, axis, corners, dense)
+            heights = _heights(clipped, away, axis, corners, dense)
             total = total + heights.sum() / (math.prod(whole) // length * (length - 1))
     return total
 
 
-def _heights(clipped: torch.Tensor, axis: int, corners: tuple[float, float], dense: float) -> torch.Tensor:
-    """What each difference of neighbours along an axis counts."""
+def _away(
+    clipped: torch.Tensor, planes: int, corners: tuple[float, float], dense: float
+) -> torch.Tensor | None:
+    """`away_from_edges` of a volume of several planes. In a slice, of few rays a voxel, streaks are faint, too."""
+    return away_from_edges(clipped, corners[0], dense) if any(corners) and planes > 1 else None
+
+
+@torch.no_grad()
+def away_from_edges(volume: torch.Tensor, corner: float, dense: float) -> torch.Tensor:
+    """Which voxels have no edge and no dense matter beside them, within three voxels along each axis.
+
+    Parameters
+    ----------
+    volume : (nz, ny, nx) tensor
+    corner : float
+        An edge varies by three of these at least.
+    dense : float
+        What is above it is dense.
+
+    Returns
+    -------
+    (nz, ny, nx) bool tensor
+    """
+    most, least = volume, -volume
+    for axis in range(volume.ndim):
+        most, least = _largest_beside(most, axis), _largest_beside(least, axis)
+    return (most + least < EDGE * corner) & (most <= dense)
+
+
+def _largest_beside(volume: torch.Tensor, axis: int) -> torch.Tensor:
+    """Largest value up to `BESIDE` voxels before and behind along an axis."""
+    largest, length = volume.clone(), volume.shape[axis]
+    for far in range(1, min(BESIDE, length - 1) + 1):
+        before, behind = (volume.narrow(axis, start, length - far) for start in (0, far))
+        for at, other in ((far, before), (0, behind)):
+            part = largest.narrow(axis, at, length - far)
+            torch.maximum(part, other, out=part)
+    return largest
+
+
+def _heights(
+    clipped: torch.Tensor,
+    away: torch.Tensor | None,
+    axis: int,
+    corners: tuple[float, float],
+    dense: float,
+) -> torch.Tensor:
+    """What each difference of neighbours along an axis counts; ``away`` is None where none is faint."""
     height = clipped.diff(dim=axis).abs()
     if not any(corners):
         return height
     length = clipped.shape[axis] - 1
     either = torch.maximum(clipped.narrow(axis, 0, length), clipped.narrow(axis, 1, length)) > dense
     corner = torch.where(either, clipped.new_tensor(corners[1]), clipped.new_tensor(corners[0]))
+    if away is not None and (width := FAINT * corners[0]):
+        # Huber's function is the height less this.
+        low = height.clamp(max=width)
+        both = away.narrow(axis, 0, length) & away.narrow(axis, 1, length)
+        height = height - both * low * (1 - low / (2 * width))
     return corner * torch.log1p(height / corner)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from tomo_polysplat.kernels.step.faint import HALO
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.ranks import Ranks, part_of
@@ -65,8 +66,8 @@ class Planes:
 def planes_of_all(gaussians: Gaussians, parts: Sequence[torch.Tensor], box: VoxelBox) -> list[Planes]:
     """Those of each rank, with room for what its Gaussians may come to reach until planes are chosen anew."""
     depth, made = box.shape[0], np.zeros(box.shape[0], int)
-    # One more: differences of neighbouring planes take those beside the ones that are reached.
-    wide = max(_WANDERED, round(_OF_ALL * depth)) + 1
+    # Some more: smoothing takes those beside the ones that are reached.
+    wide = max(_WANDERED, round(_OF_ALL * depth)) + HALO
     own = []
     for part in reached(gaussians, parts, box, _WIDENED):
         own.append(slice(max(part.start - wide, 0), min(part.stop + wide, depth)))
@@ -79,7 +80,7 @@ def fit_in(
 ) -> bool:
     """Whether no Gaussian reaches beyond the planes of its part."""
     return all(
-        max(now.start - 1, 0) >= planes.own.start and min(now.stop + 1, box.shape[0]) <= planes.own.stop
+        max(now.start - HALO, 0) >= planes.own.start and min(now.stop + HALO, box.shape[0]) <= planes.own.stop
         for now, planes in zip(reached(gaussians, parts, box), held)
     )
 

@@ -78,7 +78,9 @@ class Alignment(Nuisance):
     }
     found_by = Found.GRADIENT
     gauge = "moves of the whole object: what views have in common, and what moves it, is taken out of their shifts"
-    cost = "a fit of one pass before the run, and more where it shows moves; if asked for, fits of joined pixels"
+    cost = (
+        "a fit of one pass before the run, and more where it shows moves; if asked for, fits of joined pixels"
+    )
 
     def __init__(
         self,

@@ -50,27 +50,7 @@ def first_gaussians(
     ValueError
         If a CUDA device has too little memory left.
     """
-    relative = start / (problem.depth * plan.reference)
-    spacing = plan.spacing * problem.voxel
-    # A spacing that was asked for is nobody's lack of Gaussians, which thin ones make up for.
-    finest = math.inf if settings.seed_spacing else finest_spacing(problem)[0] * problem.voxel
-    finest = 0.0 if plan.sharp else finest
-    several = plan.curves > 1
-    stays = start_stays(math.prod(relative.shape), device)
-    gaussians = seed_gaussians(
-        torch.as_tensor(relative).to(device if stays else "cpu"),
-        problem.grid,
-        Spacing(spacing, plan.finer, finest),
-        plan.adapted(settings),
-        several,
-        problem.planar,
-    )
-    gaussians = gaussians if stays else gaussians.to(device)
-    if keeps_more_than(MUCH, device):
-        # As the start volume is moved (`plan.first_volume`).
-        gaussians = gaussians.to(torch.device("cpu"))
-        give_back()
-        gaussians = gaussians.to(device)
+    gaussians, several = _seeded(start, plan, problem, settings, device), plan.curves > 1
     free = int((gaussians.group < 0).sum())
     kinds = "none with a material number of its own"
     if several:
@@ -91,6 +71,33 @@ def first_gaussians(
         "work": ("", work(plan, problem, settings, len(gaussians))),
         "memory": ("", memory),
     }
+
+
+def _seeded(
+    start: np.ndarray | torch.Tensor, plan: Plan, problem: Problem, settings: Settings, device: torch.device
+) -> Gaussians:
+    """The seeds on the device, made on the host where there is no room for what that takes."""
+    relative = start / (problem.depth * plan.reference)
+    spacing = plan.spacing * problem.voxel
+    # A spacing that was asked for is nobody's lack of Gaussians, which thin ones make up for.
+    finest = math.inf if settings.seed_spacing else finest_spacing(problem)[0] * problem.voxel
+    finest = 0.0 if plan.sharp else finest
+    stays = start_stays(math.prod(relative.shape), device)
+    gaussians = seed_gaussians(
+        torch.as_tensor(relative).to(device if stays else "cpu"),
+        problem.grid,
+        Spacing(spacing, plan.finer, finest),
+        plan.adapted(settings),
+        plan.curves > 1,
+        problem.planar,
+    )
+    gaussians = gaussians if stays else gaussians.to(device)
+    if keeps_more_than(MUCH, device):
+        # As the start volume is moved (`plan.first_volume`).
+        gaussians = gaussians.to(torch.device("cpu"))
+        give_back()
+        gaussians = gaussians.to(device)
+    return gaussians
 
 
 def room_to_grow(gaussians: int, plan: Plan, problem: Problem, device: torch.device) -> float:

@@ -6,6 +6,8 @@ import torch
 import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
+from tomo_polysplat.kernels.step.faint import FAINT
+from tomo_polysplat.kernels.step.triton_away import away_from_edges
 from tomo_polysplat.kernels.triton_maths import SIZES, on_device
 
 __all__ = ["variation_gradient"]
@@ -14,26 +16,34 @@ _BLOCK = 256
 
 
 @triton.jit
-def _slope(a, b, dense, by_corner, by_dense_corner):
-    """Derivative of the penalty of a - b by a: the sign, less where the difference is large."""
+def _slope(a, b, both, dense, by_corner, by_dense_corner, width):
+    """Derivative of the penalty of a - b by a: the sign, less where the difference is large, or small in ``both``."""
     sign = tl.where(a > b, 1.0, 0.0) - tl.where(a < b, 1.0, 0.0)
     by_corner = tl.where(tl.maximum(a, b) > dense, by_dense_corner, by_corner)
-    return sign / (1.0 + tl.abs(a - b) * by_corner)
+    height = tl.abs(a - b)
+    low = tl.minimum(height, width)
+    height -= tl.where(both, low * (1.0 - 0.5 * low / width), 0.0)
+    return sign * tl.where(both, low / width, 1.0) / (1.0 + height * by_corner)
 
 
 @triton.jit
-def _along(volume, at, value, index, length, stride, live, ceiling, dense, by_corner, by_dense_corner):
+def _along(
+    volume, away, at, value, faint, index, length, stride, live, ceiling, dense, by_corner, by_dense_corner, width
+):  # fmt: skip
     """d/dvalue of the penalties of the differences from both neighbours along an axis."""
-    before = tl.minimum(tl.load(volume + at - stride, mask=live & (index > 0), other=0.0), ceiling)
-    after = tl.minimum(tl.load(volume + at + stride, mask=live & (index < length - 1), other=0.0), ceiling)
-    slope = tl.where(index > 0, _slope(value, before, dense, by_corner, by_dense_corner), 0.0)
-    rise = _slope(after, value, dense, by_corner, by_dense_corner)
-    return slope - tl.where(index < length - 1, rise, 0.0)
+    has_before, has_after = live & (index > 0), live & (index < length - 1)
+    before = tl.minimum(tl.load(volume + at - stride, mask=has_before, other=0.0), ceiling)
+    after = tl.minimum(tl.load(volume + at + stride, mask=has_after, other=0.0), ceiling)
+    both_before = faint & (tl.load(away + at - stride, mask=has_before, other=0) != 0)
+    both_after = faint & (tl.load(away + at + stride, mask=has_after, other=0) != 0)
+    slope = _slope(value, before, both_before, dense, by_corner, by_dense_corner, width)
+    rise = _slope(after, value, both_after, dense, by_corner, by_dense_corner, width)
+    return tl.where(index > 0, slope, 0.0) - tl.where(index < length - 1, rise, 0.0)
 
 
 @triton.jit(do_not_specialize=SIZES)
 def _variation_kernel(
-    volume, grad, largest, nz, ny, nx, count, ceiling, dense, by_corner, by_dense_corner, factor,
+    volume, away, grad, largest, nz, ny, nx, count, ceiling, dense, by_corner, by_dense_corner, width, factor,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
     at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -43,11 +53,18 @@ def _variation_kernel(
     x, y, z = at - line * nx, line % ny, line // ny
     raw = tl.load(volume + at, mask=live, other=0.0)
     value = tl.minimum(raw, ceiling)
+    faint = tl.load(away + at, mask=live, other=0) != 0
     tl.atomic_max(largest, tl.max(raw, 0), sem="relaxed")
     # The mean over an axis has a term less a line than the volume has voxels; of a slab, the whole volume.
-    along_x = _along(volume, at, value, x, nx, 1, live, ceiling, dense, by_corner, by_dense_corner)
-    along_y = _along(volume, at, value, y, ny, nx, live, ceiling, dense, by_corner, by_dense_corner)
-    along_z = _along(volume, at, value, z, nz, nx * ny, live, ceiling, dense, by_corner, by_dense_corner)
+    along_x = _along(
+        volume, away, at, value, faint, x, nx, 1, live, ceiling, dense, by_corner, by_dense_corner, width
+    )  # fmt: skip
+    along_y = _along(
+        volume, away, at, value, faint, y, ny, nx, live, ceiling, dense, by_corner, by_dense_corner, width
+    )  # fmt: skip
+    along_z = _along(
+        volume, away, at, value, faint, z, nz, nx * ny, live, ceiling, dense, by_corner, by_dense_corner, width
+    )  # fmt: skip
     whole = tl.cast(count, tl.int64) * ny * nx
     slope = along_x / tl.maximum(whole - ny * count, 1)
     slope += along_y / tl.maximum(whole - nx * count, 1)
@@ -66,14 +83,18 @@ def variation_gradient(
 ) -> torch.Tensor:
     """``factor`` times the gradient of ``fit.loss.total_variation`` of a volume (1, nz, ny, nx), so shaped.
 
-    Of a slab it is that of the whole volume, of so many ``planes``, except in planes beside which the slab ends.
-    ``largest``, a float32 tensor of one number, is raised to the largest value of the volume.
+    Of a slab it is that of the whole volume, of so many ``planes``, except within ``faint.HALO`` planes of where the
+    slab ends. ``largest``, a float32 tensor of one number, is raised to the largest value of the volume.
     """
-    grad = torch.empty_like(volume)
     by_corners = [1 / corner if corner else 0.0 for corner in corners]
+    if planes > 1:
+        away = away_from_edges(volume, ceiling, corners[0], dense)
+    else:  # in a slice nothing is faint
+        away = torch.zeros_like(volume, dtype=torch.int8)
+    grad = torch.empty_like(volume)
     with on_device(volume):
         _variation_kernel[(triton.cdiv(volume.numel(), _BLOCK),)](
-            volume, grad, largest, *volume.shape[1:], planes, ceiling, dense, *by_corners, factor,
-            BLOCK=_BLOCK, num_warps=4,
+            volume, away, grad, largest, *volume.shape[1:], planes, ceiling, dense, *by_corners,
+            FAINT * corners[0] or 1.0, factor, BLOCK=_BLOCK, num_warps=4,
         )  # fmt: skip
     return grad
