@@ -55,6 +55,18 @@ def test_roll_and_shifts_of_views_are_found():
     assert found.evidence["better"] > 0.2 and "falls" in found.why
 
 
+def test_joined_pixels_tell_moves_in_pixels_of_the_detector(monkeypatch):
+    """Half as many columns: what is found is as large as by all of them, within what a coarser fit tells."""
+    monkeypatch.setattr(realignment, "_COLUMNS", problem(True).geometry.columns // 2)
+    joined, pixel = realignment._joined(problem(True))
+    assert joined.geometry.columns == problem(True).geometry.columns // 2 and pixel.tolist() == [2, 2]
+    found, true = ask(True), problem(True)
+    assert found.value["roll"] == pytest.approx(1.5, abs=0.3)
+    order = np.arange(VIEWS) if true.order is None else np.argsort(true.order)
+    shifts = np.array(found.value["views"])[order]
+    assert np.std(shifts[:, 1] - wobble()[:, 1]) < 0.3 and np.std(shifts[:, 0] - wobble()[:, 0]) < 0.4
+
+
 @pytest.mark.parametrize(
     "before, after",
     [([1.0, 1.2, 0.9], [0.995, 1.194, 0.896]), ([1.0, 1.2, 0.9], [1.6, 0.5, 0.6]), ([np.nan] * 3, [1.0] * 3)],

@@ -9,6 +9,7 @@ import numpy as np
 
 from tomo_polysplat.fit.host_rays import HostRays
 from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.parallel import run_tasks, split_range
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.settings import Settings
 
@@ -51,12 +52,15 @@ def joined_pixels(values: np.ndarray | HostRays, rows: int, columns: int) -> np.
         return np.asarray(values)
     views, height, width = len(values), values.shape[1] // rows, values.shape[2] // columns
     joined = np.empty((views, height, width), np.float32)
-    at_once = max(1, _AT_ONCE // math.prod(values.shape[1:]))
-    for first in range(0, views, at_once):
-        some = values[first : first + at_once, : height * rows, : width * columns]
+
+    def join(first: int, last: int) -> None:
+        some = values[first:last, : height * rows, : width * columns]
         parts = some.reshape(len(some), height, rows, width, columns)
         good = np.isfinite(parts)
         sums = np.where(good, parts, 0).sum(axis=(2, 4), dtype=np.float64)
         counts = good.sum(axis=(2, 4))
-        joined[first : first + len(some)] = np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
+        joined[first:last] = np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
+
+    at_once = max(1, _AT_ONCE // math.prod(values.shape[1:]))
+    run_tasks(join, split_range(views, -(-views // at_once)))
     return joined

@@ -24,7 +24,7 @@ from tomo_polysplat.nuisances.alignment import Alignment
 from tomo_polysplat.nuisances.move_estimate import shifts_of_views, whole_moves
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.axis import axis_of
-from tomo_polysplat.plan.coarse import coarse_settings
+from tomo_polysplat.plan.coarse import coarse_problem, coarse_settings
 from tomo_polysplat.plan.first_gaussians import first_gaussians
 from tomo_polysplat.plan.first_volume import first_volume
 from tomo_polysplat.plan.means import Means
@@ -54,6 +54,8 @@ _BETTER, _SURELY_BETTER = 0.01, 2.5
 _ROUNDS, _PASSES, _SETTLED = 5, 1.0, 0.02
 # A run of fewer passes is not asked: a fit would be too large a part of it.
 _LEAST_PASSES = 5.0
+# A larger detector is asked by joined pixels, of which at least so many columns are left: moves show to hundredths.
+_COLUMNS = 384
 # A step may be so many times what a fit says. An axis stays if less than this of a step is gained: half acquisitions
 # gained 0.4, and went a pixel astray; whole turns gain 0.9 and more.
 _FARTHEST, _GAINED = 2.0, 0.6
@@ -106,17 +108,20 @@ def realigned(problem: Problem, axis: Answer, means: Means, report: Callable[[fl
         return axis
     report(0.0, "alignment")
     try:
-        moved, misfits = _Realignment(problem, axis, means).moved(_tensors(axis.value))
+        coarse, pixel = _joined(problem)
+        start = _times(_tensors(axis.value), 1 / pixel)
+        moved, misfits = _Realignment(coarse, axis, means).moved(start)
     except Exception as broken:
         # Processes that share the steps may be left behind by one that fails.
         if current_ranks().count > 1:
             raise
         logger.warning("A short fit failed, so the scanner stays where it is: %r", broken)
         return axis
-    moves = {name: value.tolist() for name, value in moved.items() if bool(value.any())}
-    if moves == axis.value:
+    if all(name in start and torch.equal(value, start[name]) for name, value in moved.items()):
         logger.info("Alignment: no more has moved")
         return axis
+    moved = _times(moved, pixel)
+    moves = {name: value.tolist() for name, value in moved.items() if bool(value.any())}
     words, (better, error) = Alignment.told(moves), _improvement(misfits[0], misfits[-1])
     share = f"misfit of held-out rays falls by {better:.1%} (standard error {error:.1%})"
     if not better > max(_BETTER, _SURELY_BETTER * error):
@@ -125,6 +130,21 @@ def realigned(problem: Problem, axis: Answer, means: Means, report: Callable[[fl
     logger.warning("The scanner stood elsewhere: %s. align=False leaves it.", words)
     evidence = {**axis.evidence, "better": better, "better_error": error}
     return Answer(moves, f"{words}; the {share}", Status.ASKED, evidence)
+
+
+def _joined(problem: Problem) -> tuple[Problem, np.ndarray]:
+    """The problem by joined pixels where these are many, and how many columns and rows are joined."""
+    factor = problem.geometry.columns // _COLUMNS
+    if factor < 2:
+        return problem, np.ones(2)
+    coarse, rows = coarse_problem(problem, factor)
+    return coarse, np.array([factor, rows], float)
+
+
+def _times(moves: Mapping[str, torch.Tensor], pixel: np.ndarray) -> dict[str, torch.Tensor]:
+    """Moves in other pixels; angles and what is in per cent stay."""
+    by = {"u": pixel[0], "v": pixel[1], "views": torch.from_numpy(pixel)}
+    return {name: value * by.get(name, 1.0) for name, value in moves.items()}
 
 
 def _improvement(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
