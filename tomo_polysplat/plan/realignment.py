@@ -55,7 +55,7 @@ _ROUNDS, _PASSES, _SETTLED = 5, 1.0, 0.02
 # A run of fewer passes is not asked: a fit would be too large a part of it.
 _LEAST_PASSES = 5.0
 # A larger detector is asked by joined pixels, of which at least so many columns are left: moves show to hundredths.
-_COLUMNS = 384
+_COLUMNS = 256
 # A step may be so many times what a fit says. An axis stays if less than this of a step is gained: half acquisitions
 # gained 0.4, and went a pixel astray; whole turns gain 0.9 and more.
 _FARTHEST, _GAINED = 2.0, 0.6
