@@ -31,10 +31,9 @@ def first_volume(problem: Problem, device: torch.device, settings: Settings) -> 
     volume, how = _made(problem, device, settings)
     if keeps_more_than(MUCH, volume.device):
         # Anew: amid what copies of the rays took it would keep all of that from being given back.
-        on_host = volume.cpu()
-        del volume
+        volume = volume.cpu()
         give_back()
-        volume = on_host.to(device)
+        volume = volume.to(device)
     return volume, how
 
 

@@ -11,6 +11,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from tomo_polysplat.start.levels import mass_level
+
 __all__ = ["coarse", "hardening_of"]
 
 # Means of so many voxels that this many are left along the longest edge.
@@ -48,8 +50,8 @@ def hardening_of(light: np.ndarray, dense: np.ndarray) -> float | None:
     light, dense : (nz, ny, nx) array
         What is `coarse` of its volumes, of rays undone as if it were water, and as if a solid of its density.
     """
-    level = _mass_level(dense)
-    if level is None:
+    level = mass_level(dense)
+    if not level > 0:
         return None
     inside, depth = _piece(dense, level)
     if len(depth) < _DEPTHS * _FEWEST:
@@ -61,15 +63,6 @@ def hardening_of(light: np.ndarray, dense: np.ndarray) -> float | None:
     of_light, of_dense = (_over_depth(volume[inside], place) for volume in (light, dense))
     bent = float((of_dense - of_light).std())
     return float(of_light.std()) / bent if bent > _BENT else None
-
-
-def _mass_level(volume: np.ndarray) -> float | None:
-    """What half of the mass lies below."""
-    ascending = np.sort(volume[volume > 0])
-    if not len(ascending):
-        return None
-    mass = np.cumsum(ascending, dtype=np.float64)
-    return float(ascending[np.searchsorted(mass, 0.5 * mass[-1])])
 
 
 def _piece(volume: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
