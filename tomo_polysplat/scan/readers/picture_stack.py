@@ -11,6 +11,7 @@ import numpy as np
 
 from tomo_polysplat.checks import fail
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup
+from tomo_polysplat.scan.readers.other_makers import what_is_told
 from tomo_polysplat.scan.readers.picture_files import frames_of
 from tomo_polysplat.scan.readers.picture_names import (
     PICTURE_SUFFIXES,
@@ -44,6 +45,7 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     known = stated_beside(written, stated)
     if path.suffix.lower() in PICTURE_SUFFIXES and path.is_file():
         known.setdefault("projections", path)
+    _require_lengths(folder, known)
     files = _sorted_out(folder, known)
     frames = frames_of(files["projections"])
     known |= {name: files[name] for name in ("flats", "darks") if files[name]}
@@ -54,6 +56,20 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
             "degrees="
         )
     return guessed(stated_over(told, known, folder), known)
+
+
+def _require_lengths(folder: Path, known: Mapping[str, Any]) -> None:
+    """Refuse pictures beside the text of a scanner that is not read, until somebody says what it tells."""
+    if "pixel" in known or known.get("beam") == "parallel":
+        return
+    told = what_is_told(folder)
+    if told is not None:
+        raise fail(
+            "path",
+            "the distances and the pixel of the scanner",
+            f"{told[0]}, which is not read",
+            f"pass {told[1]} (or the same in scan.toml), then let 'tomo-polysplat check' tell the sense of the rotation",
+        )
 
 
 def full_turn(views: int) -> Setup:

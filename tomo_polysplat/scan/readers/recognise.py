@@ -21,6 +21,7 @@ from tomo_polysplat.scan.readers import (
 )
 from tomo_polysplat.scan.readers.acquisition import Acquisition
 from tomo_polysplat.scan.readers.files_of_scans import the_one
+from tomo_polysplat.scan.readers.other_makers import what_is_told
 from tomo_polysplat.scan.readers.picture_names import pictures_in
 
 __all__ = ["acquisition_of"]
@@ -60,6 +61,10 @@ def acquisition_of(path: Path, stated: Mapping[str, Any]) -> Acquisition:
             return scans[0][1].read(folder, stated).saying(f"what is read is {folder.name} in {path.name}")
     if picture_stack.recognises(path):
         return picture_stack.read(path, stated)
+    told = what_is_told(path)
+    if told is not None:
+        remedy = f"import the folder of its TIFFs with {told[1]}; ImageJ makes TIFFs of raw pictures (File, Import, Raw)"
+        raise fail("path", "the pictures of a scan", f"{told[0]}, which is not read", remedy)
     kinds = ", ".join(reader.KIND.split(" (")[0] for reader in READERS)
     raise fail(
         "path",
