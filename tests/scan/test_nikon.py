@@ -169,7 +169,9 @@ def test_filters_as_the_scanner_writes_them(folder, material, thickness, filters
 def test_pictures_that_were_binned_or_cut_out_afterwards_are_refused(folder):
     """Half of the pixels in a picture of the same name would make everything half as large, in silence."""
     change(folder, ("DetectorPixelsX=37", "DetectorPixelsX=74"), ("DetectorPixelsY=33", "DetectorPixelsY=66"))
-    with pytest.raises(ValueError, match="pictures of 66 x 74 pixels, as DetectorPixelsY .* got 33 x 37; write"):
+    with pytest.raises(
+        ValueError, match="pictures of 66 x 74 pixels, as DetectorPixelsY .* got 33 x 37; write"
+    ):
         tps.load_scan(folder)
 
 

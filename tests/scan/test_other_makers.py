@@ -73,7 +73,9 @@ def test_the_options_of_the_refusal_make_the_scan(folder):
     output = folder.parent / "scan.h5"
     command = [sys.executable, "-m", "tomo_polysplat.cli.main", "import", str(folder), "-o", str(output)]
     # Where the axis is stands in no text that is published.
-    subprocess.run([*command, *shlex.split(options[1]), "--offset", "2.4", "0"], check=True, capture_output=True)
+    subprocess.run(
+        [*command, *shlex.split(options[1]), "--offset", "2.4", "0"], check=True, capture_output=True
+    )
     scan = tps.load_scan(output)
     require_the_same_volume(scan, marked())
     assert np.isfinite(scan.projections).all()

@@ -157,7 +157,7 @@ def _page(file: Path, number: int) -> Iterator[Any]:
 
 
 def _unreadable(file: Path, error: Exception) -> Exception:
-    remedy = "install imagecodecs" if "imagecodecs" in str(error) else "copy or write the file again"
+    remedy = "pip install imagecodecs" if "imagecodecs" in str(error) else "copy or write the file again"
     return fail("path", "a readable TIFF file", f"{file} ({str(error)[:120]})", remedy)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from tomo_polysplat.checks import fail, require_number
 from tomo_polysplat.physics.filter_text import filters_of
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
+from tomo_polysplat.scan.readers.entries import entries_of
 from tomo_polysplat.scan.readers.files_of_scans import the_one
 from tomo_polysplat.scan.readers.frames import TiffFrames
 from tomo_polysplat.scan.readers.ini_text import IniText
@@ -69,7 +70,7 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
 
 
 def _texts(path: Path) -> list[Path]:
-    files = [path] if path.is_file() else path.iterdir()
+    files = [path] if path.is_file() else entries_of(path)
     return sorted(file for file in files if file.suffix.lower() == ".xtekct" and file.is_file())
 
 
@@ -77,7 +78,7 @@ def _pictures(folder: Path, text: IniText, name: str) -> list[Path]:
     """TIFFs of that name and a number: in the folder, in the one that the text names, or in one called projections."""
     inner = folder / Path(text.text("InputFolderName").replace("\\", "/")).name
     # One of the scan's own name holds the slices, as Inspect-X writes them.
-    within = [place for place in sorted(folder.iterdir()) if has_word(place.name, "projections")]
+    within = [place for place in entries_of(folder) if has_word(place.name, "projections")]
     for place in (folder, inner, *within):
         tiffs = tiffs_in(place) if place.is_dir() else []
         named = [f for f in tiffs if re.fullmatch(rf"{re.escape(name)}_*\d+", f.stem, re.I)]
@@ -147,7 +148,7 @@ def _degrees(text: IniText, folder: Path, numbers: np.ndarray) -> tuple[np.ndarr
 
 
 def _angle_files(folder: Path) -> list[Path]:
-    files = sorted(file for file in folder.iterdir() if file.is_file())
+    files = [file for file in entries_of(folder) if file.is_file()]
     tables = [file for file in files if file.name.lower().endswith("_ctdata.txt")]
     return tables + [file for file in files if file.suffix.lower() == ".ang"]
 

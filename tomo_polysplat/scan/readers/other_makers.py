@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from tomo_polysplat.scan.readers.entries import entries_of
 from tomo_polysplat.scan.readers.text import number_of, text_of
 
 __all__ = ["what_is_told"]
@@ -69,7 +70,7 @@ def what_is_told(path: Path) -> tuple[str, str] | None:
     path : Path
         A folder, or one of its files.
     """
-    inside = sorted(path.iterdir())[:_MOST_FILES] if path.is_dir() else [path]
+    inside = entries_of(path)[:_MOST_FILES] if path.is_dir() else [path]
     endings = {ending for ending, _, _ in _MAKERS.values()}
     for file in (file for file in inside if file.is_file() and file.suffix.lower() in endings):
         if file.stat().st_size > _MOST_BYTES:

@@ -21,6 +21,7 @@ import numpy as np
 from tomo_polysplat.checks import fail, require_number
 from tomo_polysplat.physics.filter_text import filters_of
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
+from tomo_polysplat.scan.readers.entries import entries_of
 from tomo_polysplat.scan.readers.files_of_scans import the_one
 from tomo_polysplat.scan.readers.frames import TiffFrames
 from tomo_polysplat.scan.readers.ini_text import IniText
@@ -85,7 +86,7 @@ def _logs(path: Path) -> list[Path]:
 
 
 def _all_logs(folder: Path) -> list[Path]:
-    files = [file for file in folder.iterdir() if file.is_file()]
+    files = [file for file in entries_of(folder) if file.is_file()]
     return sorted(file for file in files if file.suffix.lower() == ".log" and _is_skyscan(file))
 
 
