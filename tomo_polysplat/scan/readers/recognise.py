@@ -11,6 +11,7 @@ from typing import Any
 from tomo_polysplat.checks import fail
 from tomo_polysplat.scan.readers import (
     cil_nexus,
+    esrf,
     nikon,
     npz_stack,
     nxtomo,
@@ -31,7 +32,7 @@ __all__ = ["acquisition_of"]
 _RECONSTRUCTED = re.compile(r"rec\w*|slices|volume", re.I)
 _MOST_FOLDERS = 100
 # The first one that recognises what it is shown reads it: what any folder of pictures is comes last.
-READERS = (skyscan, nikon, xradia, nxtomo, cil_nexus, rtk, npz_stack, picture_stack)
+READERS = (skyscan, nikon, xradia, nxtomo, cil_nexus, rtk, esrf, npz_stack, picture_stack)
 _REMEDY = (
     "name the folder or the file that the scanner wrote; docs/scanner_files.md tells what is read of each"
 )
@@ -64,7 +65,9 @@ def acquisition_of(path: Path, stated: Mapping[str, Any]) -> Acquisition:
         return picture_stack.read(path, stated)
     told = what_is_told(path)
     if told is not None:
-        remedy = f"import the folder of its TIFFs with {told[1]}; ImageJ makes TIFFs of raw pictures (Import, Raw)"
+        remedy = (
+            f"import the folder of its TIFFs with {told[1]}; ImageJ makes TIFFs of raw pictures (Import, Raw)"
+        )
         raise fail("path", "the pictures of a scan", f"{told[0]}, which is not read", remedy)
     kinds = ", ".join(reader.KIND.split(" (")[0] for reader in READERS)
     raise fail(
