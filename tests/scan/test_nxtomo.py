@@ -77,3 +77,69 @@ def test_an_entry_within_an_entry(path):
         file.create_group("entry1/before_scan")
         file.move("later", "entry1/tomo_entry")
     np.testing.assert_array_equal(tps.load_scan(path).projections, exact.projections)
+
+
+def flipped(path, axes):
+    """The stored pictures exchanged along these axes of (pictures, rows, columns)."""
+    with h5py.File(path, "a") as file:
+        data = file["entry0000/instrument/detector/data"]
+        data[...] = np.flip(data[()], axes)
+
+
+def turn(path, name, axis, degrees=180, kind="rotation"):
+    with h5py.File(path, "a") as file:
+        dataset = file.require_group("entry0000/instrument/detector/transformations").create_dataset(
+            name, data=degrees
+        )
+        dataset.attrs["transformation_type"], dataset.attrs["vector"] = kind, axis
+
+
+@pytest.mark.parametrize(
+    ("axes", "turns"),
+    [
+        # The ESRF's axes: x along the beam, z up. Left and right, top and bottom, both, and a turn by nothing.
+        ((2,), {"rz": (0, 0, 1)}),
+        ((1,), {"ry": (0, 1, 0)}),
+        ((1, 2), {"rz": (0, 0, 1), "ry": (0, 1, 0), "gravity": (0, 0, -1)}),
+        # McStas': z along the beam, y up, which gravity tells.
+        ((2,), {"ry": (0, 1, 0), "gravity": (0, -1, 0)}),
+        ((1,), {"rx": (1, 0, 0), "gravity": (0, -1, 0)}),
+    ],
+)
+def test_flips_that_the_file_tells_of_are_undone(path, axes, turns):
+    flipped(path, axes)
+    for name, axis in turns.items():
+        gravity = name == "gravity"
+        turn(path, name, axis, *((9.8, "gravity") if gravity else ()))
+    turn(path, "none", (0, 1, 0), 0)
+    turn(path, "shift", (0, 0, 1), 180, "translation")
+    if 2 in axes:
+        with h5py.File(path, "a") as file:
+            position = file["entry0000/instrument/detector/x_rotation_axis_pixel_position"]
+            position[()] = -position[()]
+    scan = tps.load_scan(path)
+    assert "exchanged, which is undone" in " | ".join(scan.notes["scanner"]["guessed"])
+    require_the_same_volume(scan, marked())
+
+
+def test_flips_as_older_files_tell_them(path):
+    flipped(path, (1,))
+    with h5py.File(path, "a") as file:
+        file["entry0000/instrument/detector/y_flipped"] = True
+        file["entry0000/instrument/detector/x_flipped"] = False
+    require_the_same_volume(tps.load_scan(path), marked())
+
+
+def test_an_axis_counted_from_the_first_column(path):
+    """Some beamlines write the column itself; with half a field of view the axis may be far from the middle."""
+    exact = tps.load_scan(path)
+    with h5py.File(path, "a") as file:
+        position = file["entry0000/instrument/detector/x_rotation_axis_pixel_position"]
+        position[()] += (37 - 1) / 2
+    scan = tps.load_scan(path)
+    assert "counted from the first" in " | ".join(scan.notes["scanner"]["guessed"])
+    np.testing.assert_allclose(scan.proj_geom["Vectors"], exact.proj_geom["Vectors"], atol=1e-9)
+    with h5py.File(path, "a") as file:
+        file["entry0000/instrument/detector/field_of_view"] = "Half"
+    scan = tps.load_scan(path)
+    assert "counted from the first" not in " | ".join(scan.notes["scanner"]["guessed"])
