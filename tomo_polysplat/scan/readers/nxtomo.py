@@ -114,7 +114,7 @@ def _told(path: Path, entry: h5py.Group) -> Acquisition:
         raise fail(
             "path", "pictures of image_key 0, the projections", f"keys {sorted(set(keys.tolist()))}"[:200]
         )
-    stacks = {key: Hdf5Frames(path, data.name, chosen) for key, chosen in frames.items() if len(chosen)}
+    stacks = {key: Hdf5Frames(data, chosen) for key, chosen in frames.items() if len(chosen)}
     setup, unit, said = _setup(entry, angles[frames[_PROJECTION]], data.shape[2])
     sideways, upside_down = _flips(entry)
     if sideways or upside_down:
