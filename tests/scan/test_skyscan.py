@@ -290,3 +290,10 @@ def test_the_camera_stands_where_its_pixel_tells(folder):
     change(folder, ("Camera Pixel Size (um)", "Camera Pixel"))
     with pytest.raises(ValueError, match="a number as 'Camera to Source"):
         tps.load_scan(folder)
+
+
+def test_a_camera_that_was_offset_is_said_unless_its_pictures_were_put_together(folder):
+    change(folder, ("Image Rotation=0.00000", "Camera Offset=ON"))
+    assert "the camera was offset" in guesses(tps.load_scan(folder))
+    change(folder, ("Camera Offset=ON", "Camera Offset=ON\nNumber Of Horizontal Offset Positions=2"))
+    assert "the camera was offset" not in guesses(tps.load_scan(folder))

@@ -159,7 +159,9 @@ def _setup(log: IniText, numbers: np.ndarray, rows: int) -> tuple[Setup, list[st
             f"the camera's rotation of {tilt:g} degrees is not undone; give roll={tilt:g} or roll={-tilt:g}, or "
             "reconstruct with align=True (--align), which finds it"
         )
-    if "ON" in log.text("Camera Offset").upper():
+    # Of several positions the scanner has put the pictures together.
+    together = log.number("Number Of Horizontal Offset Positions", otherwise=1.0) > 1
+    if "ON" in log.text("Camera Offset").upper() and not together:
         said.append("the camera was offset: is that in the pictures? give offset= if it is not")
     sense, guess = _sense(log)
     degrees = sense * _step(log, numbers) * numbers

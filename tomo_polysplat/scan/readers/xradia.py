@@ -137,7 +137,8 @@ def _exposures(
     light = beside / seconds
     if np.abs(light - 1).max() < _SAME:
         return None, usual, []
-    words = f"pictures of {seconds.min():.4g} to {seconds.max():.4g} s are compared with an open beam of {beside:.4g} s"
+    ends = dict.fromkeys(f"{end:.4g}" for end in (seconds.min(), seconds.max()))
+    words = f"pictures of {' to '.join(ends)} s are compared with an open beam of {beside:.4g} s"
     return light, usual, [words]
 
 
