@@ -121,7 +121,7 @@ def step_in_parts(problem, batch):
     from tomo_polysplat.fit.graph_step import GraphStep
 
     depth, device = problem.scene.box.shape[0], problem.gaussians.position.device
-    part = Part(ALONE, Planes(slice(0, depth), np.arange(depth)), len(problem.gaussians), device)
+    part = Part(ALONE, Planes(slice(0, depth), np.arange(depth)), device)
     made = GraphStep(problem, batch, part)
     assert all(len(graphs) > 1 for graphs in made._graphs.values())
     return made
@@ -136,11 +136,13 @@ def step_in_parts(problem, batch):
         ("fan", True, {"pixel_rays": 2}),
     ],
 )
-@pytest.mark.parametrize("many", [1, 1 << 20])
-def test_a_graph_in_parts_steps_like_autograd(kind, polychromatic, changes, many, monkeypatch):
-    """Also with a part of the views at a time, between each of which ranks would add up."""
-    monkeypatch.setattr(portions, "MANY", many)
-    monkeypatch.setattr(portions, "FEW_VIEWS", 1)
+@pytest.mark.parametrize("kept", [None, False, True])
+def test_a_graph_in_parts_steps_like_autograd(kind, polychromatic, changes, kept, monkeypatch):
+    """Also by portions of the Gaussians, with what is made of them kept or made twice."""
+    if kept is not None:
+        monkeypatch.setattr(portions, "FOOTPRINTS", 8)
+        monkeypatch.setattr(portions, "_WHOLE", 4)
+        monkeypatch.setattr("tomo_polysplat.fit.fused_step._room_to_keep", lambda *_: kept)
     compare_steps(step_in_parts, "cuda", ("cuda", "triton"), kind, polychromatic, **changes)
 
 
