@@ -258,7 +258,7 @@ def test_runs_that_share_memory_step_as_if_alone(every):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("place", ["_of_portion", "_volume_gradients", "_update"])
+@pytest.mark.parametrize("place", ["_of_rays", "_of_volume", "_update"])
 def test_a_gpu_without_room_for_a_second_run_goes_on_with_the_first(place, monkeypatch):
     """Wherever in the recording it ends; torch can then give memory back and record again."""
     from tomo_polysplat.fit.choose_step import NoRoom

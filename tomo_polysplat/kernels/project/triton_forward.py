@@ -184,7 +184,7 @@ def splat(
     largest: torch.Tensor | None = None,
     image: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Image of the footprints in the layout of triton_image, without the factor of the pixel; or ``image`` with it added.
+    """Image of the footprints in the layout of triton_image, without the factor of the pixel; or ``image`` and it.
 
     With ``largest``, a float32 tensor of the largest value that such an image has had, it has the same bits every
     time: what is added is rounded to some 2e-7 of that (`grained`).

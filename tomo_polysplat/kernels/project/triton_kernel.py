@@ -12,7 +12,7 @@ import torch
 from tomo_polysplat.kernels.portions import portions
 from tomo_polysplat.kernels.project.triton_backward import sum_moments
 from tomo_polysplat.kernels.project.triton_forward import splat
-from tomo_polysplat.kernels.project.triton_image import finish_image, lay_out_gradient
+from tomo_polysplat.kernels.project.triton_image import finish_image, lay_out_gradient, spread
 from tomo_polysplat.kernels.project.triton_pull_back import pull_back
 from tomo_polysplat.kernels.project.triton_setup import footprints
 from tomo_polysplat.kernels.triton_maths import require_scene
@@ -55,11 +55,12 @@ def _image(
 ) -> torch.Tensor:
     """Line integrals of a cloud of any size, a portion after the other."""
     position, scale, rotation, weight = scene
-    table, channels, image = views.table(position.device), len(weight), None
+    table, channels = views.table(position.device), len(weight)
+    image = position.new_zeros((len(views), views.rows, views.columns, spread(channels)))
     for some in portions(len(position), len(views)):
         drawn = position[some], scale[some], rotation[some], weight[:, some].contiguous()
         record = footprints(*drawn, views, table, cutoff, skipped)
-        image = splat(record, channels, views, cutoff, image=image)
+        splat(record, channels, views, cutoff, image=image)
         del record
     return finish_image(image, table, channels, views)
 
