@@ -116,14 +116,6 @@ def _told(path: Path, entry: h5py.Group) -> Acquisition:
         )
     stacks = {key: Hdf5Frames(data, chosen) for key, chosen in frames.items() if len(chosen)}
     setup, unit, said = _setup(entry, angles[frames[_PROJECTION]], data.shape[2])
-    sideways, upside_down = _flips(entry)
-    if sideways or upside_down:
-        ways = " and ".join(["left and right"] * sideways + ["top and bottom"] * upside_down)
-        said.append(
-            f"the file says that {ways} are exchanged, which is undone; the axis is that of its pictures"
-        )
-        if sideways:
-            setup = replace(setup, offset=(-setup.offset[0], setup.offset[1]))
     told = Acquisition(
         KIND,
         stacks[_PROJECTION],
@@ -133,13 +125,24 @@ def _told(path: Path, entry: h5py.Group) -> Acquisition:
         flats=stacks.get(_FLAT),
         darks=stacks.get(_DARK),
         exposure=_first(entry, f"{_DETECTOR}/count_time"),
-        top_first=not upside_down,
-        from_detector=sideways,
         other=_others(entry),
     )
     if _DARK not in stacks:
         said.append("no dark pictures: without light a pixel is taken to count 0")
-    return told.saying(*said)
+    return _unflipped(told.saying(*said), entry)
+
+
+def _unflipped(told: Acquisition, entry: h5py.Group) -> Acquisition:
+    """With what the file tells of exchanged sides; the axis is that of the pictures as they are stored."""
+    sideways, upside_down = _flips(entry)
+    setup = told.setup
+    if not (sideways or upside_down) or not isinstance(setup, Setup):
+        return told
+    if sideways:
+        setup = replace(setup, offset=(-setup.offset[0], setup.offset[1]))
+    ways = " and ".join(["left and right"] * sideways + ["top and bottom"] * upside_down)
+    words = f"the file says that {ways} are exchanged, which is undone; the axis is that of its pictures"
+    return replace(told, setup=setup, top_first=not upside_down, from_detector=sideways).saying(words)
 
 
 def _flips(entry: h5py.Group) -> tuple[bool, bool]:
