@@ -15,7 +15,7 @@ from tomo_polysplat.settings import Settings
 
 def scene_of(box, numbers):
     return FitScene(
-        box, None, 1.0, None, None, -0.1, "reference", 3.0, 0.1, False, (0.1, 0.1), False, 1, 0.2,
+        box, None, 1.0, None, None, -0.1, "reference", 0.1, False, (0.1, 0.1), False, 1, 0.2,
         solid_number=numbers,
     )  # fmt: skip
 

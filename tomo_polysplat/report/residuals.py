@@ -17,7 +17,7 @@ from tomo_polysplat.physics.detector_blur import LARGEST_BLUR, blurred
 from tomo_polysplat.physics.filter_map import FilterMap
 from tomo_polysplat.physics.pixel_light import averaged_light
 from tomo_polysplat.physics.scatter import light_around
-from tomo_polysplat.render.renderer import detector_views
+from tomo_polysplat.render.renderer import RAY_CUTOFF, detector_views
 from tomo_polysplat.report.decided import RayPhysics, ray_physics
 from tomo_polysplat.report.held_out import HeldOut
 from tomo_polysplat.report.where import MisfitMap
@@ -34,8 +34,6 @@ __all__ = ["MOST_VIEWS", "Residuals", "residuals_of"]
 
 # Views that are looked at, evenly spread over the scan, and together; and pixels of the map along an edge.
 MOST_VIEWS, _AT_ONCE, _MAP = 180, 4, 192
-# Where a Gaussian's projection ends, in deviations, unless the settings say.
-_CUTOFF = 3.0
 # Rays times energies that are held at once.
 _NUMBERS = 1 << 26
 # A ray this many deviations off is not explained.
@@ -159,7 +157,6 @@ class _Model:
     ) -> None:
         self.views, self.device = views, device
         self.kernel, _ = choose(device)
-        self.cutoff = float(result.settings.get("cutoff", _CUTOFF))
         self.physics: RayPhysics = ray_physics(result.plan)
         parts = {name: np.asarray(part, np.float32) for name, part in result.gaussians.items()}
         density, u = parts["density"], parts["u"]
@@ -190,7 +187,7 @@ class _Model:
         views, parts = self.views.select(some), self.physics.pixel_rays
         fine = views if parts == 1 else views.finer(parts)
         position, scale, rotation, weight = self.gaussians
-        areal, _ = project(position, scale, rotation, weight, fine, kernel=self.kernel, cutoff=self.cutoff)
+        areal, _ = project(position, scale, rotation, weight, fine, kernel=self.kernel, cutoff=RAY_CUTOFF)
         if self.lines is None:
             values = areal[0]
         else:
