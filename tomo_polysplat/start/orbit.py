@@ -14,7 +14,7 @@ __all__ = ["Orbit", "find_orbit"]
 _GAP_RATIO, _GAP_RADIANS = 4.0, np.deg2rad(5.0)
 # Largest sine between the detector's rows and the plane of the orbit, or its columns and the axis. Ramp
 # filtering along rows that stray by more than this leaves visible streaks.
-_TILT = 0.02
+_TILT = 0.7
 # Largest relative deviation of the sources from a circle.
 _ROUND = 0.02
 
