@@ -134,7 +134,9 @@ def _fdk_cpu(
         seen = projections[chunk]
         if level.moved:
             # A copy: what the caller gave may not be written to, of which torch warns.
-            seen = level.values(torch.from_numpy(seen.copy()), chunk, (0, flat.rows), torch.device("cpu")).numpy()
+            seen = level.values(
+                torch.from_numpy(seen.copy()), chunk, (0, flat.rows), torch.device("cpu")
+            ).numpy()
 
         def prepare(a: int, b: int) -> np.ndarray:
             weighted = seen[a - start : b - start] * pixel_weights(flat, orbit, arcs, slice(a, b))
