@@ -132,7 +132,7 @@ def test_arcs_of_other_rows_are_those_at_their_rays_distance_from_the_axis():
     along, farther = row_changes(geometry)
     heights = torch.from_numpy(rows - 0.5 * (geometry.rows - 1))
     offsets = torch.from_numpy(ray_offsets(geometry, orbit))
-    found = arcs_of_rows(offsets, torch.from_numpy(along), torch.from_numpy(farther), heights).numpy()
+    found = arcs_of_rows(offsets, torch.from_numpy(along), torch.from_numpy(farther), rows=heights).numpy()
     expected = np.stack([ray_offsets(geometry, orbit, row=row) for row in rows], axis=1)
     assert np.ptp(expected, axis=1).max() > 1
     low, high = offsets.numpy().min(axis=1)[:, None, None], offsets.numpy().max(axis=1)[:, None, None]

@@ -111,7 +111,7 @@ def weights_on(
     def shares(some: slice) -> torch.Tensor:
         """Arcs over the pixel's width, (views, rows, columns) or (views, 1, columns)."""
         if by_rows:
-            return arcs_of_rows(scales[some], *(change[some] for change in changes), height)
+            return arcs_of_rows(*(part[some] for part in (scales, *changes)), rows=height)
         return scales[some, None]
 
     if geometry.beam == "parallel":

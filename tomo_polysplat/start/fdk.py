@@ -131,15 +131,9 @@ def _fdk_cpu(
     volume = np.zeros(grid.shape, np.float32)
     for start in range(0, geometry.views, _CHUNK):
         chunk = slice(start, min(start + _CHUNK, geometry.views))
-        seen = projections[chunk]
-        if level.moved:
-            # A copy: what the caller gave may not be written to, of which torch warns.
-            seen = level.values(
-                torch.from_numpy(seen.copy()), chunk, (0, flat.rows), torch.device("cpu")
-            ).numpy()
 
         def prepare(a: int, b: int) -> np.ndarray:
-            weighted = seen[a - start : b - start] * pixel_weights(flat, orbit, arcs, slice(a, b))
+            weighted = _seen(projections, level, slice(a, b)) * pixel_weights(flat, orbit, arcs, slice(a, b))
             return filter_rows(weighted, filter_name, before, after)
 
         pixels = (chunk.stop - chunk.start) * flat.rows * flat.columns
@@ -148,3 +142,12 @@ def _fdk_cpu(
         accumulate(volume, np.concatenate(filtered), maps[chunk])
     volume[~slices_seen(geometry, grid, orbit)] = 0.0
     return volume
+
+
+def _seen(projections: np.ndarray, level: Level, views: slice) -> np.ndarray:
+    """What the level detector sees in some views."""
+    if not level.moved:
+        return projections[views]
+    # A copy: what the caller gave may not be written to, of which torch warns.
+    told = torch.from_numpy(projections[views].copy())
+    return level.values(told, views, (0, level.geometry.rows), torch.device("cpu")).numpy()

@@ -72,7 +72,8 @@ def fdk_of_slabs(
         Of a scan that filtered backprojection fits.
     depth : int
     whole : (nz, ny, nx) tensor
-        The same as made in one piece, to rounding; it may lie anywhere.
+        The same as made in one piece, to rounding; it may lie anywhere. A tilted detector that is beside the axis has
+        more rays measured twice in some slabs than in all.
     """
     for wanted, first, last in slabs(grid.shape[0], depth):
         slab = slab_of(grid, first, last)

@@ -91,7 +91,7 @@ def row_changes(geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
 
 def varies(arcs: np.ndarray) -> bool:
     """Whether `ray_arcs` differ from column to column."""
-    return arcs.strides[1] != 0
+    return bool((arcs != arcs[:, :1]).any())
 
 
 def obliquity(geometry: Geometry) -> np.ndarray:
@@ -186,7 +186,7 @@ def _risen(to: np.ndarray, half: np.ndarray) -> np.ndarray:
 
 
 def arcs_of_rows(
-    arcs: torch.Tensor, along: torch.Tensor, farther: torch.Tensor, rows: torch.Tensor
+    arcs: torch.Tensor, along: torch.Tensor, farther: torch.Tensor, *, rows: torch.Tensor
 ) -> torch.Tensor:
     """What `ray_arcs` gives for the middle row, for rows whose pixels are not above and below those of that row.
 
@@ -224,8 +224,8 @@ def pixel_weights(geometry: Geometry, orbit: Orbit, arcs: np.ndarray, views: sli
     along, farther = row_changes(part)
     if (along.any() or farther.any()) and varies(arcs):
         rows = torch.arange(part.rows, dtype=torch.float64) - 0.5 * (part.rows - 1)
-        changes = (torch.from_numpy(change) for change in (along, farther))
-        scale = arcs_of_rows(torch.from_numpy(scale[:, 0]), *changes, rows).numpy()
+        told = (torch.from_numpy(part) for part in (scale[:, 0], along, farther))
+        scale = arcs_of_rows(*told, rows=rows).numpy()
     normal = horizontal_normal(part)
     if part.beam == "parallel":
         scale = np.broadcast_to(scale / obliquity(part)[:, None, None], part.shape)
