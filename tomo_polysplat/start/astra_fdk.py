@@ -97,29 +97,12 @@ def weights_on(
 
     Lengths of rays and their parts towards the axis are polynomials in row and column: no ray is stored.
     """
-    import torch
-
-    def there(values: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(values, np.float32)).to(device)
-
     scale = arcs / np.linalg.norm(geometry.u, axis=1)[:, None]
-    along, farther = row_changes(geometry)
-    by_rows = (along.any() or farther.any()) and varies(arcs)
-    changes = there(along), there(farther)
-    height = there(np.arange(geometry.rows) - 0.5 * (geometry.rows - 1))
-
-    def shares(some: slice) -> torch.Tensor:
-        """Arcs over the pixel's width, (views, rows, columns) or (views, 1, columns)."""
-        if by_rows:
-            return arcs_of_rows(*(part[some] for part in (scales, *changes)), rows=height)
-        return scales[some, None]
-
     if geometry.beam == "parallel":
-        scales = there(scale / obliquity(geometry)[:, None])
-        return shares
-    scales = there(scale)
+        return _shares_on(device, geometry, scale / obliquity(geometry)[:, None])
+    shares = _shares_on(device, geometry, scale)
     # Seen from the pixel in the middle, so that little is lost in float32.
-    rows, columns = (np.arange(count) - 0.5 * (count - 1) for count in (geometry.rows, geometry.columns))
+    rows, columns = _from_middle(geometry.rows), _from_middle(geometry.columns)
     u, v = geometry.u, geometry.v
     ray = geometry.corner - geometry.origin - rows[0] * v - columns[0] * u
     depth = np.abs((horizontal_normal(geometry) * ray).sum(axis=1))
@@ -135,14 +118,40 @@ def weights_on(
         (ray, u),
         (u, v),
     )
-    products = there(np.stack([(a * b).sum(axis=1) for a, b in pairs]))[..., None, None]
-    row, column = height[:, None], there(columns)
-    slanted = bool(farther.any())
+    products = _there(np.stack([(a * b).sum(axis=1) for a, b in pairs]), device)[..., None, None]
+    row, column = _there(rows, device)[:, None], _there(columns, device)
+    _, farther = row_changes(geometry)
+    tilted, change = bool(farther.any()), _there(farther, device)[:, None, None]
 
     def weights(some: slice) -> torch.Tensor:
         rt, vt, ut, rr, vv, uu, rv, ru, uv = products[:, some]
         squared = rr + row * (row * vv + 2 * rv) + column * (column * uu + 2 * ru + 2 * row * uv)
         found = shares(some) * (rt + row * vt + column * ut) * squared.rsqrt()
-        return found / (1 + row * changes[1][some, None, None]) if slanted else found
+        return found / (1 + row * change[some]) if tilted else found
 
     return weights
+
+
+def _shares_on(
+    device: torch.device, geometry: Geometry, scale: np.ndarray
+) -> Callable[[slice], torch.Tensor]:
+    """What gives numbers (views, columns) of the middle row for all rows, (views, rows, columns) or (views, 1, columns)."""
+    scales = _there(scale, device)
+    along, farther = row_changes(geometry)
+    if not ((along.any() or farther.any()) and varies(scale)):
+        return lambda some: scales[some, None]
+    changes, rows = (
+        (_there(along, device), _there(farther, device)),
+        _there(_from_middle(geometry.rows), device),
+    )
+    return lambda some: arcs_of_rows(*(part[some] for part in (scales, *changes)), rows=rows)
+
+
+def _from_middle(count: int) -> np.ndarray:
+    return np.arange(count) - 0.5 * (count - 1)
+
+
+def _there(values: np.ndarray, device: torch.device) -> torch.Tensor:
+    import torch
+
+    return torch.from_numpy(np.ascontiguousarray(values, np.float32)).to(device)
