@@ -135,7 +135,7 @@ def weights_on(
 def _shares_on(
     device: torch.device, geometry: Geometry, scale: np.ndarray
 ) -> Callable[[slice], torch.Tensor]:
-    """What gives numbers (views, columns) of the middle row for all rows, (views, rows, columns) or (views, 1, columns)."""
+    """What gives (views, rows, columns) of some views, or (views, 1, columns), for numbers of the middle row."""
     scales = _there(scale, device)
     along, farther = row_changes(geometry)
     if not ((along.any() or farther.any()) and varies(scale)):
