@@ -101,3 +101,14 @@ def test_one_row_stays_a_row():
     geometry, _ = from_astra(astra.create_proj_geom("cone", 1.3, 0.9, 1, 41, TURN, 200.0, 120.0), GRID)
     rolled = moved_geometry(Scanner(geometry), {"roll": torch.tensor(3.0).double()})
     assert Level(rolled).geometry is rolled
+
+
+@pytest.mark.gpu
+def test_a_gpu_sees_the_same_from_the_host_and_from_itself():
+    level = Level(moved(roll=8.0))
+    values, rows = torch.rand(level.told.shape), (3, level.geometry.rows - 2)
+    expected = level.values(values, slice(None), rows, CPU)
+    for source in (values, values.cuda()):
+        found = level.values(source, slice(None), rows, torch.device("cuda"))
+        assert found.is_cuda
+        torch.testing.assert_close(found.cpu(), expected, rtol=1e-5, atol=1e-6)
