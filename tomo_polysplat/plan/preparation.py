@@ -21,7 +21,7 @@ from tomo_polysplat.plan.calibrated_physics import describe_scatter, with_fitted
 from tomo_polysplat.plan.calibration import Calibration, calibrated
 from tomo_polysplat.plan.checkpoint import Checkpoint
 from tomo_polysplat.plan.decision import When
-from tomo_polysplat.plan.first_volume import first_volume
+from tomo_polysplat.plan.first_volume import FirstVolume, first_volume
 from tomo_polysplat.plan.lab import Lab
 from tomo_polysplat.plan.means import Means
 from tomo_polysplat.plan.model import rays_of, scene_of
@@ -114,6 +114,7 @@ def prepare(
     run_options: RunOptions,
     saved: Checkpoint | None,
     report: Callable[[float, str], Any],
+    made: FirstVolume | None = None,
 ) -> PreparedFit:
     """Decide, seed and set up, or go on from where a checkpoint was.
 
@@ -126,6 +127,8 @@ def prepare(
     saved : Checkpoint or None
     report : callable
         Gets the share done, none, and words.
+    made : FirstVolume or None
+        That of this problem, where it is known.
 
     Raises
     ------
@@ -139,7 +142,7 @@ def prepare(
             scene = scene_of(problem, plan, settings, device)
             return PreparedFit(plan, gaussians, scene, rays_of(problem, plan, settings, device))
         report(0.0, "start volume")
-        start, why = first_volume(problem, device, settings)
+        start, why = made or first_volume(problem, device, settings)
         lab = Lab(
             problem, start, settings, device, run_options.seed, run_options.time_budget, plan, fit_start
         )

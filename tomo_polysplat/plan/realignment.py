@@ -26,17 +26,19 @@ from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.axis import axis_of
 from tomo_polysplat.plan.coarse import coarse_problem, coarse_settings
 from tomo_polysplat.plan.first_gaussians import first_gaussians
-from tomo_polysplat.plan.first_volume import first_volume
+from tomo_polysplat.plan.first_volume import FirstVolume, first_volume
 from tomo_polysplat.plan.means import Means
 from tomo_polysplat.plan.model import rays_of, scene_of
 from tomo_polysplat.plan.order import plan_from_start
+from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.trial import fitted_shortly
 from tomo_polysplat.ranks import current_ranks
 from tomo_polysplat.scan.gauges import effects, view_gauge
 from tomo_polysplat.scan.moved_rays import falls_of
 from tomo_polysplat.scan.moves import Scanner, moved_geometry
+from tomo_polysplat.settings import Settings
 
-__all__ = ["realigned"]
+__all__ = ["Look", "realigned"]
 
 logger = logging.getLogger(__name__)
 
@@ -86,7 +88,29 @@ class _Left:
     held_out: np.ndarray
 
 
-def realigned(problem: Problem, axis: Answer, means: Means, report: Callable[[float, str], Any]) -> Answer:
+@dataclass(frozen=True)
+class Look:
+    """What a fit of a pass came to, by the scanner as it stood.
+
+    Attributes
+    ----------
+    gaussians : Gaussians
+    plan : Plan
+    settings : Settings
+        Of the fit.
+    start : FirstVolume or None
+        Where it is that of the problem itself.
+    """
+
+    gaussians: Gaussians
+    plan: Plan
+    settings: Settings
+    start: FirstVolume | None
+
+
+def realigned(
+    problem: Problem, axis: Answer, means: Means, report: Callable[[float, str], Any]
+) -> tuple[Answer, Look | None]:
     """Where the scanner stood, as a fit of one pass tells it; a few more find it out where it says that it moved.
 
     Parameters
@@ -103,33 +127,38 @@ def realigned(problem: Problem, axis: Answer, means: Means, report: Callable[[fl
     -------
     Answer
         That of the axis, where there is no more to move, or where held-out rays do not confirm it.
+    Look or None
+        The fit by the scanner of the answer, if there was one.
     """
     if (means.settings.passes or math.inf) < _LEAST_PASSES:
-        return axis
+        return axis, None
     report(0.0, "alignment")
     try:
         coarse, pixel = _joined(problem)
         start = _times(_tensors(axis.value), 1 / pixel)
-        moved, misfits = _Realignment(coarse, axis, means).moved(start)
+        fits = _Realignment(coarse, axis, means)
+        moved, misfits = fits.moved(start)
     except Exception as broken:
         # Processes that share the steps may be left behind by one that fails.
         if current_ranks().count > 1:
             raise
         logger.warning("A short fit failed, so the scanner stays where it is: %r", broken)
-        return axis
+        return axis, None
+    first, last = fits.looks
+    first = first if coarse is problem else replace(first, start=None)
     if all(name in start and torch.equal(value, start[name]) for name, value in moved.items()):
         logger.info("Alignment: no more has moved")
-        return axis
+        return axis, first
     moved = _times(moved, pixel)
     moves = {name: value.tolist() for name, value in moved.items() if bool(value.any())}
     words, (better, error) = Alignment.told(moves), _improvement(misfits[0], misfits[-1])
     share = f"misfit of held-out rays falls by {better:.1%} (standard error {error:.1%})"
     if not better > max(_BETTER, _SURELY_BETTER * error):
         logger.info("Alignment: not moved, %s; the %s", words, share)
-        return axis
+        return axis, first
     logger.warning("The scanner stood elsewhere: %s. align=False leaves it.", words)
     evidence = {**axis.evidence, "better": better, "better_error": error}
-    return Answer(moves, f"{words}; the {share}", Status.ASKED, evidence)
+    return Answer(moves, f"{words}; the {share}", Status.ASKED, evidence), last
 
 
 def _joined(problem: Problem) -> tuple[Problem, np.ndarray]:
@@ -170,6 +199,12 @@ class _Realignment:
         self.seen = np.array([found[name].pixels for name in self.names])
         self.gauge = view_gauge(self.scanner).numpy()
         self.settings = replace(coarse_settings(means.settings), passes=_PASSES)
+        self._looks: list[Look] = []
+
+    @property
+    def looks(self) -> tuple[Look, Look]:
+        """The first fit and the last."""
+        return self._looks[0], self._looks[-1]
 
     def moved(self, start: dict[str, torch.Tensor]) -> tuple[dict[str, torch.Tensor], list[np.ndarray]]:
         """Where the scanner stood, and the misfits of held-out rays of fits by it, the first as it is."""
@@ -239,13 +274,15 @@ class _Realignment:
         """A fit by the scanner as it stood."""
         settings, device = self.settings, self.means.device
         # What is told of one start is not kept for another.
-        geometry = moved_geometry(self.scanner, values) if values else self.problem.geometry
-        problem = self.problem.seen_by(geometry)
-        start, _ = first_volume(problem, device, settings)
+        problem = self.problem.seen_by(moved_geometry(self.scanner, values)) if values else self.problem
+        start, how = first_volume(problem, device, settings)
         plan = plan_from_start(start, problem, settings, device)
         scene, rays = scene_of(problem, plan, settings, device), rays_of(problem, plan, settings, device)
         seeds, _ = first_gaussians(start, plan, problem, settings, device)
         outcome = fitted_shortly(seeds, plan, problem, scene, rays, replace(self.means, settings=settings))
+        own = None if values else (start, how)
+        # Those between the first and the last are let go of.
+        self._looks[1:] = [Look(outcome.gaussians, plan, settings, own)]
         return outcome.gaussians, scene, rays
 
 
