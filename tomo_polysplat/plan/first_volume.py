@@ -15,16 +15,13 @@ from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.bridged import bridged_start
 from tomo_polysplat.start.initial import initial_volume_on
 
-__all__ = ["FirstVolume", "first_volume"]
-
-# What `first_volume` gives.
-FirstVolume = tuple[torch.Tensor, str]
+__all__ = ["first_volume"]
 
 # An object of one solid looks too light as long as it is taken for water, and less so each time it is looked at.
 _TIMES = 2
 
 
-def first_volume(problem: Problem, device: torch.device, settings: Settings) -> FirstVolume:
+def first_volume(problem: Problem, device: torch.device, settings: Settings) -> tuple[torch.Tensor, str]:
     """A volume (nz, ny, nx) by classical means, and how it was made.
 
     Under a spectrum it is an attenuation in that of the first material of 1 g/cm3, else one per unit of length; either

@@ -21,7 +21,7 @@ from tomo_polysplat.plan.calibrated_physics import describe_scatter, with_fitted
 from tomo_polysplat.plan.calibration import Calibration, calibrated
 from tomo_polysplat.plan.checkpoint import Checkpoint
 from tomo_polysplat.plan.decision import When
-from tomo_polysplat.plan.first_volume import FirstVolume, first_volume
+from tomo_polysplat.plan.first_volume import first_volume
 from tomo_polysplat.plan.lab import Lab
 from tomo_polysplat.plan.means import Means
 from tomo_polysplat.plan.model import rays_of, scene_of
@@ -30,7 +30,7 @@ from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.short_fit import ShortFit, short_fit
 from tomo_polysplat.settings import Settings, make_settings
 
-__all__ = ["PreparedFit", "RunOptions", "calibrate", "fit_start", "physics", "prepare", "under"]
+__all__ = ["PreparedFit", "RunOptions", "calibrate", "fit_start", "lab_of", "physics", "prepare", "under"]
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def prepare(
     run_options: RunOptions,
     saved: Checkpoint | None,
     report: Callable[[float, str], Any],
-    made: FirstVolume | None = None,
+    lab: Lab | None = None,
 ) -> PreparedFit:
     """Decide, seed and set up, or go on from where a checkpoint was.
 
@@ -127,8 +127,8 @@ def prepare(
     saved : Checkpoint or None
     report : callable
         Gets the share done, none, and words.
-    made : FirstVolume or None
-        That of this problem, where it is known.
+    lab : Lab or None
+        Of this problem, where a look at it has made one.
 
     Raises
     ------
@@ -141,15 +141,14 @@ def prepare(
             plan, gaussians = saved.plan, saved.snapshot.gaussians.to(device)
             scene = scene_of(problem, plan, settings, device)
             return PreparedFit(plan, gaussians, scene, rays_of(problem, plan, settings, device))
-        report(0.0, "start volume")
-        start, why = made or first_volume(problem, device, settings)
-        lab = Lab(
-            problem, start, settings, device, run_options.seed, run_options.time_budget, plan, fit_start
-        )
-        decide_start(lab)
+        if lab is None:
+            report(0.0, "start volume")
+            lab = lab_of(problem, plan, run_options)
+        else:
+            lab.plan.facts = plan.facts | lab.plan.facts
+            plan = lab.plan
         scene, rays = lab.scene, lab.rays
         report(0.0, "seeds")
-        plan.note("start", why)
         decide(lab, When.TRIAL)
         gaussians, facts = lab.seeds(), lab.facts_of_seeds()
     except KeyboardInterrupt:
@@ -158,8 +157,18 @@ def prepare(
     plan.note("alternatives", alternatives(lab))
     if saved is not None:
         saved.plan = plan
-    kept = None if run_options.time_budget is None else start.cpu()
+    kept = None if run_options.time_budget is None else lab.start.cpu()
     return PreparedFit(plan, gaussians, scene, rays, kept)
+
+
+def lab_of(problem: Problem, plan: Plan, run_options: RunOptions) -> Lab:
+    """What a start volume of the problem answers, in the plan, and a lab for all other questions."""
+    settings, device = run_options.settings, run_options.device
+    start, why = first_volume(problem, device, settings)
+    lab = Lab(problem, start, settings, device, run_options.seed, run_options.time_budget, plan, fit_start)
+    decide_start(lab)
+    plan.note("start", why)
+    return lab
 
 
 def fit_start(lab: Lab, settings: Settings, steps: int) -> ShortFit:

@@ -18,22 +18,18 @@ from tomo_polysplat.fit.stopping import Clock, FitState, Stop, StopReason
 from tomo_polysplat.fit.surroundings import cut_out
 from tomo_polysplat.kernels.compile_time import compiled_seconds, working_time
 from tomo_polysplat.model.gaussians import Gaussians
-from tomo_polysplat.plan.alignment import align
 from tomo_polysplat.plan.answer import Answer, Status
-from tomo_polysplat.plan.axis import aligned, find_axis
 from tomo_polysplat.plan.calibration import Calibration
 from tomo_polysplat.plan.checkpoint import Checkpoint
 from tomo_polysplat.plan.decision import When
-from tomo_polysplat.plan.early_light import take_out_early
 from tomo_polysplat.plan.expected import expected, tell
-from tomo_polysplat.plan.first_volume import FirstVolume, first_volume
+from tomo_polysplat.plan.first_volume import first_volume
 from tomo_polysplat.plan.lab import Lab
-from tomo_polysplat.plan.light_told import EARLY_LIGHT
 from tomo_polysplat.plan.never_worse import judge, note_seeds
 from tomo_polysplat.plan.order import ask_between, decide
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.preparation import PreparedFit, RunOptions, calibrate, physics, prepare, under
-from tomo_polysplat.plan.realignment import Look, realigned
+from tomo_polysplat.plan.scanner_as_it_was import STAYS, scanner_as_it_was
 from tomo_polysplat.plan.steady_light import SteadyLight
 
 __all__ = ["Solver"]
@@ -42,8 +38,6 @@ logger = logging.getLogger(__name__)
 
 # Seconds that are kept for what comes after the fit besides the volume, where there is a time budget.
 _FINISHING = 0.03
-# Facts that a run which begins anew does not find again.
-_STAYS = ("alignment", EARLY_LIGHT, "gains", "drift")
 
 
 @dataclass(frozen=True)
@@ -92,12 +86,14 @@ class Solver:
         KeyboardInterrupt
             After Ctrl-C before the fit has begun.
         """
-        told, facts, start = self._looked_at(problem)
+        told, facts, lab = scanner_as_it_was(problem, self.moved, self.run_options, self.saved, self.report)
         problem, plan = physics(told, wanted, self.run_options, self.saved, self.report)
         plan.facts |= facts
-        start = start if problem is told else None
-        prepared = prepare(problem, plan, self.run_options, self.saved, self.report, start)
-        del start
+        # Other physics have another start.
+        lab = lab if problem is told else None
+        prepared = prepare(problem, plan, self.run_options, self.saved, self.report, lab)
+        # A GPU has room for its short fits no longer.
+        del lab
         if self.saved is not None:
             self.saved.share_taken(problem)
         outcome = self._fit(prepared, problem, ask_scatter)
@@ -125,44 +121,13 @@ class Solver:
         prepared.plan.note("returned", "start", f"{words}: the volume is the one that it began from")
         logger.warning("The start volume is returned: %s.", prepared.plan.facts["returned"].why)
 
-    def _looked_at(self, problem: Problem) -> tuple[Problem, dict[str, Answer], FirstVolume | None]:
-        """The problem by the scanner and its light as they were, what the plan tells of that, and the start volume.
-
-        A checkpoint's plan knows it. The volume is there where that look has made it, and nothing was moved.
-        """
-        options = self.run_options
-        problem, facts, look = self._aligned(problem)
-        if self.saved is not None and self.saved.plan is not None:
-            self.saved.share_early(problem, options.device)
-        if look is None:
-            return problem, facts, None
-        light = take_out_early(problem, look, options.settings, options.device)
-        return problem, facts | light, None if light else look.start
-
-    def _aligned(self, problem: Problem) -> tuple[Problem, dict[str, Answer], Look | None]:
-        """The problem by the scanner as it stood, what the plan tells of that, and the fit that told it."""
-        if self.moved is None:
-            return problem, {}, None
-        options, look = self.run_options, None
-        if self.saved is not None and self.saved.plan is not None:
-            found = self.saved.plan.facts["alignment"]
-        elif self.moved == "auto":
-            found = find_axis(problem, options, self.report)
-            if options.time_budget is None:
-                found, look = realigned(problem, found, options, self.report)
-        else:
-            # Names are asked for as they stand: who leaves out "u" does not want the axis moved.
-            axis = find_axis(problem, options, self.report) if self.moved == "usual" else None
-            found = align(problem, self.moved, options, axis, self.report)
-        return aligned(problem, found.value), {"alignment": found}, look
-
     def _anew(
         self, problem: Problem, prepared: PreparedFit, so_far: FitOutcome
     ) -> tuple[Problem, PreparedFit, FitOutcome]:
         """What `solve` gives, under other physics than those that a fit had begun with."""
         found = so_far.restart
         other, plan = under(problem, found)
-        plan.facts |= {name: fact for name, fact in prepared.plan.facts.items() if name in _STAYS}
+        plan.facts |= {name: fact for name, fact in prepared.plan.facts.items() if name in STAYS}
         try:
             anew = prepare(other, plan, self.run_options, self.saved, self.report)
             outcome = self._fit(anew, other, ask_scatter=False)
