@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,7 +31,17 @@ from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.short_fit import ShortFit, short_fit
 from tomo_polysplat.settings import Settings, make_settings
 
-__all__ = ["PreparedFit", "RunOptions", "calibrate", "fit_start", "lab_of", "physics", "prepare", "under"]
+__all__ = [
+    "PreparedFit",
+    "RunOptions",
+    "calibrate",
+    "fit_start",
+    "lab_of",
+    "no_result_yet",
+    "physics",
+    "prepare",
+    "under",
+]
 
 
 @dataclass(frozen=True)
@@ -136,7 +147,7 @@ def prepare(
         After Ctrl-C: there is no result yet.
     """
     settings, device = run_options.settings, run_options.device
-    try:
+    with no_result_yet():
         if saved is not None and saved.snapshot is not None and saved.plan is not None:
             plan, gaussians = saved.plan, saved.snapshot.gaussians.to(device)
             scene = scene_of(problem, plan, settings, device)
@@ -151,8 +162,6 @@ def prepare(
         report(0.0, "seeds")
         decide(lab, When.TRIAL)
         gaussians, facts = lab.seeds(), lab.facts_of_seeds()
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt("interrupted before the fit had begun: there is no result yet") from None
     _tell(plan, problem, facts)
     plan.note("alternatives", alternatives(lab))
     if saved is not None:
@@ -161,11 +170,20 @@ def prepare(
     return PreparedFit(plan, gaussians, scene, rays, kept)
 
 
-def lab_of(problem: Problem, plan: Plan, run_options: RunOptions) -> Lab:
-    """What a start volume of the problem answers, in the plan, and a lab for all other questions."""
-    settings, device = run_options.settings, run_options.device
+@contextmanager
+def no_result_yet() -> Iterator[None]:
+    """Say so after Ctrl-C."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("interrupted before the fit had begun: there is no result yet") from None
+
+
+def lab_of(problem: Problem, plan: Plan, means: Means) -> Lab:
+    """A lab for all questions of a problem, with what its start volume answers in the ``plan``."""
+    settings, device = means.settings, means.device
     start, why = first_volume(problem, device, settings)
-    lab = Lab(problem, start, settings, device, run_options.seed, run_options.time_budget, plan, fit_start)
+    lab = Lab(problem, start, settings, device, means.seed, means.time_budget, plan, fit_start)
     decide_start(lab)
     plan.note("start", why)
     return lab

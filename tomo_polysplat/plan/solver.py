@@ -28,7 +28,15 @@ from tomo_polysplat.plan.lab import Lab
 from tomo_polysplat.plan.never_worse import judge, note_seeds
 from tomo_polysplat.plan.order import ask_between, decide
 from tomo_polysplat.plan.plan import Plan
-from tomo_polysplat.plan.preparation import PreparedFit, RunOptions, calibrate, physics, prepare, under
+from tomo_polysplat.plan.preparation import (
+    PreparedFit,
+    RunOptions,
+    calibrate,
+    no_result_yet,
+    physics,
+    prepare,
+    under,
+)
 from tomo_polysplat.plan.scanner_as_it_was import STAYS, scanner_as_it_was
 from tomo_polysplat.plan.steady_light import SteadyLight
 
@@ -86,7 +94,10 @@ class Solver:
         KeyboardInterrupt
             After Ctrl-C before the fit has begun.
         """
-        told, facts, lab = scanner_as_it_was(problem, self.moved, self.run_options, self.saved, self.report)
+        with no_result_yet():
+            told, facts, lab = scanner_as_it_was(
+                problem, self.moved, self.run_options, self.saved, self.report
+            )
         problem, plan = physics(told, wanted, self.run_options, self.saved, self.report)
         plan.facts |= facts
         # Other physics have another start.
