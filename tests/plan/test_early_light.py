@@ -1,4 +1,4 @@
-"""Gains and drift are taken out before the questions of a run; a steady scanner's run begins as if nobody had looked."""
+"""Gains and drift are taken out before the questions of a run; a steady scan is asked as if nobody had looked."""
 
 from functools import cache
 
