@@ -88,6 +88,7 @@ def test_bone_is_as_dense_as_bone_however_long_it_is_fitted(passes):
         spectrum=beam,
         unit=scan.unit,
         settings={"passes": passes},
+        align=False,
         progress=False,
     )
     inside = ndimage.binary_erosion(scan.truth > 0.98 * scan.truth.max())
