@@ -121,7 +121,7 @@ def step_in_parts(problem, batch):
     from tomo_polysplat.fit.graph_step import GraphStep
 
     depth, device = problem.scene.box.shape[0], problem.gaussians.position.device
-    part = Part(ALONE, Planes(slice(0, depth), np.arange(depth)), len(problem.gaussians), device)
+    part = Part(ALONE, Planes(slice(0, depth), np.arange(depth)), device)
     made = GraphStep(problem, batch, part)
     assert all(len(graphs) > 1 for graphs in made._graphs.values())
     return made
@@ -136,11 +136,13 @@ def step_in_parts(problem, batch):
         ("fan", True, {"pixel_rays": 2}),
     ],
 )
-@pytest.mark.parametrize("many", [1, 1 << 20])
-def test_a_graph_in_parts_steps_like_autograd(kind, polychromatic, changes, many, monkeypatch):
-    """Also with a part of the views at a time, between each of which ranks would add up."""
-    monkeypatch.setattr(portions, "MANY", many)
-    monkeypatch.setattr(portions, "FEW_VIEWS", 1)
+@pytest.mark.parametrize("kept", [None, False, True])
+def test_a_graph_in_parts_steps_like_autograd(kind, polychromatic, changes, kept, monkeypatch):
+    """Also by portions of the Gaussians, with what is made of them kept or made twice."""
+    if kept is not None:
+        monkeypatch.setattr(portions, "FOOTPRINTS", 8)
+        monkeypatch.setattr(portions, "_WHOLE", 4)
+        monkeypatch.setattr("tomo_polysplat.fit.fused_step._room_to_keep", lambda *_: kept)
     compare_steps(step_in_parts, "cuda", ("cuda", "triton"), kind, polychromatic, **changes)
 
 
@@ -256,7 +258,7 @@ def test_runs_that_share_memory_step_as_if_alone(every):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("place", ["_of_portion", "_volume_gradients", "_update"])
+@pytest.mark.parametrize("place", ["_of_rays", "_of_volume", "_update"])
 def test_a_gpu_without_room_for_a_second_run_goes_on_with_the_first(place, monkeypatch):
     """Wherever in the recording it ends; torch can then give memory back and record again."""
     from tomo_polysplat.fit.choose_step import NoRoom
