@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.scan.moves import Scanner
-from tomo_polysplat.scan.slope import slope_at_zero
+from tomo_polysplat.scan.slopes import slope_at_zero
 
 __all__ = ["Effect", "common_offset", "effects", "view_gauge", "without_gauge"]
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import torch
 
 from tomo_polysplat.scan.moves import Scanner
-from tomo_polysplat.scan.slope import slope_at_zero
+from tomo_polysplat.scan.slopes import slope_at_zero
 
 __all__ = ["FALLS", "falls_of", "falls_on"]
 
