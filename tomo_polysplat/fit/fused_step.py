@@ -43,7 +43,7 @@ from tomo_polysplat.kernels.voxelise.triton_setup import box_table, ellipsoids
 from tomo_polysplat.model.gaussians import OF_ALL
 from tomo_polysplat.physics.detector_blur import LARGEST_BLUR
 from tomo_polysplat.physics.transmission import nodes_on
-from tomo_polysplat.render.renderer import VOXEL_CUTOFF
+from tomo_polysplat.render.renderer import RAY_CUTOFF, VOXEL_CUTOFF
 
 __all__ = ["FusedStep"]
 
@@ -303,7 +303,7 @@ class FusedStep:
         )
 
     def _footprints(self, drawn: tuple[_Drawn, torch.Tensor], table: torch.Tensor) -> torch.Tensor:
-        return footprints(*drawn[0], self._views, table, self.scene.cutoff, self._skipped)
+        return footprints(*drawn[0], self._views, table, RAY_CUTOFF, self._skipped)
 
     def _image(self, seen: _Made[torch.Tensor]) -> torch.Tensor:
         """The step's views of all portions."""
@@ -312,9 +312,7 @@ class FusedStep:
             (self._batch, self._views.rows, self._views.columns, spread(channels))
         )
         for number in range(len(self._portions)):
-            rays_forward.splat(
-                seen(number), channels, self._views, self.scene.cutoff, self._largest[0], image
-            )
+            rays_forward.splat(seen(number), channels, self._views, RAY_CUTOFF, self._largest[0], image)
         return image
 
     def _misfit_gradient(
