@@ -68,7 +68,7 @@ def test_room_for_gaussians_is_what_would_not_be_refused(monkeypatch):
         memory.require_room(GPU, **(SCENE | {"gaussians": int(most) + 1}))
     assert memory.room_for_gaussians(GPU, **(all_else | {"voxels": 4096**3})) == 0.0
     # As many bytes fewer as the voxels take more.
-    fewer = 13 * (512**3 - SCENE["voxels"]) / 330
+    fewer = 13 * (512**3 - SCENE["voxels"]) / memory._GAUSSIAN
     assert memory.room_for_gaussians(GPU, **(all_else | {"voxels": 512**3})) == pytest.approx(most - fewer)
     monkeypatch.setattr(memory, "available_memory", lambda: int(5e9))
     # A CPU holds the footprints of all Gaussians, a GPU those of a portion.
@@ -85,14 +85,12 @@ def test_counts_beyond_32_bits_are_counted(monkeypatch):
 
 
 def test_a_step_takes_what_was_measured_on_a_gpu():
-    """On an H100: 330 B a Gaussian, 780 and 12 a voxel by a step; by a second run 250, and a step once more."""
-    count, voxels = 2_760_000, 192**3
-    scene = {"gaussians": count, "views": 6, "pixels": 0, "voxels": voxels}
-    for runs, a_gaussian in ((1, 330 + 780), (2, 330 + 250 + 2 * 780)):
-        taken = a_gaussian * count + runs * 12 * voxels
-        told = memory.step_bytes(GPU, **scene, runs=runs)
-        counted = sum(told.values()) - min(memory._SAMPLES, 27 * 12 * voxels)
-        assert taken <= counted < 1.1 * taken
+    """On an H100: 2.77 GB while a step is made and tried for the first time, besides the Gaussians themselves."""
+    count, voxels = 9_576_542, 400**3
+    taken = 2.77e9 + 56 * count
+    told = memory.step_bytes(GPU, gaussians=count, views=6, pixels=600**2, voxels=voxels)
+    counted = sum(told.values()) - min(memory._SAMPLES, 27 * 12 * voxels)
+    assert taken <= counted < 1.5 * taken
 
 
 def test_a_larger_cloud_never_takes_less(monkeypatch):
@@ -116,7 +114,7 @@ def test_ranks_part_what_gaussians_take(monkeypatch):
         monkeypatch.setattr(memory, "current_ranks", lambda ranks=ranks: Ranks(0, ranks))
         taken[ranks] = [sum(memory.step_bytes(GPU, gaussians=count, **scene).values()) for count in counts]
         assert sorted(taken[ranks]) == taken[ranks]
-    assert all(0.5 * one < two < 1.2 * one for one, two in zip(taken[1], taken[2]))
+    assert all(0.5 * one < two < 1.4 * one for one, two in zip(taken[1], taken[2]))
     assert all(1 / 8 * one < eight < one and eight < two for one, two, eight in zip(*taken.values()))
 
 

@@ -88,3 +88,18 @@ def test_everything_but_the_groups_is_fitted():
     assert set(cloud.parameters()) == {
         *("position", "log_scale", "rotation", "attenuation", "own_material", "shared_material", "blur")
     }
+
+
+@pytest.mark.gpu
+def test_what_is_kept_lies_on_the_host_and_takes_the_place_of_what_was_kept():
+    cloud = gaussians(own=(0.2, 0.4)).to(torch.device("cuda"))
+    cloud.position.requires_grad_()
+    first = cloud.kept(None)
+    with torch.no_grad():
+        cloud.position += 1.0
+    second = cloud.kept(first)
+    assert second is first and not first.position.requires_grad and first.position.device.type == "cpu"
+    for name in cloud.parameters():
+        assert torch.equal(getattr(second, name), getattr(cloud, name).detach().cpu())
+    fewer = cloud.select(torch.tensor([0], device="cuda"))
+    assert len(fewer.kept(second)) == 1

@@ -30,11 +30,12 @@ __all__ = [
 
 logger = logging.getLogger(__name__)
 
-# Bytes a Gaussian takes: for parameters, moments, the best copy and pull; what a step makes of it on its way, with
-# gradients; and its footprint and sums in each view of a step. On a GPU the last two are those of a portion at a time.
-# Of several ranks each has these of its part, and the first one between passes parameters, moments, pull, the best copy
-# and a place in a part of all of them.
-_GAUSSIAN, _PASSING, _FOOTPRINT, _WHOLE = 330, 350, 144, 220
+# Bytes a Gaussian takes: 56 for parameters, 96 for moments, 4 for pull, and 56 for a copy while a step is recorded or
+# Gaussians are sorted anew, or for the best copy on a CPU; what a step makes of it on its way, with gradients; and its
+# footprint and sums in each view of a step. On a GPU the last two are those of a portion at a time.
+# Of several ranks each has these of its part, and the first one between passes parameters, moments, pull and a place in
+# a part of all of them.
+_GAUSSIAN, _PASSING, _FOOTPRINT, _WHOLE = 212, 468, 144, 164
 # Bytes a pixel of a step takes: image and gradient of four channels, projections and their slopes.
 _PIXEL = 48
 # Bytes a voxel takes at once, by torch's own count on 40^3 to 64^3 (tests/fit/test_counted_memory.py): while a start is

@@ -129,11 +129,10 @@ class _Keeper(Run):
         if self.checkpoint is None or self.checkpoint.snapshot is None:
             return
         kept, self.checkpoint.snapshot = self.checkpoint.snapshot, None
-        numbers, gaussians = kept.numbers, self.fitter.gaussians
+        numbers = kept.numbers
         self.fitter.restore(kept)
         self.clock.done, self.clock.begun = numbers["steps"], self.started + numbers["begun"]
-        best = None if kept.best is None else kept.best.to(gaussians.position.device)
-        self.watch.recall(numbers["history"], best)
+        self.watch.recall(numbers["history"], None if kept.best is None else kept.best.kept(None))
         self.outcome.history, stop = numbers["history"], numbers["stop"]
         self.outcome.stop = None if stop is None else Stop(StopReason(stop[0]), stop[1])
         self.outcome.skipped_pairs = numbers["skipped_pairs"]
@@ -243,7 +242,7 @@ def fit(setup: FitSetup, course: Course) -> FitOutcome:
     steps = max(1, math.ceil((settings.passes or 1.0) * views_of_a_pass(rays) / batch))
     outcome = FitOutcome(gaussians)
     passes = settings.passes or 1.0
-    watch: Watch[Gaussians] = Watch(settings.patience or usual_patience(passes))
+    watch: Watch[Gaussians] = Watch(settings.patience or usual_patience(passes), Gaussians.kept)
     # Nobody else holds the fitter, which makes room for another one where a question is answered by that.
     run = _Keeper(
         Fitter(setup, Batches(batch, steps, course.rng)),
@@ -263,7 +262,8 @@ def fit(setup: FitSetup, course: Course) -> FitOutcome:
         logger.warning("Interrupted after %d steps; the best state so far is returned.", clock.done)
         outcome.stop = Stop(StopReason.INTERRUPTED, "interrupted")
     outcome.stop = outcome.stop or _used_up(clock, passes)
-    outcome.gaussians = watch.best or gaussians.copy()
+    # The fitter's, which may have grown, where nothing was kept.
+    outcome.gaussians = (watch.best or run.fitter.gaussians).to(gaussians.position.device)
     return outcome
 
 

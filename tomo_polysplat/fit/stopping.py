@@ -232,10 +232,20 @@ class Watch(Generic[_Fitted]):
     The best state is the one after the pass at which the mean held-out error of that pass and the three before is
     lowest. Where no ray is held out, the misfit of the fitted ones takes its place; a pass that met none of those
     that are says nothing.
+
+    Parameters
+    ----------
+    patience : int
+    keep : callable, optional
+        Makes of what is fitted a copy that later steps leave alone, and may use what it has made before for that.
     """
 
-    def __init__(self, patience: int) -> None:
-        self.patience = patience
+    def __init__(
+        self,
+        patience: int,
+        keep: Callable[[_Fitted, _Fitted | None], _Fitted] = lambda fitted, _: fitted.copy(),
+    ) -> None:
+        self.patience, self._keep = patience, keep
         self.best: _Fitted | None = None
         self.recent: list[float] = []
         self.by_held_out = False
@@ -251,7 +261,9 @@ class Watch(Generic[_Fitted]):
                 )
             return Stop(StopReason.NOT_FINITE, "the fit stopped being finite")
         if self._note(state.loss, state.held_out):
-            self.best = fitted.copy()
+            # None while it is made: whoever interrupts that goes on from what is fitted, which is the best.
+            before, self.best = self.best, None
+            self.best = self._keep(fitted, before)
         if self.by_held_out and self.waited >= self.patience:
             words = f"the held-out rays had not improved for {self.waited} passes"
             return Stop(StopReason.HELD_OUT, words)

@@ -71,6 +71,24 @@ class Gaussians:
         parts = {field.name: getattr(self, field.name) for field in fields(self)}
         return Gaussians(**{name: tensor.detach().to(device, copy=True) for name, tensor in parts.items()})
 
+    def kept(self, before: Gaussians | None) -> Gaussians:
+        """Detached copies of everything on the host, in place of those made ``before`` where there are as many."""
+        if self.position.device.type == "cpu":
+            return self.copy()
+        if before is None or len(before) != len(self):
+            names = [field.name for field in fields(self)]
+            before = Gaussians(
+                **{
+                    name: torch.empty_like(
+                        getattr(self, name), device="cpu", requires_grad=False, pin_memory=True
+                    )
+                    for name in names
+                }
+            )
+        for field in fields(self):
+            getattr(before, field.name).copy_(getattr(self, field.name).detach())
+        return before
+
     def select(self, chosen: torch.Tensor) -> Gaussians:
         """The Gaussians of these (m,) int64 indices, still attached to the graph of gradients."""
         own = {name: tensor.index_select(0, chosen) for name, tensor in self.each().items()}
