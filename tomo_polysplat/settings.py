@@ -46,7 +46,7 @@ _CHOICES = {
     "density_check": ("refuse", "warn"),
     "kernel": ("auto", "triton", "numba", "reference"),
 }
-_SWITCHES = ("gains", "drift", "bowtie")
+_SWITCHES = ("gains", "drift")
 
 
 @dataclass(frozen=True)
@@ -170,9 +170,6 @@ class Settings:
     """Whether each pixel's gain is found and taken out; None: where held-out rays confirm it."""
     drift: bool | None = None
     """Whether each view's light is, likewise."""
-    bowtie: bool | None = None
-    """Whether a filter of aluminium is looked for that is thicker in front of some pixels, where ``filter_map`` tells none
-    and there is no time budget."""
 
     # The misfit.
     loss: str = "huber"

@@ -16,19 +16,19 @@ from tomo_polysplat.settings import Settings
 
 __all__ = ["FilterSums", "filter_sums"]
 
-# Groups of neighbouring views that are summed by themselves; views looked at together, and rays.
-_BLOCKS, _AT_ONCE, _RAYS = 12, 8, 1 << 21
+# Views looked at together, and rays, of which there are as many for each node of the spectrum.
+_AT_ONCE, _RAYS = 8, 1 << 21
 # Residuals beyond so many usual ones of some views, or of what a model is allowed, count as so many.
 _FAR, _LEAST_ERROR = 4.0, 1e-3
 
 
 @dataclass(frozen=True)
 class FilterSums:
-    """Sums by pixel over the fitted rays of groups of views, weighed by inverse variances up to a factor.
+    """Sums by pixel over the fitted rays, weighed by inverse variances up to a factor.
 
     Attributes
     ----------
-    sums : (5, blocks, rows, columns) array
+    sums : (5, rows, columns) array
         Of 1, of the slope of -log(I/I0) by the filter's thickness (1/cm), of its square, of what is measured less the
         model, and of slope times that.
     held_out : (views,) array
@@ -48,9 +48,8 @@ def filter_sums(
     settings: Settings,
     quadrature: Quadrature,
     grams: float,
-    most: int | None = None,
 ) -> FilterSums:
-    """Those of all views, or of so many at most, evenly spread.
+    """Those of all views.
 
     Parameters
     ----------
@@ -62,26 +61,21 @@ def filter_sums(
         Nodes that know the filter's material.
     grams : float
         Its density in g/cm3.
-    most : int, optional
     """
     views, rows, columns = len(rays.views), rays.views.rows, rays.views.columns
-    chosen = np.unique(np.linspace(0, views - 1, min(most or views, views)).astype(int))
-    blocks = min(_BLOCKS, len(chosen))
-    block = (np.arange(len(chosen)) * blocks // len(chosen)).tolist()
-    sums = torch.zeros((5, blocks, rows, columns), dtype=torch.float64, device=rays.target)
-    held_out = torch.full((len(chosen),), torch.nan, dtype=torch.float64, device=rays.target)
+    sums = torch.zeros((5, rows, columns), dtype=torch.float64, device=rays.target)
+    held_out = torch.full((views,), torch.nan, dtype=torch.float64, device=rays.target)
     allowed = max(settings.model_error, _LEAST_ERROR)
     at_once = max(1, min(_AT_ONCE, _RAYS // (rows * columns)))
-    for first in range(0, len(chosen), at_once):
-        some = chosen[first : first + at_once]
+    for first in range(0, views, at_once):
+        some = np.arange(first, min(first + at_once, views))
         seen, measured, fitted, aside = rays.batch(some)
         predicted, _ = scene.projections(gaussians, seen)
         slopes = scene.filter_slopes(gaussians, seen, quadrature) * grams
         left = _clipped(measured - predicted, fitted, allowed)
         parts = torch.stack([torch.ones_like(left), slopes, slopes.square(), left, slopes * left])
-        parts = (parts * fitted.square()).double()
+        sums += (parts * fitted.square()).double().sum(dim=1)
         for k in range(len(some)):
-            sums[:, block[first + k]] += parts[:, k]
             if bool(aside[k].any()):
                 held_out[first + k] = misfit(predicted[k], measured[k], aside[k], settings)
     return FilterSums(sums.cpu().numpy(), held_out.cpu().numpy())

@@ -6,58 +6,28 @@ its gain, or a ring of the object: only how it goes with the slope, from view to
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.optimize import lsq_linear
 
-__all__ = ["FilterLeft", "filter_left"]
+__all__ = ["filter_left"]
 
 # Eigenvalues of scaled equations below this share of the largest tell nothing.
 _RANK = 1e-9
 
 
-@dataclass(frozen=True)
-class FilterLeft:
-    """Coefficients of a filter's shape.
-
-    Attributes
-    ----------
-    step : (shapes,) array
-        By how much they are to change.
-    spread : float
-        Deviation of that filter over the pixels, weighed by how well they tell it.
-    error : float
-        Its standard error, by leaving out one group of views after another (jackknife: Efron 1982).
-    """
-
-    step: np.ndarray
-    spread: float
-    error: float
-
-
-def filter_left(sums: np.ndarray, shapes: np.ndarray, least: np.ndarray) -> FilterLeft:
-    """The step that explains most of what is left, by least squares.
+def filter_left(sums: np.ndarray, shapes: np.ndarray, least: np.ndarray) -> np.ndarray:
+    """(shapes,) step of the coefficients that explains most of what is left, by least squares.
 
     Parameters
     ----------
-    sums : (5, blocks, rows, columns) array
+    sums : (5, rows, columns) array
         See `fit.filter_sums.FilterSums`.
     shapes : (shapes, rows, columns) array
-        A uniform filter is added to them, and not returned: the spectrum's, or the object's density.
+        A uniform filter is added to them, and not returned: it is the spectrum's, or the object's density.
     least : (shapes,) array
         Of each step.
     """
-    whole = sums.sum(axis=1)
-    matrix, right = _equations(whole, shapes)
-    step = _solved(matrix, right, least)
-    spread = _spread(matrix, step)
-    blocks = sums.shape[1]
-    without = []
-    for block in range(blocks):
-        parts = _equations(whole - sums[:, block], shapes)
-        without.append(_spread(parts[0], _solved(*parts, least)))
-    return FilterLeft(step, spread, float(np.sqrt((blocks - 1) * np.var(without))))
+    return _solved(*_equations(sums, shapes), least)
 
 
 def _equations(sums: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -80,10 +50,3 @@ def _solved(matrix: np.ndarray, right: np.ndarray, least: np.ndarray) -> np.ndar
     bounds = np.append(least * size[:-1], -np.inf), np.full(len(size), np.inf)
     found: np.ndarray = lsq_linear(factor, target, bounds, method="bvls").x / size
     return found[:-1]
-
-
-def _spread(matrix: np.ndarray, step: np.ndarray) -> float:
-    """Deviation of a filter over the pixels, weighed by how well they tell it."""
-    total = max(float(matrix[-1, -1]), 1e-30)
-    mean = float(step @ matrix[:-1, -1]) / total
-    return float(np.sqrt(max(float(step @ matrix[:-1, :-1] @ step) / total - mean**2, 0.0)))

@@ -1,4 +1,4 @@
-"""The shape of a bowtie or a heel over a detector, by a few numbers."""
+"""The shape of a filter over a detector, by a few numbers."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-__all__ = ["BOWTIE", "HEEL", "filter_shapes", "filter_thickness"]
+from tomo_polysplat.physics.materials import density
+from tomo_polysplat.units import cm_per
 
-# Powers of the place along columns that no side has more of, and those that one side has: of the place, -1 to 1 over
-# the detector, along its columns (u) and its rows (v).
-BOWTIE, HEEL = ("u2", "u4"), ("u", "v")
-_POWERS = {"u": (1, 0), "u2": (2, 0), "u4": (4, 0), "v": (0, 1)}
+__all__ = ["bowtie_map", "filter_shapes", "filter_thickness"]
+
+# Powers of the place, -1 to 1 over the detector, along its columns (u) and its rows (v).
+_POWERS = {"u": (1, 0), "u2": (2, 0), "v": (0, 1)}
 
 
 def filter_shapes(rows: int, columns: int, names: Sequence[str]) -> np.ndarray:
@@ -33,3 +34,23 @@ def filter_thickness(coefficients: Mapping[str, float], rows: int, columns: int)
     shapes = filter_shapes(rows, columns, names)
     thickness = np.einsum("k,kij->ij", [float(coefficients[name]) for name in names], shapes)
     return np.asarray(thickness - thickness.min())
+
+
+def bowtie_map(
+    coefficients: Mapping[str, float], rows: int, columns: int, unit: str = "cm"
+) -> tuple[str, np.ndarray, float] | None:
+    """The map of a bowtie of aluminium, as `tomo_polysplat.reconstruct` takes it; None of no coefficients.
+
+    Parameters
+    ----------
+    coefficients : mapping
+        In cm, as ``result.plan["bowtie"].value`` has them.
+    rows, columns : int
+        Pixels of the detector.
+    unit : str
+        Of the scan the map is for.
+    """
+    if not coefficients:
+        return None
+    thickness = filter_thickness(coefficients, rows, columns) / cm_per(unit)
+    return "Al", thickness.astype(np.float32), density("Al")

@@ -35,9 +35,7 @@ def filter_slope(areal: torch.Tensor, quadrature: Quadrature, behind: torch.Tens
     taken = torch.tensor(quadrature.filter, dtype=areal.dtype, device=areal.device)
     through = [weight - own * behind for weight, own in zip(log_weights[:, 0], taken)]
     slope = -_mean(torch.stack(through), taken)
-    logs = [
-        log - torch.einsum("k,k...->...", curves, areal) for log, curves in zip(through, attenuation)
-    ]
+    logs = [log - torch.einsum("k,k...->...", curves, areal) for log, curves in zip(through, attenuation)]
     return slope + _mean(torch.stack(logs), taken)
 
 

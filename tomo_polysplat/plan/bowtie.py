@@ -1,36 +1,36 @@
-"""Whether a filter in front of the pixels is thicker for some, and how thick, as a run and two fits by joined pixels tell.
+"""How thick a filter in front of each pixel is, as a fit by joined pixels tells in which it goes along with the object.
 
-The object makes up for most of a bowtie as long as a fit is rough: it becomes too dense at its rim. So what a run has
-left after a while tells no more than that there is one. Its shape is found by a fit in which it goes on with the
-object, from pass to pass.
+An object makes up for most of a bowtie: it becomes too light at its rim. So the misfit of a fit hardly tells whether
+there is one, and what a rough fit leaves tells it no better. Where the filter goes on from pass to pass by what is
+left, the object gives way, and both come to where they are.
 """
 
 from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 
+from tomo_polysplat.checks import fail
 from tomo_polysplat.fit.filter_sums import FilterSums, filter_sums
-from tomo_polysplat.fit.fitter import Fitter, next_views
+from tomo_polysplat.fit.fitter import next_views
 from tomo_polysplat.fit.learning_rates import hurried
 from tomo_polysplat.fit.problem import Problem
-from tomo_polysplat.fit.rays import Rays
-from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.fit.step import EagerStep
+from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.nuisances.bowtie import Bowtie
-from tomo_polysplat.nuisances.bowtie_estimate import FilterLeft, filter_left
+from tomo_polysplat.nuisances.bowtie_estimate import filter_left
 from tomo_polysplat.physics.beer_lambert import projection
 from tomo_polysplat.physics.filter_map import FilterMap
 from tomo_polysplat.physics.filter_shape import filter_shapes, filter_thickness
 from tomo_polysplat.physics.materials import density
-from tomo_polysplat.physics.quadrature import Quadrature, fit_quadrature
-from tomo_polysplat.physics.scatter import add_scatter
+from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.coarse import coarse_problem, coarse_settings
 from tomo_polysplat.plan.first_gaussians import first_gaussians
 from tomo_polysplat.plan.first_volume import first_volume
@@ -38,84 +38,66 @@ from tomo_polysplat.plan.means import Means
 from tomo_polysplat.plan.model import rays_of, scene_of
 from tomo_polysplat.plan.order import plan_from_start
 
-__all__ = ["behind_bowtie", "find_bowtie", "shown_bowtie"]
+__all__ = ["behind_bowtie", "find_bowtie"]
 
 logger = logging.getLogger(__name__)
 
 _MATERIAL = "Al"
 # Nodes of the spectrum hold up to so many cm of it, and no filter is thicker.
-_THICKEST = 4.0
-# Views of a run that are looked at.
-_LOOKED_AT = 48
-# A fit that finds it has at least so many columns, and this share of them as views; its passes, and views of a step.
-_COLUMNS, _VIEWS, _PASSES, _BATCH = 48, 1.25, 12, 4
-# Share of them after which the shape goes along, and by how many times what is left says: the object hides the rest.
-_FROM, _FURTHER = 0.15, 1.5
+_THICKEST = 5.0
+# At least so many columns are left, and this share of them as views; passes of a fit, and views of a step.
+_COLUMNS, _VIEWS, _PASSES, _BATCH = 36, 1.25, 12, 4
+# Shares of the passes between which the filter goes along, and by how many times what is left says: the object hides a
+# part of it. Before, the object is too rough; afterwards it gets used to it.
+_FROM, _UNTIL, _FURTHER = 0.3, 0.8, 1.5
 
 
-def _grams() -> float:
-    return density(_MATERIAL)
+def find_bowtie(problem: Problem, means: Means, report: Callable[[float, str], Any]) -> Answer:
+    """Coefficients in cm of aluminium, as `behind_bowtie` takes them; empty where none is confirmed.
+
+    Parameters
+    ----------
+    problem : Problem
+        Without a filter.
+    means : Means
+    report : callable
+        Gets the share done, none, and words.
+    """
+    report(0.0, "bowtie")
+    search = _Search(_fewer(problem), means)
+    plain, _ = search.fit(moving=False)
+    behind, found = search.fit(moving=True)
+    better, error = _improvement(plain.held_out, behind.held_out)
+    thickest = float(filter_thickness(found, *problem.projections.shape[1:]).max())
+    evidence = {"thickest": thickest, "better": better, "better_error": error}
+    verdict, words = Bowtie.gate(evidence), Bowtie.told({Bowtie.name: found})
+    if verdict.kept:
+        logger.info("Behind %s; %s.", words, verdict.why)
+        return Answer(found, f"{words}; {verdict.why}", Status.ASKED, evidence)
+    logger.warning("filter_map='fit' found no bowtie: %s.", verdict.why)
+    return Answer({}, f"none: {verdict.why}", Status.ASKED, evidence)
 
 
 def behind_bowtie(problem: Problem, found: dict[str, float]) -> Problem:
-    """The problem with a filter of these coefficients, in cm (`physics.filter_shape`); itself where there are none."""
+    """The problem behind a filter of these coefficients in cm (`physics.filter_shape`); itself where there are none."""
     if not found:
         return problem
-    return replace_filter(problem, filter_thickness(found, *problem.projections.shape[1:]))
+    return _behind(problem, filter_thickness(found, *problem.projections.shape[1:]))
 
 
-def replace_filter(problem: Problem, thickness: np.ndarray, reach: float = 0.0) -> Problem:
+def _behind(problem: Problem, thickness: np.ndarray, reach: float = 0.0) -> Problem:
     """The problem behind so many cm of aluminium, (rows, columns)."""
-    areal = np.ascontiguousarray(thickness * _grams(), np.float32)
-    return problem.behind(FilterMap(_MATERIAL, areal, _grams(), reach * _grams()))
-
-
-def shown_bowtie(problem: Problem, fitter: Fitter) -> dict[str, float] | None:
-    """What a run under way leaves of the rays: ``spread`` and ``error``, in cm; None where its nodes are but one."""
-    scene = fitter.scene
-    if scene.quadrature is None or problem.spectrum is None:
-        return None
-    reach = (_MATERIAL, 0.0, 0.1 * _grams())
-    of_run = scene.quadrature
-    curves = len(of_run.attenuation)
-    nodes = fit_quadrature(problem.spectrum, problem.materials, of_run.max_path, curves=curves, behind=reach)
-    nodes = add_scatter(nodes, problem.scatter_level(fitter.rays.target))
-    rays, settings = fitter.rays, fitter.settings
-    sums = filter_sums(fitter.gaussians, scene, rays, settings, nodes, _grams(), _LOOKED_AT)
-    names = _names(problem)
-    left = filter_left(sums.sums, filter_shapes(rays.views.rows, rays.views.columns, names), _least(names, {}))
-    logger.info("A bowtie as the run has it: %s, spread %.3f (%.3f)", dict(zip(names, left.step)), left.spread, left.error)
-    return {"spread": left.spread, "error": left.error}
-
-
-def find_bowtie(problem: Problem, means: Means) -> tuple[dict[str, float], dict[str, float]]:
-    """Coefficients of a filter, and by how much, ``better`` and ``better_error``, held-out rays fit better with it."""
-    search = _Search(_fewer(problem), means)
-    plain, _ = search.fit(moving=False)
-    found, coefficients = search.fit(moving=True)
-    better, error = _improvement(plain.held_out, found.held_out)
-    evidence = {"better": better, "better_error": error}
-    logger.info("A bowtie by a fit of joined pixels: %s, %s", coefficients, evidence)
-    return {name: value for name, value in coefficients.items() if value}, evidence
-
-
-def _names(problem: Problem) -> tuple[str, ...]:
-    return ("u2", "u4", "u") if problem.projections.shape[1] == 1 else ("u2", "u4", "u", "v")
-
-
-def _least(names: tuple[str, ...], at: dict[str, float]) -> np.ndarray:
-    """Of a step of each from where it is: a bowtie is not thicker in the middle."""
-    return np.array([Bowtie.parameters[name].least - at.get(name, 0.0) for name in names])
+    areal = np.ascontiguousarray(thickness * density(_MATERIAL), np.float32)
+    return problem.behind(FilterMap(_MATERIAL, areal, density(_MATERIAL), reach * density(_MATERIAL)))
 
 
 def _fewer(problem: Problem) -> Problem:
     """The problem by joined pixels, and by some of its views."""
     coarse, _ = coarse_problem(problem, max(1, problem.geometry.columns // _COLUMNS))
-    views = len(coarse.projections)
-    every = max(1, int(views / (_VIEWS * coarse.geometry.columns)))
+    every = max(1, int(coarse.geometry.views / (_VIEWS * coarse.geometry.columns)))
     if every == 1:
         return coarse
-    some = np.arange(0, views, every)
+    some = np.arange(0, coarse.geometry.views, every)
     return replace(coarse, projections=coarse.projections[some], geometry=coarse.geometry.select(some))
 
 
@@ -124,7 +106,7 @@ def _improvement(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
     both = np.isfinite(before) & np.isfinite(after)
     fall, mean = (before - after)[both], float(before[both].mean()) if both.any() else 0.0
     if not mean > 0 or len(fall) < 2:
-        return 0.0, math.inf
+        return -math.inf, math.inf
     return float(fall.mean()) / mean, float(fall.std(ddof=1)) / math.sqrt(len(fall)) / mean
 
 
@@ -132,62 +114,61 @@ class _Search:
     """Fits of a scan whose pixels may have a filter."""
 
     def __init__(self, problem: Problem, means: Means) -> None:
-        self.names, self.shape = _names(problem), problem.projections.shape[1:]
-        self.shapes = filter_shapes(*self.shape, self.names)
-        device = means.device
-        self.settings = replace(coarse_settings(means.settings), passes=float(_PASSES))
-        self.seed = means.seed
-        problem = replace_filter(problem, np.zeros(self.shape), _THICKEST)
-        start, _ = first_volume(problem, device, self.settings)
-        plan = plan_from_start(start, problem, self.settings, device)
-        self.scene = scene_of(problem, plan, self.settings, device)
-        self.rays = rays_of(problem, plan, self.settings, device)
-        self.seeds, _ = first_gaussians(start, plan, problem, self.settings, device)
-        self.spacing, self.adapted = plan.spacing * problem.voxel, plan.adapted(self.settings)
+        self.names, self.shape = tuple(Bowtie.parameters), problem.projections.shape[1:]
+        self.shapes, self.grams = filter_shapes(*self.shape, self.names), density(_MATERIAL)
+        settings = replace(coarse_settings(means.settings), passes=float(_PASSES))
+        problem, device = _behind(problem, np.zeros(self.shape), _THICKEST), means.device
+        start, _ = first_volume(problem, device, settings)
+        plan = plan_from_start(start, problem, settings, device)
+        self.scene = scene_of(problem, plan, settings, device)
+        self.rays = rays_of(problem, plan, settings, device)
+        if self.scene.quadrature is None:
+            raise fail("filter_map", "a scan whose rays are hardened beside 'fit'", "one of thin rays")
+        self.seeds, _ = first_gaussians(start, plan, problem, settings, device)
+        self.spacing, self.seed = plan.spacing * problem.voxel, means.seed
+        self.batch = min(_BATCH, len(self.rays.views))
+        self.steps_of_a_pass = max(1, round(len(self.rays.views) / self.batch))
+        self.settings = hurried(plan.adapted(settings), _PASSES * self.steps_of_a_pass)
 
     def fit(self, *, moving: bool) -> tuple[FilterSums, dict[str, float]]:
-        """What a fit leaves, and the coefficients with which it ends; they go along where they are ``moving``."""
-        scene, rays = self.scene, self.rays
+        """What a fit leaves, and the coefficients with which it ends, which go along where they are ``moving``."""
         at = dict.fromkeys(self.names, 0.0)
         self._put(at)
         gaussians = self.seeds.copy()
-        rng, views, order = np.random.default_rng(self.seed), len(rays.views), np.empty(0, int)
-        batch = min(_BATCH, views)
-        of_a_pass = max(1, round(views / batch))
-        settings = hurried(self.adapted, _PASSES * of_a_pass)
-        step = EagerStep(FitSetup(gaussians, self.spacing, rays, scene, settings))
-        for number in range(_PASSES * of_a_pass):
-            chosen, order = next_views(order, batch, views, rng)
-            step(chosen, number / (_PASSES * of_a_pass))
-            if (number + 1) % of_a_pass == 0:
-                with torch.no_grad():
-                    scene.keep_within(gaussians)
-                if moving and number >= _FROM * _PASSES * of_a_pass:
-                    at = self._moved(at, self._left(gaussians, at))
-                    self._put(at)
+        step = EagerStep(FitSetup(gaussians, self.spacing, self.rays, self.scene, self.settings))
+        rng, order = np.random.default_rng(self.seed), np.empty(0, int)
+        for made in range(1, _PASSES + 1):
+            for number in range(self.steps_of_a_pass):
+                chosen, order = next_views(order, self.batch, len(self.rays.views), rng)
+                step(chosen, (made - 1 + number / self.steps_of_a_pass) / _PASSES)
+            with torch.no_grad():
+                self.scene.keep_within(gaussians)
+            if moving and _FROM <= made / _PASSES <= _UNTIL:
+                at = self._moved(at, self._sums(gaussians))
+                self._put(at)
         return self._sums(gaussians), at
 
-    def _sums(self, gaussians: Any) -> FilterSums:
+    def _sums(self, gaussians: Gaussians) -> FilterSums:
         assert self.scene.quadrature is not None
-        return filter_sums(gaussians, self.scene, self.rays, self.settings, self.scene.quadrature, _grams())
+        nodes = self.scene.quadrature
+        return filter_sums(gaussians, self.scene, self.rays, self.settings, nodes, self.grams)
 
-    def _left(self, gaussians: Any, at: dict[str, float]) -> FilterLeft:
-        return filter_left(self._sums(gaussians).sums, self.shapes, _least(self.names, at))
-
-    def _moved(self, at: dict[str, float], left: FilterLeft) -> dict[str, float]:
+    def _moved(self, at: dict[str, float], left: FilterSums) -> dict[str, float]:
         """The coefficients after a step, within their ranges."""
-        moved = {}
-        for name, by in zip(self.names, left.step):
-            ends = Bowtie.parameters[name]
-            moved[name] = float(np.clip(at[name] + _FURTHER * by, ends.least, ends.most))
-        logger.debug("bowtie %s", moved)
-        return moved
+        ends = [Bowtie.parameters[name] for name in self.names]
+        least = np.array([end.least - at[name] for end, name in zip(ends, self.names)])
+        steps = filter_left(left.sums, self.shapes, least)
+        return {
+            name: float(np.clip(at[name] + _FURTHER * by, end.least, end.most))
+            for name, by, end in zip(self.names, steps, ends)
+        }
 
     def _put(self, at: dict[str, float]) -> None:
-        """Put a filter in front of the pixels of the scene."""
+        """Put a filter in front of the pixels of the scene, which its steps read."""
         scene = self.scene
-        if scene.behind is None or scene.quadrature is None or scene.quadrature.filter is None:
-            return
-        areal = _grams() * np.minimum(filter_thickness(at, *self.shape), _THICKEST)
+        assert (
+            scene.behind is not None and scene.quadrature is not None and scene.quadrature.filter is not None
+        )
+        areal = self.grams * np.minimum(filter_thickness(at, *self.shape), _THICKEST)
         alone = projection(areal[None], scene.quadrature.log_weights, scene.quadrature.filter[None])
         scene.behind.copy_(torch.from_numpy(np.stack([areal, alone]).astype(np.float32)))

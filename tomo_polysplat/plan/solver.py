@@ -21,6 +21,7 @@ from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.plan.alignment import align
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.axis import aligned, find_axis
+from tomo_polysplat.plan.bowtie import behind_bowtie, find_bowtie
 from tomo_polysplat.plan.calibration import Calibration
 from tomo_polysplat.plan.checkpoint import Checkpoint
 from tomo_polysplat.plan.decision import When
@@ -41,7 +42,7 @@ logger = logging.getLogger(__name__)
 # Seconds that are kept for what comes after the fit besides the volume, where there is a time budget.
 _FINISHING = 0.03
 # Facts that a run which begins anew does not find again.
-_STAYS = ("alignment", "gains", "drift")
+_STAYS = ("alignment", "bowtie", "gains", "drift")
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,8 @@ class Solver:
         Which moves of the scanner the rays are asked about (`plan.alignment`).
     report : callable
         Gets the share done, and words.
+    bowtie : bool
+        Whether the rays are asked about a bowtie filter (`plan.bowtie`).
     compiled : float
         Seconds that this process had compiled for before.
     """
@@ -70,6 +73,7 @@ class Solver:
     flipped: bool
     report: Callable[[float, str], Any]
     moved: str | Sequence[str] | None = None
+    bowtie: bool = False
     compiled: float = field(default_factory=compiled_seconds)
 
     def solve(
@@ -91,8 +95,9 @@ class Solver:
             After Ctrl-C before the fit has begun.
         """
         problem, alignment = self._aligned(problem)
+        problem, filters = self._filtered(problem)
         problem, plan = physics(problem, wanted, self.run_options, self.saved, self.report)
-        plan.facts |= alignment
+        plan.facts |= alignment | filters
         prepared = prepare(problem, plan, self.run_options, self.saved, self.report)
         if self.saved is not None:
             self.saved.share_taken(problem)
@@ -137,6 +142,16 @@ class Solver:
             axis = find_axis(problem, options, self.report) if self.moved == "usual" else None
             found = align(problem, self.moved, options, axis, self.report)
         return aligned(problem, found.value), {"alignment": found}
+
+    def _filtered(self, problem: Problem) -> tuple[Problem, dict[str, Answer]]:
+        """The problem behind the bowtie that the rays tell, and the plan's word of it, which a checkpoint knows."""
+        if not self.bowtie:
+            return problem, {}
+        if self.saved is not None and self.saved.plan is not None:
+            found = self.saved.plan.facts["bowtie"]
+        else:
+            found = find_bowtie(problem, self.run_options, self.report)
+        return behind_bowtie(problem, found.value), {"bowtie": found}
 
     def _anew(
         self, problem: Problem, prepared: PreparedFit, so_far: FitOutcome
