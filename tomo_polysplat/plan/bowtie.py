@@ -28,7 +28,7 @@ from tomo_polysplat.nuisances.bowtie import Bowtie
 from tomo_polysplat.nuisances.bowtie_estimate import filter_left
 from tomo_polysplat.physics.beer_lambert import projection
 from tomo_polysplat.physics.filter_map import FilterMap
-from tomo_polysplat.physics.filter_shape import filter_shapes, filter_thickness
+from tomo_polysplat.physics.filter_shape import bowtie_map, filter_shapes, filter_thickness
 from tomo_polysplat.physics.materials import density
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.coarse import coarse_problem, coarse_settings
@@ -42,7 +42,6 @@ __all__ = ["behind_bowtie", "find_bowtie"]
 
 logger = logging.getLogger(__name__)
 
-_MATERIAL = "Al"
 # Nodes of the spectrum hold up to so many cm of it, and no filter is thicker.
 _THICKEST = 5.0
 # At least so many columns are left, and this share of them as views; passes of a fit, and views of a step.
@@ -80,15 +79,9 @@ def find_bowtie(problem: Problem, means: Means, report: Callable[[float, str], A
 
 def behind_bowtie(problem: Problem, found: dict[str, float]) -> Problem:
     """The problem behind a filter of these coefficients in cm (`physics.filter_shape`); itself where there are none."""
-    if not found:
-        return problem
-    return _behind(problem, filter_thickness(found, *problem.projections.shape[1:]))
-
-
-def _behind(problem: Problem, thickness: np.ndarray, reach: float = 0.0) -> Problem:
-    """The problem behind so many cm of aluminium, (rows, columns)."""
-    areal = np.ascontiguousarray(thickness * density(_MATERIAL), np.float32)
-    return problem.behind(FilterMap(_MATERIAL, areal, density(_MATERIAL), reach * density(_MATERIAL)))
+    rows, columns = problem.projections.shape[1:]
+    told = bowtie_map(found, rows, columns)
+    return problem if told is None else problem.behind(FilterMap.of(told, "cm", rows, columns))
 
 
 def _fewer(problem: Problem) -> Problem:
@@ -114,10 +107,12 @@ class _Search:
     """Fits of a scan whose pixels may have a filter."""
 
     def __init__(self, problem: Problem, means: Means) -> None:
-        self.names, self.shape = tuple(Bowtie.parameters), problem.projections.shape[1:]
-        self.shapes, self.grams = filter_shapes(*self.shape, self.names), density(_MATERIAL)
+        rows, columns = problem.projections.shape[1:]
+        self.names, self.shape = tuple(Bowtie.parameters), (rows, columns)
+        self.shapes, self.grams = filter_shapes(rows, columns, self.names), density("Al")
         settings = replace(coarse_settings(means.settings), passes=float(_PASSES))
-        problem, device = _behind(problem, np.zeros(self.shape), _THICKEST), means.device
+        nothing, device = np.zeros(self.shape, np.float32), means.device
+        problem = problem.behind(FilterMap("Al", nothing, self.grams, _THICKEST * self.grams))
         start, _ = first_volume(problem, device, settings)
         plan = plan_from_start(start, problem, settings, device)
         self.scene = scene_of(problem, plan, settings, device)
