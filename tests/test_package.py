@@ -72,17 +72,8 @@ def part_of(path, folder, prefix):
 
 
 def imported_parts(path):
-    """Parts of the package that a file imports anywhere in it, except for type checking."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    typing_only = {
-        child
-        for node in ast.walk(tree)
-        if isinstance(node, ast.If) and ast.unparse(node.test) in ("TYPE_CHECKING", "typing.TYPE_CHECKING")
-        for child in ast.walk(node)
-    }
-    for node in ast.walk(tree):
-        if node in typing_only:
-            continue
+    """Parts of the package that a file imports anywhere in it, for type checking as well."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative imports hide where they lead"
             names = [f"{node.module}.{alias.name}" for alias in node.names]
@@ -134,16 +125,31 @@ def imported_modules(path, known):
             yield from (alias.name for alias in node.names)
 
 
+def module_of(path):
+    if PACKAGE not in path.parents:
+        path = PACKAGE / "plugins" / path.relative_to(ROOT / "plugins")
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
 def test_no_modules_import_each_other():
-    """But for results, which can show themselves to what knows what a result is."""
-    known = {
-        ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
-        for path in PACKAGE.rglob("*.py")
-        if path.relative_to(PACKAGE).parts[0] not in ("result", "report", "quality")
-    }
+    """Neither by way of others, nor within functions, nor for type checking."""
+    known = {module_of(path): path for _, path in [*sources(), ("", PACKAGE / "__init__.py")]}
     graph = {name: {*imported_modules(path, known)} & (known.keys() - {name}) for name, path in known.items()}
     assert sum(map(len, graph.values())) > 500, "the search for imports found next to nothing"
     graphlib.TopologicalSorter(graph).prepare()
+
+
+def test_what_a_result_holds_knows_nothing_of_what_shows_or_judges_it():
+    known = {module_of(path): path for _, path in sources()}
+    reached, new = set(), {"tomo_polysplat.result.data"}
+    while new:
+        reached |= new
+        new = {
+            other for name in new for other in imported_modules(known[name], known)
+        } & known.keys() - reached
+    assert "tomo_polysplat.scan.geometry" in reached
+    parts = {name.split(".")[1] for name in reached}
+    assert not parts & {"report", "quality", "viewer", "reconstruction", "cli"}
 
 
 def test_basics_depend_on_basics_only():

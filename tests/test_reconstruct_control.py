@@ -115,8 +115,8 @@ def test_a_bar_is_drawn_only_when_asked_for(capfd):
     reconstruct(fan(), progress=False)
     reconstruct(fan(), progress=None)  # no terminal here
     assert capfd.readouterr().err == ""
-    # Longer than the tenth of a second that lies between two drawings at least.
-    reconstruct(fan(), progress=True, settings={"passes": 20.0, "views_per_step": 2})
+    # A pass takes longer than the tenth of a second that lies between two drawings at least.
+    reconstruct(fan(), progress=True, settings={"passes": 4.0, "views_per_step": 1})
     assert "held-out error" in capfd.readouterr().err
 
 
@@ -194,7 +194,7 @@ def test_a_volume_that_takes_the_budget_leaves_half_of_it_to_the_fit(monkeypatch
 def test_what_a_volume_takes_is_told_by_some_of_its_slices(compiling):
     """With a clock that a volume moves by five seconds and each of its slices by one more."""
     box, now, first = VoxelBox(np.zeros(3), np.ones(3), (17, 4, 5)), [0.0], [compiling]
-    scene = FitScene(box, None, 1.0, None, None, 0.0, "reference", 3.0, 0.1, False, (0.1, 0.1), False, 1, 0.2)
+    scene = FitScene(box, None, 1.0, None, None, 0.0, "reference", 0.1, False, (0.1, 0.1), False, 1, 0.2)
 
     def basis(self, gaussians):
         now[0] += 5 + self.box.shape[0] + (first.pop() if first else 0.0)

@@ -14,10 +14,10 @@ SPECTRUM = tps.Spectrum.from_tube(90, filters={"Al": 0.1})
 def core_error(core, seed=0, **settings):
     """Relative error of the mean inside a disc of some matter in one of water, 6 cm wide."""
     projections, proj_geom, vol_geom = disc(core, SPECTRUM, half=3.0)
+    # Where the scanner stood is asked in other files.
     settings = {"passes": 10.0, "views_per_step": 5} | settings
-    result = tps.reconstruct(
-        projections, proj_geom, vol_geom, spectrum=SPECTRUM, unit="cm", settings=settings, seed=seed
-    )
+    options = {"spectrum": SPECTRUM, "unit": "cm", "align": False, "settings": settings, "seed": seed}
+    result = tps.reconstruct(projections, proj_geom, vol_geom, **options)
     y, x = np.mgrid[:45, :45] - 22
     true = density(core) * mass_attenuation(core, [result.energy_kev])[0]
     return float(result.volume[np.hypot(x, y) < 4].mean()) / true - 1

@@ -10,6 +10,7 @@ import sys
 import threading
 import warnings
 from contextlib import nullcontext
+from functools import cache
 
 import numba
 import numpy as np
@@ -29,6 +30,12 @@ def digest(seed=0):
     return hashlib.sha256(reconstruct(fan(), seed=seed).volume.tobytes()).hexdigest()
 
 
+@cache
+def alone(seed=0):
+    """That of this process, which no child asks for: a fork would inherit the answer."""
+    return digest(seed)
+
+
 def pinned():
     """On one core of those there are, where the system lets a process choose."""
     if hasattr(os, "sched_setaffinity"):
@@ -44,12 +51,12 @@ def in_processes(method, seeds, begin=None):
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="this system cannot fork")
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_forked_processes_side_by_side_give_what_one_gives_alone():
-    alone, before = [digest(seed) for seed in (0, 1)], torch.get_num_threads()
+    expected, before = [alone(seed) for seed in (0, 1)], torch.get_num_threads()
     try:
         # Threads of torch and of the kernels have run in this process: a child has none of them.
         torch.set_num_threads(max(2, before))
         torch.ones(600, 600) @ torch.ones(600, 600)
-        assert in_processes("fork", [0, 1]) == alone and alone[0] != alone[1]
+        assert in_processes("fork", [0, 1]) == expected and expected[0] != expected[1]
     finally:
         torch.set_num_threads(before)
 
@@ -82,7 +89,7 @@ def _use(result, scan, folder):
 
 
 def test_a_spawned_process_on_one_core_gives_the_same():
-    assert in_processes("spawn", [0], pinned) == [digest()]
+    assert in_processes("spawn", [0], pinned) == [alone()]
 
 
 # From few views the start is made by SIRT, from more by filtered backprojection.
@@ -117,22 +124,22 @@ def test_the_same_bits_for_any_number_of_threads(name, monkeypatch):
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_a_fork_within_a_solve_can_solve_itself():
     """As a callback may do; the parent's solve goes on."""
-    alone, answers = digest(), []
+    answers = []
 
     def fork(state):
         if not answers:
             answers.extend(in_processes("fork", [0]))
 
     result = reconstruct(fan(), callbacks=[fork])
-    assert answers == [alone]
-    assert hashlib.sha256(result.volume.tobytes()).hexdigest() == alone
+    assert answers == [alone()]
+    assert hashlib.sha256(result.volume.tobytes()).hexdigest() == alone()
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_a_lock_held_while_forking_does_not_hang_the_child():
-    alone = digest()
+    expected = alone()
     with device._borrowed.lock:
-        assert in_processes("fork", [0]) == [alone]
+        assert in_processes("fork", [0]) == [expected]
 
 
 def surroundings():
@@ -206,23 +213,23 @@ def test_a_solve_does_not_know_what_was_solved_before():
     ids=["no gradients", "inference", "autocast", "NumPy raises", "another device"],
 )
 def test_modes_of_the_caller_do_not_matter(mode):
-    alone = digest()
+    expected = alone()
     with mode():
-        assert digest() == alone
+        assert digest() == expected
 
 
 def test_a_default_type_of_the_caller_does_not_matter():
-    alone = digest()
+    expected = alone()
     torch.set_default_dtype(torch.float64)
     try:
-        assert digest() == alone
+        assert digest() == expected
     finally:
         torch.set_default_dtype(torch.float32)
 
 
 def test_the_caller_may_use_torch_in_a_thread_meanwhile():
     """A callback's thread keeps its own modes, and the solve its result."""
-    alone, seen = digest(), []
+    expected, seen = alone(), []
 
     def other():
         with torch.no_grad():
@@ -236,7 +243,7 @@ def test_the_caller_may_use_torch_in_a_thread_meanwhile():
 
     result = reconstruct(fan(), callbacks=[beside])
     assert seen[:2] == [False, 125_000.0]
-    assert hashlib.sha256(result.volume.tobytes()).hexdigest() == alone
+    assert hashlib.sha256(result.volume.tobytes()).hexdigest() == expected
 
 
 def test_torch_has_one_thread_for_the_volume_as_well(monkeypatch):

@@ -20,7 +20,6 @@ _RANGES: dict[str, dict[str, Any]] = {
     # Far beyond these the mean of a volume fell to a third or to 0, or rose to ten times and more.
     "seed_width": {"at_least": 0.3, "at_most": 100.0},
     "largest_scale": {"at_least": 0.5, "at_most": 100.0},
-    "cutoff": {"above": 0.0},
     "support_level": {"at_least": 0.0, "at_most": 1.0},
     "seed_spacing": {"above": 0.0, "at_most": 32.0},
     "closer_seeds": {"at_least": 0.0, "at_most": 8.0},
@@ -109,8 +108,6 @@ class Settings:
     surroundings: float = 0.5
     """Where the object reaches beyond both the detector and the volume, the volume is widened during the fit, on every
     side by this share of its edge at most; 0: never."""
-    cutoff: float = 3.0
-    """Standard deviations at which a projected Gaussian ends."""
 
     # Smoothing.
     tv_weight: float = 0.04

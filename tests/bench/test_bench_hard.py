@@ -1,11 +1,10 @@
 """The hard cases in short, and that none of them can pass by looking at nothing, crashing or hanging."""
 
 import json
-import os
-import time
 
 import numpy as np
 import pytest
+from watched_cases import bad, crashing, good, hanging, noisy
 
 from tomo_polysplat.bench import hard
 from tomo_polysplat.bench.hard import HARD_CASES, chosen_cases, run_hard_bench
@@ -103,32 +102,6 @@ def test_the_same_volume_is_the_same_bits_on_a_cpu(device, off, same):
     assert relative_rms(volume * (1 + off), volume) == pytest.approx(off, rel=1e-3)
     same_volume(findings, volume * (1 + off), volume, device, "volume")
     assert findings.passed == same
-
-
-def good(device):
-    findings = Findings()
-    findings.at_most("error", 0.5, 1.0)
-    findings.equal("device", device, "cpu")
-    return findings
-
-
-def bad(device):
-    findings = Findings()
-    findings.at_most("error", 1.5, 1.0)
-    return findings
-
-
-def noisy(device):
-    np.zeros(1) / np.zeros(1)
-    return good(device)
-
-
-def crashing(device):
-    os._exit(11)
-
-
-def hanging(device):
-    time.sleep(600)
 
 
 def test_what_is_raised_or_warned_of_is_the_outcome():

@@ -106,7 +106,7 @@ def test_a_detector_that_sees_no_more_than_the_volume_tells_nothing():
 
 def test_what_has_left_a_closed_volume_comes_back_to_its_faces():
     box = VoxelBox(np.array([-0.8, -0.6, -0.4]), np.array([0.2, 0.2, 0.2]), (5, 7, 9))
-    scene = FitScene(box, None, 1.0, None, None, 0.0, "reference", 3.0, 0.1, False, (0.1, 0.1), True, 1, 0.2)
+    scene = FitScene(box, None, 1.0, None, None, 0.0, "reference", 0.1, False, (0.1, 0.1), True, 1, 0.2)
 
     class Cloud:
         position = torch.tensor([[1.5, 0.1, -0.9], [0.85, -0.65, 0.45]])

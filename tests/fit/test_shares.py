@@ -56,7 +56,7 @@ def test_the_planes_of_all_make_the_whole_volume(count, deviation):
     whole = voxelise_gaussians(gaussians, gaussians.weights(None), BOX, "numba")[0]
     parts = parted(gaussians, count)
     held = planes_of_all(gaussians, parts, BOX)
-    ranks = [Part(Ranks(k, count), planes, 0, CPU) for k, planes in enumerate(held)]
+    ranks = [Part(Ranks(k, count), planes, CPU) for k, planes in enumerate(held)]
     made = []
     for part, index in zip(ranks, parts):
         own = gaussians.select(index)

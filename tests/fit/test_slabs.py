@@ -20,7 +20,7 @@ def scene():
     spacing = np.full(3, 1 / 15)
     box = VoxelBox(-0.5 + 0.5 * spacing, spacing, SHAPE)
     curves = torch.tensor([1.0, 2.5, 9.0])
-    return FitScene(box, None, 1.0, curves, curves, 0.0, "numba", 3.0, 0.5, False, (0.0, 0.0), False, 1, 0.2)
+    return FitScene(box, None, 1.0, curves, curves, 0.0, "numba", 0.5, False, (0.0, 0.0), False, 1, 0.2)
 
 
 def cloud(metal):

@@ -121,7 +121,7 @@ def step_in_parts(problem, batch):
     from tomo_polysplat.fit.graph_step import GraphStep
 
     depth, device = problem.scene.box.shape[0], problem.gaussians.position.device
-    part = Part(ALONE, Planes(slice(0, depth), np.arange(depth)), len(problem.gaussians), device)
+    part = Part(ALONE, Planes(slice(0, depth), np.arange(depth)), device)
     made = GraphStep(problem, batch, part)
     assert all(len(graphs) > 1 for graphs in made._graphs.values())
     return made
@@ -136,11 +136,13 @@ def step_in_parts(problem, batch):
         ("fan", True, {"pixel_rays": 2}),
     ],
 )
-@pytest.mark.parametrize("many", [1, 1 << 20])
-def test_a_graph_in_parts_steps_like_autograd(kind, polychromatic, changes, many, monkeypatch):
-    """Also with a part of the views at a time, between each of which ranks would add up."""
-    monkeypatch.setattr(portions, "MANY", many)
-    monkeypatch.setattr(portions, "FEW_VIEWS", 1)
+@pytest.mark.parametrize("kept", [None, False, True])
+def test_a_graph_in_parts_steps_like_autograd(kind, polychromatic, changes, kept, monkeypatch):
+    """Also by portions of the Gaussians, with what is made of them kept or made twice."""
+    if kept is not None:
+        monkeypatch.setattr(portions, "FOOTPRINTS", 8)
+        monkeypatch.setattr(portions, "_WHOLE", 4)
+        monkeypatch.setattr("tomo_polysplat.fit.fused_step._room_to_keep", lambda *_: kept)
     compare_steps(step_in_parts, "cuda", ("cuda", "triton"), kind, polychromatic, **changes)
 
 
@@ -256,7 +258,7 @@ def test_runs_that_share_memory_step_as_if_alone(every):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("place", ["_of_portion", "_volume_gradients", "_update"])
+@pytest.mark.parametrize("place", ["_of_rays", "_of_volume", "_update"])
 def test_a_gpu_without_room_for_a_second_run_goes_on_with_the_first(place, monkeypatch):
     """Wherever in the recording it ends; torch can then give memory back and record again."""
     from tomo_polysplat.fit.choose_step import NoRoom
@@ -300,14 +302,17 @@ def test_a_recording_that_is_invalidated_leaves_torch_in_order():
     assert isinstance(make_step(fit_problem("cone", True, "cuda", "triton"), batch=BATCH), GraphStep)
 
 
-def test_a_step_does_not_load_the_compiler_of_torch():
-    """It takes more than a second, in every process that fits."""
+def test_a_step_and_slopes_of_moves_do_not_load_the_compiler_of_torch_or_sympy():
+    """They take more than a second each, in every process that fits."""
     made = "from step_scenes import fit_problem; from tomo_polysplat.fit.step import EagerStep; import sys, numpy"
     stepped = "EagerStep(fit_problem('cone', True, 'cpu', 'numba'))(numpy.array([0]), 0.0)"
-    code = f"{made}; {stepped}; print('torch._dynamo' in sys.modules)"
+    sloped = (
+        "from tomo_polysplat.scan.slopes import slope_at_zero; print(float(slope_at_zero(lambda x: 3 * x)))"
+    )
+    code = f"{made}; {stepped}; {sloped}; print({{'torch._dynamo', 'sympy'}} & {{*sys.modules}})"
     folder = Path(__file__).parent.parent / "kernels"
     paths = os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
         [sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": paths}, capture_output=True, text=True
     )
-    assert done.stdout.strip() == "False", done.stderr
+    assert done.stdout.split() == ["3.0", "set()"], done.stderr

@@ -56,7 +56,6 @@ def fit_problem(kind, polychromatic, device, kernel, count=17, **changes):
         *curves,
         -0.1,
         kernel,
-        3.0,
         0.0,
         blurring,
         corners,

@@ -48,14 +48,14 @@ def cone_beam_tilted_detector_three_channels(device):
 
 
 @case
-def views_of_a_large_cloud_one_after_the_other(device):
+def a_large_cloud_portion_by_portion(device):
     """Without gradients; both a cone and a slice."""
     for scene, views in (
         (as_float32(gaussians(9)), cone_views(3, 9, 13)),
         (as_float32(gaussians(5, planar=True)), planar_views(True, 3, 13)),
     ):
         whole, _ = project(*(t.to(device, torch.float32) for t in scene), views, kernel="triton", cutoff=3.0)
-        with mock.patch.object(portions, "MANY", 1), mock.patch.object(portions, "FEW_VIEWS", 2):
+        with mock.patch.object(portions, "FOOTPRINTS", 12), mock.patch.object(portions, "_WHOLE", 4):
             parted, _ = project(
                 *(t.to(device, torch.float32) for t in scene), views, kernel="triton", cutoff=3.0
             )

@@ -38,10 +38,11 @@ def a_step_of_our_kernels_is_that_of_autograd(device):
 
 
 @case
-def a_step_whose_views_are_held_one_after_the_other(device):
-    """As of a large cloud, with sharp rays and with what the detector makes of them."""
-    with mock.patch.object(portions, "MANY", 1), mock.patch.object(portions, "FEW_VIEWS", 1):
-        compare_steps(_fused, device, ("cpu", "reference"))
+def a_step_of_a_large_cloud_portion_by_portion(device):
+    """With what is made of Gaussians made twice, and kept; with what the detector makes of rays, and sharp ones."""
+    with mock.patch.object(portions, "FOOTPRINTS", 8), mock.patch.object(portions, "_WHOLE", 4):
+        with mock.patch("tomo_polysplat.fit.fused_step._room_to_keep", lambda *_: False):
+            compare_steps(_fused, device, ("cpu", "reference"))
         compare_steps(_fused, device, ("cpu", "reference"), blurring=False, steps=1)
 
 
@@ -197,13 +198,13 @@ def _special(kernel, *args, grid, warmup, **named):
 
 @case
 def the_parts_of_ranks_make_the_step_of_one(device):
-    """Of three with few planes to part, and of two in a plane, which cannot be parted at all; also view by view."""
+    """Of three with few planes to part, and of two in a plane, which cannot be parted at all; by portions."""
     for kind, count, changes in (
         ("cone", 3, {"pixel_rays": 2}),
         ("cone", 2, {"count": 16}),
         ("fan", 2, {"blurring": False}),
     ):
-        with mock.patch.object(portions, "MANY", 8), mock.patch.object(portions, "FEW_VIEWS", 1):
+        with mock.patch.object(portions, "FOOTPRINTS", 8), mock.patch.object(portions, "_WHOLE", 4):
             whole, parts = _stepped(kind, device, 1, changes), _stepped(kind, device, count, changes)
         for name, values in whole.items():
             tolerance = 2e-5 * np.abs(values).max()
@@ -240,11 +241,6 @@ def _stepped(kind, device, count, changes):
 def _of_rank(problem, rank, index, planes):
     from tomo_polysplat.fit.fused_step import FusedStep
 
-    part = Part(
-        Ranks(rank, len(planes)),
-        planes[rank],
-        len(problem.gaussians) // len(planes),
-        problem.gaussians.position.device,
-    )
+    part = Part(Ranks(rank, len(planes)), planes[rank], problem.gaussians.position.device)
     own = problem.gaussians.select(index).copy()
     return FusedStep(problem._replace(gaussians=own), BATCH, part)

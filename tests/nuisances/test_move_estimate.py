@@ -45,6 +45,12 @@ def test_slopes_that_tell_nothing_have_no_move():
     assert not few.value.any()
 
 
+def test_nothing_is_found_where_nothing_is_asked():
+    """As of a slice whose axis is known: there, single views alone are asked."""
+    found = whole_moves(*sums(np.random.default_rng(0), np.zeros((VIEWS, 2)), 1.0), ())
+    assert found.value.shape == found.error.shape == (0,)
+
+
 def test_views_are_shifted_by_what_both_halves_tell():
     rng = np.random.default_rng(1)
     true = rng.normal(0, 0.4, (VIEWS, 2))

@@ -59,7 +59,9 @@ def answer_with(monkeypatch, gain):
 
 
 def reconstruct(scan, settings=None, **options):
-    options = {"unit": scan.unit, "spectrum": scan.spectrum, "progress": False} | options
+    # Where the scanner stood is asked in other files.
+    usual = {"unit": scan.unit, "spectrum": scan.spectrum, "progress": False, "align": False}
+    options = usual | options
     settings = QUICK | (settings or {})
     return tps.reconstruct(scan.projections, scan.proj_geom, scan.vol_geom, settings=settings, **options)
 

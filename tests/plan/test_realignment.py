@@ -10,7 +10,11 @@ import tomo_polysplat as tps
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.plan import realignment
 from tomo_polysplat.plan.answer import Answer, Status
+from tomo_polysplat.plan.first_look import first_look
+from tomo_polysplat.plan.lab import Lab
 from tomo_polysplat.plan.means import Means
+from tomo_polysplat.plan.plan import Plan
+from tomo_polysplat.plan.preparation import lab_of
 from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.scan.moves import Scanner, moved_geometry
 from tomo_polysplat.settings import make_settings
@@ -37,8 +41,13 @@ def problem(moved):
     return Problem.of(values, told, grid, scan.unit, scan.spectrum, None)
 
 
+@cache
+def first(moved):
+    return first_look(lab_of(problem(moved), Plan(), MEANS))
+
+
 def ask(moved, axis=AXIS):
-    return realignment.realigned(problem(moved), axis, MEANS, lambda *_: None)
+    return realignment.realigned(problem(moved), axis, first(moved), MEANS, lambda *_: None)
 
 
 def test_a_scanner_that_is_right_is_left():
@@ -73,22 +82,26 @@ def test_joined_pixels_tell_moves_in_pixels_of_the_detector(monkeypatch):
 )
 def test_moves_that_held_out_rays_do_not_confirm_are_not_made(monkeypatch, before, after):
     found = {"roll": torch.tensor(1.0).double()}, [np.array(before), np.array(after)]
+    monkeypatch.setattr(realignment._Realignment, "is_clear", lambda *_: True)
     monkeypatch.setattr(realignment._Realignment, "moved", lambda *_: found)
     assert ask(False) is AXIS
 
 
 def test_a_fit_that_fails_moves_nothing_and_ends_no_run(monkeypatch, caplog):
-    def failing(*_):
+    def failing(*_, **__):
         raise RuntimeError("broken")
 
     monkeypatch.setattr(realignment, "first_volume", failing)
-    assert ask(False) is AXIS and "broken" in caplog.text
+    assert ask(True) is AXIS and "broken" in caplog.text
+    monkeypatch.setattr(Lab, "trial", failing)
+    assert first_look(lab_of(problem(False), Plan(), MEANS)) is None and caplog.text.count("broken") == 2
 
 
-def test_a_short_run_is_not_asked(monkeypatch):
-    monkeypatch.setattr(realignment._Realignment, "moved", None)
-    quick = Means(make_settings("balanced", {"passes": 4.0}), None, 0, torch.device("cpu"))
-    assert realignment.realigned(problem(False), AXIS, quick, lambda *_: None) is AXIS
+def test_a_short_run_is_not_asked():
+    """A pass would be more than a tenth of it."""
+    quick = Means(make_settings("balanced", {"passes": 9.0}), None, 0, torch.device("cpu"))
+    assert first_look(lab_of(problem(False), Plan(), quick)) is None
+    assert realignment.realigned(problem(False), AXIS, None, quick, lambda *_: None) is AXIS
 
 
 def test_a_roll_that_hides_from_a_fit_is_reached_by_longer_steps():

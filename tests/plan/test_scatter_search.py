@@ -24,7 +24,15 @@ def pins(scatter=0.0, views=60):
 
 
 def reconstruct(scan, **options):
-    options = {"unit": scan.unit, "spectrum": scan.spectrum, "settings": QUICK, "progress": False} | options
+    # Where the scanner stood is asked in other files.
+    usual = {
+        "unit": scan.unit,
+        "spectrum": scan.spectrum,
+        "settings": QUICK,
+        "progress": False,
+        "align": False,
+    }
+    options = usual | options
     return tps.reconstruct(scan.projections, scan.proj_geom, scan.vol_geom, **options)
 
 

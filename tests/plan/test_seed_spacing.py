@@ -113,7 +113,7 @@ def test_pairs_are_those_that_the_kernels_draw():
     scene = scene_of(of, chosen, settings, device)
     middle = seeds.select(seeds.position.norm(dim=1).argmin()[None])
     views = rays_of(of, chosen, settings, device).views.select([0])
-    image = project_gaussians(middle, middle.attenuation[None], views, scene.kernel, settings.cutoff)[0]
+    image = project_gaussians(middle, middle.attenuation[None], views, scene.kernel)[0]
     told = facts["work"][1].split()
     assert float(told[0]) == len(seeds)
     assert float(told[3]) == pytest.approx(int((image > 0).sum()), rel=0.35)

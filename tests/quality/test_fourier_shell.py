@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tomo_polysplat.quality.fourier_shell import HALVES, TRUTH, first_below, shell_correlation
+from tomo_polysplat.result.detail import ShellCorrelation
 
 SIZE, EDGES = (21, 24, 23), (0.5, 0.5, 0.5)
 
@@ -45,8 +46,6 @@ def test_halves_at_a_seventh_tell_where_all_of_it_is_half_right(shape):
 
 
 def test_where_a_line_crosses_a_level():
-    from tomo_polysplat.quality.fourier_shell import ShellCorrelation
-
     curve = ShellCorrelation(np.array([1.0, 2.0, 3.0, 4.0]), np.array([1.0, np.nan, 0.6, 0.1]))
     assert first_below(curve, 0.35) == pytest.approx(3.5) and first_below(curve, 0.05) is None
 

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from tomo_polysplat.kernels.project.autograd import project
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.render.renderer import (
+    RAY_CUTOFF,
     VOXEL_CUTOFF,
     detector_views,
     project_gaussians,
@@ -26,8 +28,8 @@ def inside(radius):
 
 
 def test_voxels_and_rays_cut_the_same_share_of_a_gaussian():
-    """A projection cut at 3 deviations loses exp(-9/2) of a two-dimensional Gaussian."""
-    assert inside(VOXEL_CUTOFF) == pytest.approx(1 - math.exp(-4.5), abs=1e-6)
+    """A projection cut at c deviations loses exp(-c^2/2) of a two-dimensional Gaussian."""
+    assert inside(VOXEL_CUTOFF) == pytest.approx(1 - math.exp(-(RAY_CUTOFF**2) / 2), abs=1e-6)
 
 
 def cloud(dims=3, count=40, seed=0, widest=0.12, narrowest=0.06):
@@ -79,9 +81,7 @@ def cube(size, planar=False, half=1.0):
 def test_every_view_and_the_volume_hold_the_mass_of_the_gaussians(planar):
     gaussians = cloud(2 if planar else 3)
     weights, expected = gaussians.weights(None), mass(gaussians)
-    image, skipped = project_gaussians(
-        gaussians, weights, detector_views(parallel(planar), planar), KERNEL, 3.0
-    )
+    image, skipped = project_gaussians(gaussians, weights, detector_views(parallel(planar), planar), KERNEL)
     area = 0.05 if planar else 0.05**2
     sums = image[0].double().sum(dim=(1, 2)) * area
     cell = (2 / 50) ** (2 if planar else 3)
@@ -99,7 +99,8 @@ def test_a_ray_is_the_line_integral_of_the_voxels():
     weights = gaussians.weights(None)
     size = 61
     half = 0.5 * size * 0.05
-    image, _ = project_gaussians(gaussians, weights, detector_views(parallel(), False), KERNEL, 6.0)
+    drawn = gaussians.position, gaussians.scale(), gaussians.rotation, weights
+    image, _ = project(*drawn, detector_views(parallel(), False), kernel=KERNEL, cutoff=6.0)
     volume = voxelise_gaussians(gaussians, weights, voxel_box(cube(size, half=half)), KERNEL)
     along_y = volume[0].double().sum(dim=1) * 0.05
     error = (along_y - image[0, 0].double()).abs().max() / image[0, 0].abs().max()

@@ -187,7 +187,7 @@ def test_a_large_result_that_was_damaged_is_refused(tmp_path, monkeypatch):
 def test_a_result_is_saved_slab_by_slab(tmp_path, monkeypatch):
     whole = polychromatic(np.linspace(0, 1, 60).reshape(GRID.shape))
     whole.save(tmp_path / "whole.h5")
-    monkeypatch.setattr("tomo_polysplat.result.result._AT_ONCE", 20)
+    monkeypatch.setattr("tomo_polysplat.result.data._AT_ONCE", 20)
     parts = polychromatic(whole.material)
     assert [values.shape for _, values in parts.slabs()] == [(1, 4, 5)] * 3
     parts.save(tmp_path / "parts.h5")

@@ -6,6 +6,7 @@ import torch
 from start_phantoms import chords, distance
 
 from tomo_polysplat.scan.geometry import from_astra
+from tomo_polysplat.scan.moves import Scanner, moved_geometry
 from tomo_polysplat.start.bridged import bridged_start
 from tomo_polysplat.start.initial import initial_volume_on
 
@@ -50,7 +51,14 @@ def between(grid):
     return torch.from_numpy(line & beside & (distance(grid, (0, 0, 0)) < 17))
 
 
-@pytest.mark.parametrize("scan", [fan, cone])
+def rolled():
+    geometry, grid = cone()
+    degrees = {"roll": 4.0, "tilt": -3.0}
+    values = {name: torch.tensor(value, dtype=torch.float64) for name, value in degrees.items()}
+    return moved_geometry(Scanner(geometry), values), grid
+
+
+@pytest.mark.parametrize("scan", [fan, cone, rolled])
 def test_matter_between_opaque_metal_is_not_lost(scan):
     geometry, grid = scan()
     volume, bridged, why = starts(geometry, grid)

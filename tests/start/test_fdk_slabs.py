@@ -84,6 +84,32 @@ def test_a_gpu_that_has_no_room_gets_smaller_slabs(monkeypatch):
     assert made[0] == 21 and max(made[1:]) <= 11, "less was tried"
 
 
+@pytest.mark.parametrize("room", [1e9, 1e6])
+def test_a_rolled_detector_by_slabs_or_in_one_piece(monkeypatch, room):
+    """The CPU plays ASTRA, which gets level rows, those alone that a slab needs."""
+    from tomo_polysplat.scan.moves import Scanner, moved_geometry
+    from tomo_polysplat.start import astra_fdk
+
+    _, geometry, grid = scanned("cone")
+    geometry = moved_geometry(Scanner(geometry), {"roll": torch.tensor(6.0).double()})
+    projections, made = chords(geometry, SPHERES), []
+
+    def play(piece, cropped, slab, orbit, filter_name):
+        made.append(slab.shape[0])
+        return torch.from_numpy(fdk(piece.numpy(), cropped, slab, filter_name=filter_name))
+
+    monkeypatch.setattr(slabs, "_FILTER", 0)
+    monkeypatch.setattr(slabs, "free_bytes", lambda device: room)
+    monkeypatch.setattr(astra_fdk, "fdk_cuda_tensor", play)
+    whole, orbit = fdk(projections, geometry, grid, filter_name="hann"), find_orbit(geometry)[0]
+    found = slabs.fdk_on_device(
+        torch.from_numpy(projections), geometry, grid, orbit, "hann", torch.device("cpu")
+    )
+    assert (len(made) == 1) == (room > 1e8)
+    np.testing.assert_allclose(found.numpy(), whole, rtol=0, atol=1e-5 * np.abs(whole).max())
+    assert (whole == 0).all(axis=(1, 2)).any() and (whole != 0).any(), "slices beyond the detector are empty"
+
+
 # Textures interpolate by weights of 8 bits, which the other coordinates of a slab round another way: 5e-5 on an H200.
 _TEXTURE = 2e-4
 

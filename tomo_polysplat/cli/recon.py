@@ -21,6 +21,7 @@ from tomo_polysplat.cli.options import (
     spectrum_from,
 )
 from tomo_polysplat.cli.recon_outputs import require_outputs, require_room_of, write_outputs
+from tomo_polysplat.fit.filtered import FIT
 from tomo_polysplat.fit.stopping import StopReason
 from tomo_polysplat.interrupts import postponed_interrupts
 from tomo_polysplat.progress import progress_reports
@@ -172,9 +173,7 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
     make_settings(arguments.quality, settings)
     scan = scan_from(arguments, spectrum_from(arguments))
     spectrum = _spectrum_of(scan, arguments)
-    to_find = "fit" if arguments.filter_map == "fit" else None
-    if arguments.filter_map is not None and to_find is None:
-        scan = replace(scan, filter_map=filter_map_from(arguments.filter_map))
+    scan, to_find = _filtered(scan, arguments.filter_map)
     require_room_of(arguments, scan)
     print(visible(scan))
     # What a run will take is said without -v as well.
@@ -215,6 +214,13 @@ def _follow(device: str) -> int:
 
     follow_torchrun(device)
     return 0
+
+
+def _filtered(scan: Scan, told: str | None) -> tuple[Scan, str | None]:
+    """The scan with the filter that is told, and "fit" where one is to be found."""
+    if told is None or told == FIT:
+        return scan, told
+    return replace(scan, filter_map=filter_map_from(told)), None
 
 
 def _aligned(arguments: argparse.Namespace) -> str | bool | list[str]:

@@ -46,7 +46,7 @@ class _Followed:
         views = DetectorViews(*about["views"])
         self.rays = Rays(projections, views, photons, model_error, held_out, streamed, dimmed)
         setup = FitSetup(self.gaussians, about["spacing"], self.rays, about["scene"], about["settings"])
-        part = Part(ranks, about["planes"][ranks.rank], max(about["counts"]), ranks.device)
+        part = Part(ranks, about["planes"][ranks.rank], ranks.device)
         self.step: Step = own_step(setup, about["batch"], ranks, beside, part)
 
     @torch.no_grad()

@@ -7,9 +7,9 @@ tensor, so that the same launches do for every step (`graph_step.py` records the
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, NamedTuple
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -25,9 +25,11 @@ from tomo_polysplat.fit.step import (
     step_rates,
     turning,
 )
+from tomo_polysplat.free_memory import free_bytes
 from tomo_polysplat.kernels.portions import portions
 from tomo_polysplat.kernels.project import triton_backward as rays_backward
 from tomo_polysplat.kernels.project import triton_forward as rays_forward
+from tomo_polysplat.kernels.project.triton_image import spread
 from tomo_polysplat.kernels.project.triton_pull_back import pull_back as rays_pull_back
 from tomo_polysplat.kernels.project.triton_setup import footprints
 from tomo_polysplat.kernels.step.triton_activate import activate
@@ -35,13 +37,13 @@ from tomo_polysplat.kernels.step.triton_detector import detected_misfit_gradient
 from tomo_polysplat.kernels.step.triton_misfit import Measurement, Splat, misfit_gradient
 from tomo_polysplat.kernels.step.triton_update import FIRST_DECAY, SECOND_DECAY, Bounds, update, update_shared
 from tomo_polysplat.kernels.step.triton_variation import variation_gradient
-from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.kernels.voxelise import triton_backward as box_backward
 from tomo_polysplat.kernels.voxelise import triton_forward as box_forward
 from tomo_polysplat.kernels.voxelise.triton_setup import box_table, ellipsoids
+from tomo_polysplat.model.gaussians import OF_ALL
 from tomo_polysplat.physics.detector_blur import LARGEST_BLUR
 from tomo_polysplat.physics.transmission import nodes_on
-from tomo_polysplat.render.renderer import VOXEL_CUTOFF
+from tomo_polysplat.render.renderer import RAY_CUTOFF, VOXEL_CUTOFF
 
 __all__ = ["FusedStep"]
 
@@ -49,15 +51,29 @@ __all__ = ["FusedStep"]
 # Every part begins at 16 bytes whatever the batch: elsewhere the kernels would be compiled once more.
 _HEAD, _CHOSEN, _VIEW = 4, 2, 21
 
+# Bytes of a Gaussian that both halves of a step use: what is drawn and its ellipsoid, and its footprint in a view; and
+# the share of what is free that may be kept so.
+_PASSING, _RECORD, _KEPT = 92, 80, 0.25
+
 # Position, deviation, rotation and weights.
 _Drawn = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
 
-class _Seen(NamedTuple):
-    """Footprints of Gaussians in some views, and the images of these."""
+_Thing = TypeVar("_Thing")
 
-    record: torch.Tensor
-    splat: Splat
+
+class _Made(Generic[_Thing]):
+    """What is made of a portion of the Gaussians, by its number: once if kept, else as often as it is asked for."""
+
+    def __init__(self, make: Callable[[int], _Thing], kept: bool) -> None:
+        self._make, self._kept = make, dict[int, _Thing]() if kept else None
+
+    def __call__(self, number: int) -> _Thing:
+        if self._kept is None:
+            return self._make(number)
+        if number not in self._kept:
+            self._kept[number] = self._make(number)
+        return self._kept[number]
 
 
 class FusedStep:
@@ -87,9 +103,10 @@ class FusedStep:
         self._bounds = Bounds(bounds, (scene.least_u, 1.0), LARGEST_BLUR, EPSILON)
         fine = scene.fine(rays.views)
         self._table = fine.host_table()
-        # Only the shape of these views counts. All ranks have as many portions.
-        most = len(gaussians) if part is None else part.most
-        self._portions = portions(fine.select(np.arange(batch)), most)
+        # Only the shape of these views counts.
+        self._views = fine.select(np.arange(batch))
+        self._portions = portions(len(gaussians), batch)
+        self._keeps = len(self._portions) == 1 or _room_to_keep(len(gaussians), batch, device)
         self._parts = (fine.rows // rays.views.rows, fine.columns // rays.views.columns)
         self._sums = torch.zeros(3, dtype=torch.float64, device=device)
         self._skipped = torch.zeros((), dtype=torch.int64, device=device)
@@ -105,9 +122,11 @@ class FusedStep:
         self._measurement = self._measure()
         self._box = scene.box if part is None else part.box(scene.box)
         self._box_table = box_table(self._box, device)
+        largest = self._portions[0].stop
         self._not_smoothed = tuple(
-            torch.zeros(shape, device=device) for shape in ((len(gaussians), 3),) * 2 + ((len(gaussians), 4),)
-        ) + (torch.zeros((1, len(gaussians)), device=device),)
+            torch.zeros(shape, device=device)
+            for shape in ((largest, 3), (largest, 3), (largest, 4), (1, largest))
+        )
 
     @property
     def largest(self) -> list[float]:
@@ -198,62 +217,77 @@ class FusedStep:
     # The order of a step and what each part leaves to the next: cut up it would be passed around.
     def _stages(self, smooth: float) -> Iterator[tuple[torch.Tensor, ...]]:
         """The same in stages; each but the last ends with what ranks add up, where there are several."""
-        gaussians, part = self.gaussians, self.part
+        part, numbers, keeps = self.part, range(len(self._portions)), self._keeps
         _, chosen, table = self._parts_of_control()
         table, chosen = table.view(self._batch, _VIEW), chosen.view(_CHOSEN, self._batch)
-        scale, weight, output = activate(
-            gaussians.log_scale,
-            gaussians.attenuation,
-            gaussians.own_material,
-            gaussians.shared_material,
-            gaussians.group,
-            self._curves,
-        )
-        drawn = (gaussians.position, scale, gaussians.rotation)
-        of_volume = self._not_smoothed
+        drawn = _Made(self._activated, keeps)
+        seen = _Made(lambda number: self._footprints(drawn(number), table), keeps)
+        boxed = _Made(lambda number: self._ellipsoids(drawn(number)), keeps)
+        for number in numbers if keeps else ():
+            # Here, as both streams use them.
+            drawn(number)
         lent: tuple[torch.Tensor, ...] = ()
         if smooth:
             with self._beside():
-                voxels = self._voxelised((*drawn, output))
+                volume = self._voxelised(boxed)
                 if part is not None:
-                    lent = (part.lent(voxels[1][0]),)
+                    lent = (part.lent(volume[0]),)
                 else:
-                    of_volume = self._volume_gradients((*drawn, output), *voxels, smooth)
-                    del voxels
-        of_rays: tuple[torch.Tensor, ...] = ()
-        first = 0
-        for views in self._portions:
-            seen = self._splatted((*drawn, weight), table, chosen, views, first)
-            if part is not None:
-                self._join()
-                yield (seen.splat.raw, *(lent if not first else ()))
-            if part is not None and smooth and not first:
+                    slope = self._slope(volume, smooth)
+                    del volume
+        image, skipped = self._image(seen), None if keeps else self._skipped.clone()
+        if part is not None:
+            self._join()
+            yield (image, *lent)
+            if smooth:
                 with self._beside():
-                    part.take(lent[0], voxels[1][0])
-                    of_volume = self._volume_gradients((*drawn, output), *voxels, smooth)
-                    del voxels
-            of_portion = self._of_portion((*drawn, weight), seen)
-            for total, gradient in zip(of_rays, of_portion):
-                total += gradient
-            of_rays, first = of_rays or of_portion, first + len(views)
-            del seen, of_portion
-        self._join()
-        self._update((scale, self._curves), of_rays, of_volume)
+                    part.take(lent[0], volume[0])
+                    slope = self._slope(volume, smooth)
+                    del volume
+        pixels = self._misfit_gradient(image, table, chosen)
+        del image
+        for number in numbers:
+            of_volume = self._none_of_volume(number)
+            if smooth:
+                with self._beside():
+                    of_volume = self._of_volume(drawn(number), boxed(number), slope)
+            of_rays = self._of_rays(drawn(number), seen(number), table, pixels)
+            self._join()
+            self._update(number, drawn(number), of_rays, of_volume)
+            del of_rays, of_volume
+        if skipped is not None:
+            # Those that were made twice count once.
+            self._skipped.copy_(skipped)
         if part is not None and self._curves is not None:
             yield (self._grad_shared,)
         self._update_shared()
 
-    def _update(self, drawn, of_rays, of_volume) -> None:
-        gaussians, (head, _, _) = self.gaussians, self._parts_of_control()
-        state = (self._grad_shared, self.pull, self._rates, head)
+    def _activated(self, number: int) -> tuple[_Drawn, torch.Tensor]:
+        """What is drawn of a portion, with the weights that the rays see, and the weight in the volume (1, n)."""
+        gaussians, some = self.gaussians, self._portions[number]
+        scale, weight, output = activate(
+            gaussians.log_scale[some],
+            gaussians.attenuation[some],
+            gaussians.own_material[some],
+            gaussians.shared_material,
+            gaussians.group[some],
+            self._curves,
+        )
+        return (gaussians.position[some], scale, gaussians.rotation[some], weight), output
+
+    def _update(self, number: int, drawn: tuple[_Drawn, torch.Tensor], of_rays, of_volume) -> None:
+        some, (head, _, _) = self._portions[number], self._parts_of_control()
+        common = {name: getattr(self.gaussians, name) for name in OF_ALL}
+        parameters = self.gaussians.parameters()
+        own = {name: tensor[some] for name, tensor in parameters.items() if name not in common}
         update(
-            gaussians.parameters(),
-            gaussians.group,
-            self.moments,
-            drawn,
+            own | common,
+            self.gaussians.group[some],
+            {name: (self.moments[name][0][some], self.moments[name][1][some]) for name in own},
+            (drawn[0][1], self._curves),
             of_rays,
             of_volume,
-            state,
+            (self._grad_shared, self.pull[some], self._rates, head),
             self._bounds,
         )
 
@@ -268,27 +302,41 @@ class FusedStep:
             self._bounds,
         )
 
-    def _splatted(self, drawn: _Drawn, table, chosen, views: DetectorViews, first: int) -> _Seen:
-        """Images of the views from the ``first`` of the step on."""
-        cutoff, largest = self.scene.cutoff, self._largest[0]
-        table = table[first : first + len(views)]
-        record = footprints(*drawn, views, table, cutoff, self._skipped)
-        image = rays_forward.splat(record, len(drawn[-1]), views, cutoff, largest)
-        measurement = self._measurement
-        return _Seen(
-            record, Splat(image, table, chosen, views, self._parts, measurement, self._sums, largest, first)
-        )
+    def _footprints(self, drawn: tuple[_Drawn, torch.Tensor], table: torch.Tensor) -> torch.Tensor:
+        return footprints(*drawn[0], self._views, table, RAY_CUTOFF, self._skipped)
 
-    def _of_portion(self, drawn: _Drawn, seen: _Seen) -> tuple[torch.Tensor, ...]:
-        """Gradients of the misfit of such images by position, deviation, rotation and weights."""
-        record, splat = seen
+    def _image(self, seen: _Made[torch.Tensor]) -> torch.Tensor:
+        """The step's views of all portions."""
+        channels = 1 if self._curves is None else 3
+        image = self._largest.new_zeros(
+            (self._batch, self._views.rows, self._views.columns, spread(channels))
+        )
+        for number in range(len(self._portions)):
+            rays_forward.splat(seen(number), channels, self._views, RAY_CUTOFF, self._largest[0], image)
+        return image
+
+    def _misfit_gradient(
+        self, image: torch.Tensor, table: torch.Tensor, chosen: torch.Tensor
+    ) -> torch.Tensor:
+        """Gradient of the misfit of such an image by its pixels."""
+        splat = Splat(
+            image, table, chosen, self._views, self._parts, self._measurement, self._sums, self._largest[0]
+        )
         if self.scene.blurring or max(self._parts) > 1:
             blur = self.gaussians.blur if self.scene.blurring else self._no_blur
-            pixels = detected_misfit_gradient(splat, blur, self._grad_blur)
-        else:
-            pixels = misfit_gradient(splat)
-        moments = rays_backward.sum_moments(record, pixels, len(drawn[-1]), splat.views)
-        return rays_pull_back(*drawn, splat.table, splat.views, moments)
+            return detected_misfit_gradient(splat, blur, self._grad_blur)
+        return misfit_gradient(splat)
+
+    def _of_rays(
+        self,
+        drawn: tuple[_Drawn, torch.Tensor],
+        record: torch.Tensor,
+        table: torch.Tensor,
+        pixels: torch.Tensor,
+    ) -> tuple[torch.Tensor, ...]:
+        """Gradients of the misfit by a portion's position, deviation, rotation and weights."""
+        moments = rays_backward.sum_moments(record, pixels, len(drawn[0][-1]), self._views)
+        return rays_pull_back(*drawn[0], table, self._views, moments)
 
     def _beside(self) -> AbstractContextManager[Any]:
         """Where the volume's part of a step is made, which needs nothing of that of the rays."""
@@ -297,17 +345,21 @@ class FusedStep:
     def _join(self) -> None:
         """Wait for what is made there."""
 
-    def _voxelised(self, drawn: _Drawn) -> tuple[torch.Tensor, torch.Tensor]:
-        """Ellipsoids and their volume (1, nz, ny, nx), of the rank's planes."""
-        record = ellipsoids(*drawn, self._box_table, VOXEL_CUTOFF)
-        return record, box_forward.splat(record, 1, self._box, VOXEL_CUTOFF, self._largest[1])
+    def _ellipsoids(self, drawn: tuple[_Drawn, torch.Tensor]) -> torch.Tensor:
+        (position, scale, rotation, _), output = drawn
+        return ellipsoids(position, scale, rotation, output, self._box_table, VOXEL_CUTOFF)
 
-    def _volume_gradients(
-        self, drawn: _Drawn, record: torch.Tensor, volume: torch.Tensor, smooth: float
-    ) -> tuple[torch.Tensor, ...]:
-        """Gradients of the volume's total variation, likewise, times ``smooth``."""
+    def _voxelised(self, boxed: _Made[torch.Tensor]) -> torch.Tensor:
+        """The volume (1, nz, ny, nx) of the rank's planes, of all portions."""
+        volume = self._largest.new_zeros((1, *self._box.shape))
+        for number in range(len(self._portions)):
+            box_forward.splat(boxed(number), 1, self._box, VOXEL_CUTOFF, self._largest[1], volume)
+        return volume
+
+    def _slope(self, volume: torch.Tensor, smooth: float) -> torch.Tensor:
+        """Gradient of the total variation by the voxels, times ``smooth``."""
         chosen, planes = self.settings, self.scene.box.shape[0]
-        slope = variation_gradient(
+        return variation_gradient(
             volume,
             chosen.tv_clip,
             self.scene.tv_corners,
@@ -316,5 +368,22 @@ class FusedStep:
             self._largest[1],
             planes,
         )
+
+    def _of_volume(
+        self, drawn: tuple[_Drawn, torch.Tensor], record: torch.Tensor, slope: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        """Gradients of the total variation by a portion's position, deviation, rotation and weight."""
+        (position, scale, rotation, _), output = drawn
         moments = box_backward.sum_moments(record, slope, self._box, VOXEL_CUTOFF)
-        return box_backward.pull_back(*drawn, self._box_table, moments)
+        return box_backward.pull_back(position, scale, rotation, output, self._box_table, moments)
+
+    def _none_of_volume(self, number: int) -> tuple[torch.Tensor, ...]:
+        """The same where nothing is smoothed."""
+        count = self._portions[number].stop - self._portions[number].start
+        *of_shape, of_weight = self._not_smoothed
+        return (*(zeros[:count] for zeros in of_shape), of_weight[:, :count])
+
+
+def _room_to_keep(gaussians: int, views: int, device: torch.device) -> bool:
+    """Whether what a step makes of each Gaussian on its way is kept, or made a second time: the result is the same."""
+    return device.type == "cpu" or gaussians * (_PASSING + _RECORD * views) <= _KEPT * free_bytes(device)

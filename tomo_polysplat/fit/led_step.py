@@ -92,7 +92,7 @@ class LedStep:
         with torch.no_grad():
             common = {name: getattr(gaussians, name).clone() for name in OF_ALL}
             own = Gaussians(**gaussians.select(self._parts[0]).each(), **common)
-        part = Part(ranks, self._planes[0], max(counts), gaussians.position.device)
+        part = Part(ranks, self._planes[0], gaussians.position.device)
         shared: Step | None = None if beside is None else beside._own
         try:
             self._own: Step = self._make(setup._replace(gaussians=own), self._batch, ranks, shared, part)

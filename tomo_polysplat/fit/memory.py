@@ -11,7 +11,7 @@ import torch
 
 from tomo_polysplat.checks import fail
 from tomo_polysplat.free_memory import available_memory, free_bytes, give_back, in_gigabytes, require_memory
-from tomo_polysplat.kernels.portions import FEW_VIEWS, MANY
+from tomo_polysplat.kernels.portions import FOOTPRINTS
 from tomo_polysplat.ranks import current_ranks
 
 __all__ = [
@@ -30,11 +30,11 @@ __all__ = [
 
 logger = logging.getLogger(__name__)
 
-# Bytes a Gaussian takes: 330 for parameters, moments, the best copy, pull and no smoothing's gradients, and what a step
-# makes of it on its way; its footprint and sums in each view of a step (2.8e6 Gaussians, 192^3 voxels and 6 views a
-# step on an H100: 330 and, with the footprints of three views, 780). Of several ranks each has these of its part, and
-# the first one between passes parameters, moments, pull, the best copy and a place in a part of all of them.
-_GAUSSIAN, _FOOTPRINT, _WHOLE = 680, 144, 220
+# Bytes a Gaussian takes: for parameters, moments, the best copy and pull; what a step makes of it on its way, with
+# gradients; and its footprint and sums in each view of a step. On a GPU the last two are those of a portion at a time.
+# Of several ranks each has these of its part, and the first one between passes parameters, moments, pull, the best copy
+# and a place in a part of all of them.
+_GAUSSIAN, _PASSING, _FOOTPRINT, _WHOLE = 330, 350, 144, 220
 # Bytes a pixel of a step takes: image and gradient of four channels, projections and their slopes.
 _PIXEL = 48
 # Bytes a voxel takes at once, by torch's own count on 40^3 to 64^3 (tests/fit/test_counted_memory.py): while a start is
@@ -209,10 +209,14 @@ def room_for_gaussians(device: torch.device, *, views: int, pixels: int, voxels:
     if free is None:
         return math.inf
     left = max(_SHARE * free - sum(_of_all(views, pixels, voxels, runs, device).values()), 0.0)
-    few = left / (runs * _of_a_gaussian(views))
-    if few < _many() or device.type == "cpu":
+    if device.type == "cpu":
+        return left / (runs * _of_a_gaussian(views))
+    ranks = current_ranks().count
+    few = left / (runs * ((_WHOLE if ranks > 1 else 0) + _of_a_gaussian(views) / ranks))
+    portion = FOOTPRINTS / views
+    if few <= portion * ranks:
         return few
-    return left / (runs * _of_a_gaussian(min(views, FEW_VIEWS)))
+    return (left / runs - portion * (_PASSING + _FOOTPRINT * views)) / _that_stays()
 
 
 @contextmanager
@@ -237,22 +241,21 @@ def told_of_lack() -> Iterator[None]:
 
 def _of_gaussians(count: int, views: int, runs: int, device: torch.device) -> int:
     """Bytes of so many Gaussians in each run, on the first rank."""
-    whole = runs * count * _of_a_gaussian(views)
     if device.type == "cpu":
-        return math.ceil(whole)
-    # A GPU holds the footprints of fewer views at once of a large cloud, which may have grown from a smaller one.
-    few = runs * count * _of_a_gaussian(min(views, FEW_VIEWS))
-    return math.ceil(max(few, min(whole, runs * _many() * _of_a_gaussian(views))))
+        return math.ceil(runs * count * _of_a_gaussian(views))
+    portion = min(count / current_ranks().count, FOOTPRINTS / views)
+    return math.ceil(runs * (count * _that_stays() + portion * (_PASSING + _FOOTPRINT * views)))
 
 
-def _many() -> int:
-    """How many Gaussians of all ranks make a large cloud on each."""
-    return MANY * current_ranks().count
+def _that_stays() -> float:
+    """Bytes of a Gaussian that the first rank's GPU holds from step to step."""
+    ranks = current_ranks().count
+    return (_WHOLE if ranks > 1 else 0) + _GAUSSIAN / ranks
 
 
 def _of_a_gaussian(views: int) -> float:
-    ranks = current_ranks().count
-    return (_WHOLE if ranks > 1 else 0) + (_GAUSSIAN + _FOOTPRINT * views) / ranks
+    """Bytes of a Gaussian of which all is held at once."""
+    return _GAUSSIAN + _PASSING + _FOOTPRINT * views
 
 
 def _of_all(views: int, pixels: int, voxels: int, runs: int, device: torch.device) -> dict[str, int]:

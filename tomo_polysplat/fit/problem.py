@@ -265,6 +265,11 @@ class Problem:
 
         return TakenOut(self.projections.shape, known.taken, copies)
 
+    def forget_told(self) -> None:
+        """Forget what rays told that have been changed since: their noise, where matter lies, what is texture."""
+        known = self._known
+        known.photons = known.agreement = known.closed = None
+
     def let_go_of_level(self) -> None:
         """Forget rays made level for physics that is not used: they take as much memory as those measured."""
         self._known.level.clear()

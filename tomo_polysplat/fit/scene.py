@@ -48,7 +48,6 @@ class FitScene:
     least_u : float
         Least material number; see ``physics.material_range``.
     kernel : str
-    cutoff : float
     metal_tail : float
         Share of the metal around a voxel that some point of it has to come near to; see ``render.metal_edges``.
     blurring : bool
@@ -80,7 +79,6 @@ class FitScene:
     output_curve: torch.Tensor | None
     least_u: float
     kernel: str
-    cutoff: float
     metal_tail: float
     blurring: bool
     tv_corners: tuple[float, float]
@@ -110,7 +108,7 @@ class FitScene:
         """
         weights = gaussians.weights(self.reference_curve)
         rays = self.fine(views)
-        areal, skipped = project_gaussians(gaussians, weights, rays, self.kernel, self.cutoff, vectors)
+        areal, skipped = project_gaussians(gaussians, weights, rays, self.kernel, vectors)
         areal = (areal if of_all is None else of_all(areal)) * self.areal_scale
         sharp = self._seen(areal)
         if self.pixel_rays > 1:

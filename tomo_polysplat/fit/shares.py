@@ -93,13 +93,11 @@ class Part:
     ranks : Ranks
     planes : Planes
         Of the volume.
-    most : int
-        Gaussians of the largest part.
     device : torch.device
     """
 
-    def __init__(self, ranks: Ranks, planes: Planes, most: int, device: torch.device) -> None:
-        self.ranks, self.planes, self.most = ranks, planes.own, most
+    def __init__(self, ranks: Ranks, planes: Planes, device: torch.device) -> None:
+        self.ranks, self.planes = ranks, planes.own
         mine = (planes.shared >= planes.own.start) & (planes.shared < planes.own.stop)
         self._here = torch.from_numpy(planes.shared[mine] - planes.own.start).to(device)
         self._there = torch.from_numpy(np.flatnonzero(mine)).to(device)

@@ -39,7 +39,7 @@ HALF_LOG2E = 0.7213475204444817
 # of a second each, and the Gaussians of every call are another number.
 SIZES = (
     "count", "rows", "columns", "area", "room", "beyond", "nz", "ny", "nx", "stride", "many", "nodes", "parts",
-    "first", "of_step",
+    "of_step",
 )  # fmt: skip
 
 

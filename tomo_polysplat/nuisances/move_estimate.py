@@ -39,8 +39,10 @@ def whole_moves(normal: np.ndarray, told: np.ndarray, which: Sequence[int]) -> W
     told : (views, n) array
         Sums of slopes times what is left.
     which : sequence of int
-        The slopes of the moves.
+        The slopes of the moves; none where nothing of the whole scanner is asked.
     """
+    if not len(which):
+        return WholeMoves(np.zeros(0), np.zeros(0))
     matrix, right = _without_constant(normal, told, which)
     groups = [part for part in np.array_split(np.arange(len(matrix)), _GROUPS) if len(part)]
     whole = _solved(matrix.sum(axis=0), right.sum(axis=0))

@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+import torch
 
 from tomo_polysplat.checks import fail
 from tomo_polysplat.file_lock import FileLock
@@ -31,6 +32,7 @@ from tomo_polysplat.plan.checkpoint_content import (
     snapshot_of,
     taken_of,
 )
+from tomo_polysplat.plan.light_told import EARLY_LIGHT
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.scan.archive import read_archive
 
@@ -89,9 +91,16 @@ class Checkpoint:
         """What the run has taken so far."""
         return 0.0 if self.snapshot is None else self.snapshot.numbers["seconds"]
 
+    def share_early(self, problem: Problem, device: torch.device) -> None:
+        """Take out of what was measured what was taken out before the questions, as one step."""
+        if self.plan is not None and EARLY_LIGHT in self.plan.facts and self._taken:
+            # There have to be copies to take it out of.
+            problem.measured(device)
+            problem.taken.add(*self._taken[0])
+
     def share_taken(self, problem: Problem) -> None:
         """Take out of what was measured what the run had taken out, and keep what it will, from now on."""
-        for gains, drift in self._taken:
+        for gains, drift in self._taken[len(problem.taken.steps) :]:
             problem.taken.add(gains, drift)
         self._taken = problem.taken.steps
 

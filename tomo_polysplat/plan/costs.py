@@ -6,6 +6,7 @@ import math
 
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.plan.plan import Plan
+from tomo_polysplat.render.renderer import RAY_CUTOFF
 from tomo_polysplat.settings import Settings
 
 __all__ = ["work"]
@@ -15,7 +16,7 @@ def work(plan: Plan, problem: Problem, settings: Settings, gaussians: int) -> st
     """Pairs of a Gaussian and a pixel, or a voxel, that the seeds make in a pass over the views."""
     width, height = (size / problem.voxel for size in problem.geometry.pixel_size_at(problem.grid.centre))
     deviation = settings.seed_width * plan.spacing
-    reach = settings.cutoff * deviation
+    reach = RAY_CUTOFF * deviation
     pixels = 2 * reach / width if problem.planar else math.pi * reach**2 / (width * height)
     views = problem.geometry.views
     steps = math.ceil(views / plan.views_per_step)

@@ -44,7 +44,6 @@ def scene_of(problem: Problem, plan: Plan, settings: Settings, device: torch.dev
         output_curve=output_curve,
         least_u=least_u,
         kernel=kernel,
-        cutoff=settings.cutoff,
         metal_tail=settings.metal_tail,
         blurring=plan.blurred,
         tv_corners=plan.tv_corners,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,7 +31,17 @@ from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.short_fit import ShortFit, short_fit
 from tomo_polysplat.settings import Settings, make_settings
 
-__all__ = ["PreparedFit", "RunOptions", "calibrate", "fit_start", "physics", "prepare", "under"]
+__all__ = [
+    "PreparedFit",
+    "RunOptions",
+    "calibrate",
+    "fit_start",
+    "lab_of",
+    "no_result_yet",
+    "physics",
+    "prepare",
+    "under",
+]
 
 
 @dataclass(frozen=True)
@@ -114,6 +125,7 @@ def prepare(
     run_options: RunOptions,
     saved: Checkpoint | None,
     report: Callable[[float, str], Any],
+    lab: Lab | None = None,
 ) -> PreparedFit:
     """Decide, seed and set up, or go on from where a checkpoint was.
 
@@ -126,6 +138,8 @@ def prepare(
     saved : Checkpoint or None
     report : callable
         Gets the share done, none, and words.
+    lab : Lab or None
+        Of this problem, where a look at it has made one.
 
     Raises
     ------
@@ -133,30 +147,46 @@ def prepare(
         After Ctrl-C: there is no result yet.
     """
     settings, device = run_options.settings, run_options.device
-    try:
+    with no_result_yet():
         if saved is not None and saved.snapshot is not None and saved.plan is not None:
             plan, gaussians = saved.plan, saved.snapshot.gaussians.to(device)
             scene = scene_of(problem, plan, settings, device)
             return PreparedFit(plan, gaussians, scene, rays_of(problem, plan, settings, device))
-        report(0.0, "start volume")
-        start, why = first_volume(problem, device, settings)
-        lab = Lab(
-            problem, start, settings, device, run_options.seed, run_options.time_budget, plan, fit_start
-        )
-        decide_start(lab)
+        if lab is None:
+            report(0.0, "start volume")
+            lab = lab_of(problem, plan, run_options)
+        else:
+            lab.plan.facts = plan.facts | lab.plan.facts
+            plan = lab.plan
         scene, rays = lab.scene, lab.rays
         report(0.0, "seeds")
-        plan.note("start", why)
         decide(lab, When.TRIAL)
         gaussians, facts = lab.seeds(), lab.facts_of_seeds()
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt("interrupted before the fit had begun: there is no result yet") from None
     _tell(plan, problem, facts)
     plan.note("alternatives", alternatives(lab))
     if saved is not None:
         saved.plan = plan
-    kept = None if run_options.time_budget is None else start.cpu()
+    kept = None if run_options.time_budget is None else lab.start.cpu()
     return PreparedFit(plan, gaussians, scene, rays, kept)
+
+
+@contextmanager
+def no_result_yet() -> Iterator[None]:
+    """Say so after Ctrl-C."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("interrupted before the fit had begun: there is no result yet") from None
+
+
+def lab_of(problem: Problem, plan: Plan, means: Means) -> Lab:
+    """A lab for all questions of a problem, with what its start volume answers in the ``plan``."""
+    settings, device = means.settings, means.device
+    start, why = first_volume(problem, device, settings)
+    lab = Lab(problem, start, settings, device, means.seed, means.time_budget, plan, fit_start)
+    decide_start(lab)
+    plan.note("start", why)
+    return lab
 
 
 def fit_start(lab: Lab, settings: Settings, steps: int) -> ShortFit:

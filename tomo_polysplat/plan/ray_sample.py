@@ -82,7 +82,7 @@ def sample_rays(gaussians: Gaussians, scene: FitScene, rays: Rays, seed: int, mo
     weights, rng = gaussians.weights(scene.reference_curve), np.random.default_rng(seed)
     seen, views_in_all = 0, views_around(rays)
     for views, measured, weight, aside in batches_around(rays):
-        areal, _ = project_gaussians(gaussians, weights, views, scene.kernel, scene.cutoff)
+        areal, _ = project_gaussians(gaussians, weights, views, scene.kernel)
         weight = weight + aside
         areal = areal * scene.areal_scale
         whole_beam = measured if rays.dimmed is None else measured + rays.dimmed

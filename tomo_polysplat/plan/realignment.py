@@ -1,7 +1,8 @@
 """Moves of the scanner that opposite rays do not tell, by default: roll, tilt, single views, and an axis they miss.
 
-What a fit of a pass leaves of the rays tells them. Where there are any, two or three more fits find them to hundredths
-of a pixel, and rays held out of these have to confirm them.
+What a fit of a pass leaves of the rays tells them: one that the questions of the run ask for, too, or of joined pixels.
+Where there are any, three or four more fits find them to hundredths of a pixel, and rays held out of these have to
+confirm them.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.axis import axis_of
 from tomo_polysplat.plan.coarse import coarse_problem, coarse_settings
 from tomo_polysplat.plan.first_gaussians import first_gaussians
+from tomo_polysplat.plan.first_look import Look
 from tomo_polysplat.plan.first_volume import first_volume
 from tomo_polysplat.plan.means import Means
 from tomo_polysplat.plan.model import rays_of, scene_of
@@ -36,7 +38,7 @@ from tomo_polysplat.scan.gauges import effects, view_gauge
 from tomo_polysplat.scan.moved_rays import falls_of
 from tomo_polysplat.scan.moves import Scanner, moved_geometry
 
-__all__ = ["realigned"]
+__all__ = ["is_joined", "realigned"]
 
 logger = logging.getLogger(__name__)
 
@@ -52,8 +54,9 @@ _LEAST, _SURE, _LEAST_OF_VIEWS, _FOUND = 0.01, 2.5, 0.03, 2.0
 _BETTER, _SURELY_BETTER = 0.01, 2.5
 # Fits, their passes, and the change, in pixels, after which the moves are known.
 _ROUNDS, _PASSES, _SETTLED = 5, 1.0, 0.02
-# A run of fewer passes is not asked: a fit would be too large a part of it.
-_LEAST_PASSES = 5.0
+# A run of fewer passes is not asked by joined pixels: these are a quarter of all, or less, and a pass over them would
+# take more than a tenth of it.
+_LEAST_PASSES = 2.5
 # A larger detector is asked by joined pixels, of which at least so many columns are left: moves show to hundredths.
 _COLUMNS = 256
 # A step may be so many times what a fit says. An axis stays if less than this of a step is gained: half acquisitions
@@ -86,7 +89,13 @@ class _Left:
     held_out: np.ndarray
 
 
-def realigned(problem: Problem, axis: Answer, means: Means, report: Callable[[float, str], Any]) -> Answer:
+def realigned(
+    problem: Problem,
+    axis: Answer,
+    first: Look | None,
+    means: Means,
+    report: Callable[[float, str], Any],
+) -> Answer:
     """Where the scanner stood, as a fit of one pass tells it; a few more find it out where it says that it moved.
 
     Parameters
@@ -95,6 +104,8 @@ def realigned(problem: Problem, axis: Answer, means: Means, report: Callable[[fl
         As told.
     axis : Answer
         Of `plan.axis.find_axis`, with which it begins.
+    first : Look or None
+        By the scanner with that axis. Nothing is asked without one, but of a large detector, by joined pixels.
     means : Means
     report : callable
         Gets the share done, none, and words.
@@ -104,13 +115,18 @@ def realigned(problem: Problem, axis: Answer, means: Means, report: Callable[[fl
     Answer
         That of the axis, where there is no more to move, or where held-out rays do not confirm it.
     """
-    if (means.settings.passes or math.inf) < _LEAST_PASSES:
+    joined = is_joined(problem)
+    if (means.settings.passes or math.inf) < _LEAST_PASSES if joined else first is None:
         return axis
     report(0.0, "alignment")
     try:
         coarse, pixel = _joined(problem)
         start = _times(_tensors(axis.value), 1 / pixel)
-        moved, misfits = _Realignment(coarse, axis, means).moved(start)
+        fits = _Realignment(coarse, axis, means)
+        if first is not None and not joined and not fits.is_clear(first, start):
+            logger.info("Alignment: no more has moved")
+            return axis
+        moved, misfits = fits.moved(start)
     except Exception as broken:
         # Processes that share the steps may be left behind by one that fails.
         if current_ranks().count > 1:
@@ -132,11 +148,16 @@ def realigned(problem: Problem, axis: Answer, means: Means, report: Callable[[fl
     return Answer(moves, f"{words}; the {share}", Status.ASKED, evidence)
 
 
+def is_joined(problem: Problem) -> bool:
+    """Whether the detector is so large that it is asked by joined pixels."""
+    return problem.geometry.columns // _COLUMNS >= 2
+
+
 def _joined(problem: Problem) -> tuple[Problem, np.ndarray]:
     """The problem by joined pixels where these are many, and how many columns and rows are joined."""
-    factor = problem.geometry.columns // _COLUMNS
-    if factor < 2:
+    if not is_joined(problem):
         return problem, np.ones(2)
+    factor = problem.geometry.columns // _COLUMNS
     coarse, rows = coarse_problem(problem, factor)
     return coarse, np.array([factor, rows], float)
 
@@ -170,6 +191,10 @@ class _Realignment:
         self.seen = np.array([found[name].pixels for name in self.names])
         self.gauge = view_gauge(self.scanner).numpy()
         self.settings = replace(coarse_settings(means.settings), passes=_PASSES)
+
+    def is_clear(self, look: Look, values: dict[str, torch.Tensor]) -> bool:
+        """Whether a fit says that the scanner moved from where these moves have it."""
+        return self._left(look.gaussians, look.lab.scene, look.lab.rays, values).clear
 
     def moved(self, start: dict[str, torch.Tensor]) -> tuple[dict[str, torch.Tensor], list[np.ndarray]]:
         """Where the scanner stood, and the misfits of held-out rays of fits by it, the first as it is."""

@@ -18,10 +18,12 @@ from tomo_polysplat.fit.stopping import Clock, FitState, Stop, StopReason
 from tomo_polysplat.fit.surroundings import cut_out
 from tomo_polysplat.kernels.compile_time import compiled_seconds, working_time
 from tomo_polysplat.model.gaussians import Gaussians
-from tomo_polysplat.plan.alignment import align
 from tomo_polysplat.plan.answer import Answer, Status
+<<<<<<< HEAD
 from tomo_polysplat.plan.axis import aligned, find_axis
 from tomo_polysplat.plan.bowtie import behind_bowtie, find_bowtie
+=======
+>>>>>>> main
 from tomo_polysplat.plan.calibration import Calibration
 from tomo_polysplat.plan.checkpoint import Checkpoint
 from tomo_polysplat.plan.decision import When
@@ -31,8 +33,16 @@ from tomo_polysplat.plan.lab import Lab
 from tomo_polysplat.plan.never_worse import judge, note_seeds
 from tomo_polysplat.plan.order import ask_between, decide
 from tomo_polysplat.plan.plan import Plan
-from tomo_polysplat.plan.preparation import PreparedFit, RunOptions, calibrate, physics, prepare, under
-from tomo_polysplat.plan.realignment import realigned
+from tomo_polysplat.plan.preparation import (
+    PreparedFit,
+    RunOptions,
+    calibrate,
+    no_result_yet,
+    physics,
+    prepare,
+    under,
+)
+from tomo_polysplat.plan.scanner_as_it_was import STAYS, scanner_as_it_was
 from tomo_polysplat.plan.steady_light import SteadyLight
 
 __all__ = ["Solver"]
@@ -41,8 +51,11 @@ logger = logging.getLogger(__name__)
 
 # Seconds that are kept for what comes after the fit besides the volume, where there is a time budget.
 _FINISHING = 0.03
+<<<<<<< HEAD
 # Facts that a run which begins anew does not find again.
 _STAYS = ("alignment", "bowtie", "gains", "drift")
+=======
+>>>>>>> main
 
 
 @dataclass(frozen=True)
@@ -94,11 +107,25 @@ class Solver:
         KeyboardInterrupt
             After Ctrl-C before the fit has begun.
         """
+<<<<<<< HEAD
         problem, alignment = self._aligned(problem)
         problem, filters = self._filtered(problem)
         problem, plan = physics(problem, wanted, self.run_options, self.saved, self.report)
         plan.facts |= alignment | filters
         prepared = prepare(problem, plan, self.run_options, self.saved, self.report)
+=======
+        with no_result_yet():
+            told, facts, lab = scanner_as_it_was(
+                problem, self.moved, self.run_options, self.saved, self.report
+            )
+        problem, plan = physics(told, wanted, self.run_options, self.saved, self.report)
+        plan.facts |= facts
+        # Other physics have another start.
+        lab = lab if problem is told else None
+        prepared = prepare(problem, plan, self.run_options, self.saved, self.report, lab)
+        # A GPU has room for its short fits no longer.
+        del lab
+>>>>>>> main
         if self.saved is not None:
             self.saved.share_taken(problem)
         outcome = self._fit(prepared, problem, ask_scatter)
@@ -126,6 +153,7 @@ class Solver:
         prepared.plan.note("returned", "start", f"{words}: the volume is the one that it began from")
         logger.warning("The start volume is returned: %s.", prepared.plan.facts["returned"].why)
 
+<<<<<<< HEAD
     def _aligned(self, problem: Problem) -> tuple[Problem, dict[str, Answer]]:
         """The problem by the scanner as it stood, and what the plan tells of that; a checkpoint's plan knows it."""
         if self.moved is None:
@@ -153,13 +181,15 @@ class Solver:
             found = find_bowtie(problem, self.run_options, self.report)
         return behind_bowtie(problem, found.value), {"bowtie": found}
 
+=======
+>>>>>>> main
     def _anew(
         self, problem: Problem, prepared: PreparedFit, so_far: FitOutcome
     ) -> tuple[Problem, PreparedFit, FitOutcome]:
         """What `solve` gives, under other physics than those that a fit had begun with."""
         found = so_far.restart
         other, plan = under(problem, found)
-        plan.facts |= {name: fact for name, fact in prepared.plan.facts.items() if name in _STAYS}
+        plan.facts |= {name: fact for name, fact in prepared.plan.facts.items() if name in STAYS}
         try:
             anew = prepare(other, plan, self.run_options, self.saved, self.report)
             outcome = self._fit(anew, other, ask_scatter=False)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from tomo_polysplat.checks import require_array, require_shape
+from tomo_polysplat.result.detail import ShellCorrelation
 
-__all__ = ["HALVES", "TRUTH", "ShellCorrelation", "first_below", "shell_correlation"]
+__all__ = ["HALVES", "TRUTH", "first_below", "shell_correlation"]
 
 # Where a volume of all views correlates by 1/2 with the truth, halves of them correlate by 1/7 if their errors are
 # independent: the correlation with the truth is sqrt(2 c / (1 + c)), and 1/2 at c = 1/7 (Rosenthal and Henderson 2003,
@@ -16,21 +15,6 @@ __all__ = ["HALVES", "TRUTH", "ShellCorrelation", "first_below", "shell_correlat
 HALVES, TRUTH = 1 / 7, 0.5
 # A shell of fewer coefficients says little; shells are averaged with those beside them, weighed by their numbers.
 _FEWEST = 12
-
-
-class ShellCorrelation(NamedTuple):
-    """Correlation by spatial frequency.
-
-    Attributes
-    ----------
-    frequency : (n,) array
-        Middle of each shell, in cycles per unit of length, up to half a cycle a voxel.
-    correlation : (n,) array
-        -1 to 1; NaN where a shell holds next to nothing.
-    """
-
-    frequency: np.ndarray
-    correlation: np.ndarray
 
 
 def shell_correlation(

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from tomo_polysplat.checks import fail
 from tomo_polysplat.quality.again import fit_again, levels_of, require_scan_of, voxel_edge
-from tomo_polysplat.quality.fourier_shell import HALVES, ShellCorrelation, first_below, shell_correlation
+from tomo_polysplat.quality.fourier_shell import HALVES, first_below, shell_correlation
+from tomo_polysplat.result.detail import Resolution
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.scan.scan import Scan
 from tomo_polysplat.start.agreement import places_of_views
 
-__all__ = ["Resolution", "resolution", "weight_of"]
+__all__ = ["resolution", "weight_of"]
 
 logger = logging.getLogger(__name__)
 
@@ -27,46 +27,6 @@ _FEWEST_VIEWS = 10
 _BESIDE_METAL, _SOFT_EDGE, _MAP = 2, 1.5, 2.0
 # Voxels along an edge of the middle part that is compared, of a larger volume.
 _LONGEST = 512
-
-
-@dataclass(frozen=True, eq=False)
-class Resolution:
-    """How fine the detail is that half the views and the other half show alike.
-
-    Attributes
-    ----------
-    period : float
-        Of the finest waves on which two halves of the views agree (correlation of 1/7), in `unit`. Detail of half a
-        period is seen as such. Two voxels is the least that a volume can show.
-    by_voxels : bool
-        Whether the halves agree down to that.
-    voxel : float
-        Edge of a voxel.
-    unit : str
-    curve : ShellCorrelation
-    doubt : (z, y, x) float32 array
-        Standard deviation, in 1/`unit`, of the whole result that the difference of the halves tells, over about four
-        voxels: large where halves disagree. What both have wrong, as beside metal, it does not tell.
-    seconds : float
-        That the two fits took.
-    """
-
-    period: float
-    by_voxels: bool
-    voxel: float
-    unit: str
-    curve: ShellCorrelation
-    doubt: np.ndarray
-    seconds: float
-
-    def describe(self) -> str:
-        """One sentence."""
-        size = f"{self.period:.3g} {self.unit} ({self.period / self.voxel:.2g} voxels)"
-        if self.by_voxels:
-            return f"Two halves of the views agree on all that the voxels can show, waves of {size}."
-        return (
-            f"Two halves of the views agree on waves of {size} and longer (Fourier shell correlation of 1/7)."
-        )
 
 
 def resolution(result: Result, scan: Scan, *, device: str = "auto", progress: Any = None) -> Resolution:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,12 +14,13 @@ from tomo_polysplat.physics.beer_lambert import projection
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.physics.water import areal_density
 from tomo_polysplat.quality.again import fit_again, geometry_of, levels_of, require_scan_of, voxel_edge
+from tomo_polysplat.result.detail import Contrast
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, from_astra
 from tomo_polysplat.scan.scan import Scan
 from tomo_polysplat.units import cm_per
 
-__all__ = ["Contrast", "contrast", "ball_in_voxels", "paths_through_balls", "places_for_balls"]
+__all__ = ["contrast", "ball_in_voxels", "paths_through_balls", "places_for_balls"]
 
 logger = logging.getLogger(__name__)
 
@@ -32,47 +32,6 @@ _APART, _RING = 2.0, 2.0
 _MATTER = 0.5
 # Points a voxel and axis that tell how much of it lies in a ball.
 _POINTS = 5
-
-
-@dataclass(frozen=True, eq=False)
-class Contrast:
-    """Share of their contrast that faint balls keep.
-
-    Attributes
-    ----------
-    diameters : (n,) array
-        Of the balls, in `unit`.
-    kept : (n,) array
-        Mean share of their true contrast, in the volume with them less that without; NaN where no place was found.
-    error : (n,) array
-        Standard deviation of that mean, from how the balls of a size differ; NaN for a single one.
-    added : float
-        Their contrast, as a share of the attenuation of the object's main matter.
-    voxel : float
-        Edge of a voxel.
-    unit : str
-    seconds : float
-        That the fit with them took.
-    """
-
-    diameters: np.ndarray
-    kept: np.ndarray
-    error: np.ndarray
-    added: float
-    voxel: float
-    unit: str
-    seconds: float
-
-    def describe(self) -> str:
-        """One sentence."""
-        told = [
-            f"{kept:.2f} of it at {diameter / self.voxel:.2g} voxels across"
-            for diameter, kept in zip(self.diameters, self.kept)
-            if np.isfinite(kept)
-        ]
-        if not told:
-            return "The object has no place for a faint ball away from its surface and from metal."
-        return f"A ball that differs by {self.added:.0%} from the matter around it keeps {', '.join(told)}."
 
 
 # One parameter for each option that a caller names.

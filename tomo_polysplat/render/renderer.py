@@ -15,6 +15,7 @@ from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 
 __all__ = [
+    "RAY_CUTOFF",
     "VOXEL_CUTOFF",
     "detector_views",
     "project_gaussians",
@@ -24,9 +25,9 @@ __all__ = [
     "voxelise_peaks",
 ]
 
-# Cut-off of Gaussians in a volume, in deviations. It keeps the mass of a projected Gaussian cut at 3, 1 - exp(-9/2):
+# Where Gaussians end, in deviations: projected, and in a volume. Both keep the same mass, 1 - exp(-9/2): the second is
 # the solution c of erf(c/sqrt 2) - sqrt(2/pi) c exp(-c^2/2) = 1 - exp(-9/2).
-VOXEL_CUTOFF = 3.33424
+RAY_CUTOFF, VOXEL_CUTOFF = 3.0, 3.33424
 # Samples per voxel and axis for thin Gaussians, which are sampled in groups that need as many: twice as many samples an
 # axis are eight times as many points. The last number is the most samples held at once.
 _SAMPLES, _SLAB = (3, 6, 12, 24), 1 << 25
@@ -58,7 +59,6 @@ def project_gaussians(
     weights: torch.Tensor,
     views: DetectorViews,
     kernel: str,
-    cutoff: float,
     vectors: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, int]:
     """(channels, views, rows, columns) line integrals, and the pairs skipped at the source plane.
@@ -72,7 +72,7 @@ def project_gaussians(
         weights,
         views,
         kernel=kernel,
-        cutoff=cutoff,
+        cutoff=RAY_CUTOFF,
         vectors=vectors,
     )
 

@@ -13,8 +13,7 @@ from tomo_polysplat.report.style import ACCENT, QUIET
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from tomo_polysplat.quality.halves import Resolution
-    from tomo_polysplat.quality.inserts import Contrast
+    from tomo_polysplat.result.detail import Contrast, Resolution
 
 __all__ = ["detail"]
 

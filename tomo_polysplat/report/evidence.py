@@ -11,7 +11,7 @@ from tomo_polysplat.report.style import ACCENT, QUIET, SAFE
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from tomo_polysplat.report.residuals import Residuals
+    from tomo_polysplat.result.residuals import Residuals
 
 __all__ = ["by_pixel_figure", "by_view_figure"]
 

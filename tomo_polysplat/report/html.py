@@ -19,15 +19,15 @@ from tomo_polysplat.report.evidence import by_pixel_figure, by_view_figure
 from tomo_polysplat.report.figures import history_figure, png_bytes, slices_figure
 from tomo_polysplat.report.materials import histogram_figure
 from tomo_polysplat.report.page import folded, image, page, section, text
-from tomo_polysplat.report.residuals import Residuals
+from tomo_polysplat.report.residuals import residuals_of
 from tomo_polysplat.report.slices import Plane, display_window, planes_through
 from tomo_polysplat.report.style import OURS, full_name
 from tomo_polysplat.report.verdict import verdict
+from tomo_polysplat.result.residuals import Residuals
 
 if TYPE_CHECKING:
-    from tomo_polysplat.quality.halves import Resolution
-    from tomo_polysplat.quality.inserts import Contrast
-    from tomo_polysplat.result.result import Result
+    from tomo_polysplat.result.data import ResultData
+    from tomo_polysplat.result.detail import Contrast, Resolution
     from tomo_polysplat.scan.scan import Scan
 
 __all__ = ["image", "of_scan", "page", "title_of", "told", "write_report"]
@@ -39,7 +39,7 @@ Volumes = list[tuple[str, np.ndarray]]
 
 # One parameter for each option that a caller names.
 def write_report(
-    result: Result,
+    result: ResultData,
     path: str | os.PathLike,
     *,
     scan: Scan | None = None,
@@ -72,7 +72,7 @@ def write_report(
     write_text(path, page(f"{title} – tomo-polysplat", body), overwrite=overwrite)
 
 
-def told(result: Result, residuals: Residuals | None) -> list[str]:
+def told(result: ResultData, residuals: Residuals | None) -> list[str]:
     """Pieces of HTML on how well the rays are explained and what was decided, without slices and for another page."""
     return [
         f'<p class="note">{text(_about(result))}</p>',
@@ -83,12 +83,12 @@ def told(result: Result, residuals: Residuals | None) -> list[str]:
     ]
 
 
-def _verdict(result: Result, residuals: Residuals | None) -> list[str]:
+def _verdict(result: ResultData, residuals: Residuals | None) -> list[str]:
     sentences = "".join(f"<p>{text(words)}</p>" for words in verdict(result, residuals))
     return [f'<div class="verdict">{sentences}</div>']
 
 
-def _speed(result: Result) -> list[str]:
+def _speed(result: ResultData) -> list[str]:
     figure = history_figure(result.history)
     return [
         "<h2>Speed against error</h2>",
@@ -96,13 +96,13 @@ def _speed(result: Result) -> list[str]:
     ]
 
 
-def title_of(result: Result, scan: Scan | None) -> str:
+def title_of(result: ResultData, scan: Scan | None) -> str:
     """The scan's name, where somebody has told it."""
     told = result.provenance.get("scan") or ("" if scan is None else scan.name)
     return str(told or "Reconstruction")
 
 
-def _about(result: Result) -> str:
+def _about(result: ResultData) -> str:
     nz, ny, nx = result.grid.shape
     size = " x ".join(f"{edge:.4g}" for edge in result.grid.voxel_size)
     energy = "" if result.energy_kev is None else f" at {result.energy_kev:.1f} keV"
@@ -113,7 +113,7 @@ def _about(result: Result) -> str:
     )
 
 
-def of_scan(result: Result, scan: Scan) -> tuple[Residuals | None, Volumes]:
+def of_scan(result: ResultData, scan: Scan) -> tuple[Residuals | None, Volumes]:
     """Residuals, and the volume of the standard method by its name; what fails is left out, which the log says.
 
     Residuals that the result has already are taken, others are kept in it.
@@ -124,20 +124,22 @@ def of_scan(result: Result, scan: Scan) -> tuple[Residuals | None, Volumes]:
         require_shape("the scan's volume", volume, result.grid.shape, "of the result")
         beside.append((full_name(name.lower()) if name == "FDK" else name, volume))
         if residuals is None and result.gaussians:
-            residuals = result.explain(scan)
+            residuals = result.residuals = residuals_of(result, scan)
     except (ValueError, RuntimeError, MemoryError) as error:
         logger.warning("The page does without what the scan would tell: %s", error)
     return residuals, beside
 
 
-def _spatial(result: Result, volume: np.ndarray) -> np.ndarray:
+def _spatial(result: ResultData, volume: np.ndarray) -> np.ndarray:
     """As (z, y, x) with y ascending, whatever order the caller's geometry has."""
     volume = np.asarray(volume)
     require_shape("truth, metal_mask", volume, result.volume.shape, "of the volume")
     return volume[None, ::-1] if result.flipped_2d else volume
 
 
-def _slices(result: Result, shown: Volumes, truth: np.ndarray | None, metal: np.ndarray | None) -> list[str]:
+def _slices(
+    result: ResultData, shown: Volumes, truth: np.ndarray | None, metal: np.ndarray | None
+) -> list[str]:
     """The browser of axial slices, and the other two planes below it."""
     ours = dict(shown)[full_name(OURS)]
     window = display_window(ours if truth is None else truth, metal)
@@ -147,14 +149,14 @@ def _slices(result: Result, shown: Volumes, truth: np.ndarray | None, metal: np.
 
 
 def _other_planes(
-    result: Result, shown: Volumes, window: tuple[float, float], planes: list[Plane]
+    result: ResultData, shown: Volumes, window: tuple[float, float], planes: list[Plane]
 ) -> list[str]:
     figure = slices_figure(shown, result.unit, result.energy_kev, window, planes)
     return ["<h2>The other two planes</h2>", image(png_bytes(figure), "coronal and sagittal slices")]
 
 
 def _errors(
-    result: Result, volume: np.ndarray, truth: np.ndarray | None, metal: np.ndarray | None
+    result: ResultData, volume: np.ndarray, truth: np.ndarray | None, metal: np.ndarray | None
 ) -> list[str]:
     if truth is None:
         return []
@@ -183,7 +185,7 @@ def _rays(residuals: Residuals | None) -> list[str]:
     ]
 
 
-def _decided(result: Result) -> list[str]:
+def _decided(result: ResultData) -> list[str]:
     """The decisions that mattered, each with its evidence."""
     told = []
     for subject, one in decisions(result.plan):
@@ -193,7 +195,7 @@ def _decided(result: Result) -> list[str]:
     return ["<h2>What was decided, and why</h2>", f"<dl>{''.join(told)}</dl>"] if told else []
 
 
-def _folded(result: Result) -> list[str]:
+def _folded(result: ResultData) -> list[str]:
     parts = [
         *folded("The rest of the plan", rest_of_plan(result.plan)),
         *folded("Left out or limited: counts", result.counts),

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from tomo_polysplat.result.result import Result
+    from tomo_polysplat.result.data import ResultData
 
 __all__ = ["histogram_figure", "marks"]
 
@@ -27,7 +27,7 @@ _MOST = 4_000_000
 _LEAST = 2e-3
 
 
-def histogram_figure(result: Result) -> Figure:
+def histogram_figure(result: ResultData) -> Figure:
     """Voxels by their attenuation, both axes logarithmic, stacked by which curve most of their matter follows."""
     from matplotlib.figure import Figure
 
@@ -53,7 +53,7 @@ def histogram_figure(result: Result) -> Figure:
     return figure
 
 
-def _mark(axis: Axes, result: Result, top: float) -> None:
+def _mark(axis: Axes, result: ResultData, top: float) -> None:
     """Lines at what the base materials have at their usual density."""
     for name, place in marks(result):
         if _LEAST * top < place <= 1.5 * top:
@@ -62,7 +62,7 @@ def _mark(axis: Axes, result: Result, top: float) -> None:
             axis.text(1.02 * place, 0.97, name, va="top", fontsize=8, color=QUIET, transform=beside)
 
 
-def _groups(result: Result, step: int, values: np.ndarray) -> list[tuple[str, np.ndarray]]:
+def _groups(result: ResultData, step: int, values: np.ndarray) -> list[tuple[str, np.ndarray]]:
     """Name and values of the voxels that are mostly of one curve."""
     if result.materials is None:
         return [("all voxels", values)]
@@ -78,7 +78,7 @@ def material_name(material: Any) -> str:
     return material if isinstance(material, str) else " + ".join(map(str, material))
 
 
-def marks(result: Result) -> list[tuple[str, float]]:
+def marks(result: ResultData) -> list[tuple[str, float]]:
     """The base materials at their usual density, by attenuation in 1/unit at the volume's energy."""
     if result.materials is None or result.energy_kev is None:
         return []

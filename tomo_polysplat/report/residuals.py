@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,88 +16,36 @@ from tomo_polysplat.physics.detector_blur import LARGEST_BLUR, blurred
 from tomo_polysplat.physics.filter_map import FilterMap
 from tomo_polysplat.physics.pixel_light import averaged_light
 from tomo_polysplat.physics.scatter import light_around
-from tomo_polysplat.render.renderer import detector_views
+from tomo_polysplat.render.renderer import RAY_CUTOFF, detector_views
 from tomo_polysplat.report.decided import RayPhysics, ray_physics
 from tomo_polysplat.report.held_out import HeldOut
 from tomo_polysplat.report.where import MisfitMap
+<<<<<<< HEAD
 from tomo_polysplat.result.filter_found import filter_of
+=======
+from tomo_polysplat.result.residuals import Residuals
+>>>>>>> main
 from tomo_polysplat.scan.geometry import from_astra, is_planar_geometry
 from tomo_polysplat.scan.noise import photons_per_ray
 from tomo_polysplat.scan.usable import usable_rays
 from tomo_polysplat.units import cm_per
 
 if TYPE_CHECKING:
-    from tomo_polysplat.result.result import Result
+    from tomo_polysplat.result.data import ResultData
     from tomo_polysplat.scan.scan import Scan
 
-__all__ = ["MOST_VIEWS", "Residuals", "residuals_of"]
+__all__ = ["MOST_VIEWS", "residuals_of"]
 
 # Views that are looked at, evenly spread over the scan, and together; and pixels of the map along an edge.
 MOST_VIEWS, _AT_ONCE, _MAP = 180, 4, 192
-# Where a Gaussian's projection ends, in deviations, unless the settings say.
-_CUTOFF = 3.0
 # Rays times energies that are held at once.
 _NUMBERS = 1 << 26
 # A ray this many deviations off is not explained.
 _FAR = 3.0
 
 
-@dataclass(frozen=True, eq=False)
-class Residuals:
-    """What the model says of the rays, less what was measured.
-
-    Attributes
-    ----------
-    views : (n,) int array
-        The views looked at.
-    by_view : (n,) array
-        Root mean square of the residuals of each, in units of noise; NaN where no ray of it is usable.
-    by_pixel : (rows, columns) array
-        The same of each pixel over the views; blocks of pixels where there are many, NaN where none is usable.
-    bias : (rows, columns) array
-        Mean residual, model less measurement, in units of noise: what noise alone would average out.
-    held_out : (n,) array
-        As `by_view`, of the rays alone that the fit has not seen; NaN where there are none.
-    rms, within : float
-        Root mean square over all rays, and the share of them that is off by less than three deviations.
-    rms_held_out : float
-        That over the rays the fit has not seen; NaN where there are none.
-    rays : int
-        Usable rays looked at.
-    photons : float
-        Of an unattenuated ray, from which the noise follows; infinity for data without noise, whose residuals are
-        those of -log(I/I0) themselves.
-    worst : (3,) array
-        Where in the volume the rays meet that are explained worst, (x, y, z); see ``report.where``.
-    worst_value, usual_value : float
-        Root mean square of the rays through there, and through the middling point of the volume.
-    block : int
-        Pixels along an edge of a block of the maps.
-    """
-
-    views: np.ndarray
-    by_view: np.ndarray
-    by_pixel: np.ndarray
-    bias: np.ndarray
-    held_out: np.ndarray
-    rms: float
-    within: float
-    rms_held_out: float
-    rays: int
-    photons: float
-    worst: np.ndarray
-    worst_value: float
-    usual_value: float
-    block: int = 1
-
-    @property
-    def unit(self) -> str:
-        """What the numbers are in."""
-        return "deviations of the noise" if np.isfinite(self.photons) else "units of -log(I/I0)"
-
-
 def residuals_of(
-    result: Result, scan: Scan, *, device: str = "auto", most_views: int = MOST_VIEWS
+    result: ResultData, scan: Scan, *, device: str = "auto", most_views: int = MOST_VIEWS
 ) -> Residuals:
     """Project the Gaussians of a result along the rays of its scan, and compare.
 
@@ -144,7 +91,7 @@ def residuals_of(
     return _collected(model, values, chosen, photons, MisfitMap(some, grid), unseen)
 
 
-def _as_steady(values: np.ndarray, result: Result) -> np.ndarray:
+def _as_steady(values: np.ndarray, result: ResultData) -> np.ndarray:
     """The projections (views, rows, columns) less gains and drift that the fit has taken out, in place."""
     for part, shape in ((result.gains, values.shape[1:]), (result.drift, (len(values), 1, 1))):
         if part is not None:
@@ -156,11 +103,10 @@ class _Model:
     """Predicts -log(I/I0) of some views from the Gaussians of a result."""
 
     def __init__(
-        self, result: Result, views: DetectorViews, device: torch.device, behind: FilterMap | None = None
+        self, result: ResultData, views: DetectorViews, device: torch.device, behind: FilterMap | None = None
     ) -> None:
         self.views, self.device = views, device
         self.kernel, _ = choose(device)
-        self.cutoff = float(result.settings.get("cutoff", _CUTOFF))
         self.physics: RayPhysics = ray_physics(result.plan)
         parts = {name: np.asarray(part, np.float32) for name, part in result.gaussians.items()}
         density, u = parts["density"], parts["u"]
@@ -176,7 +122,7 @@ class _Model:
             known = (behind.attenuation(result.spectrum.energies), behind.areal, self.dimmed)
             self.behind = tuple(torch.from_numpy(np.asarray(a, np.float32)).to(device) for a in known)
 
-    def _spectral_lines(self, result: Result) -> tuple[torch.Tensor, torch.Tensor] | None:
+    def _spectral_lines(self, result: ResultData) -> tuple[torch.Tensor, torch.Tensor] | None:
         """Logarithm of the weights, and attenuation (energies, curves) of densities times lengths in the unit."""
         if result.materials is None or result.spectrum is None:
             return None
@@ -191,7 +137,7 @@ class _Model:
         views, parts = self.views.select(some), self.physics.pixel_rays
         fine = views if parts == 1 else views.finer(parts)
         position, scale, rotation, weight = self.gaussians
-        areal, _ = project(position, scale, rotation, weight, fine, kernel=self.kernel, cutoff=self.cutoff)
+        areal, _ = project(position, scale, rotation, weight, fine, kernel=self.kernel, cutoff=RAY_CUTOFF)
         if self.lines is None:
             values = areal[0]
         else:

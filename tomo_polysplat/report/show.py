@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -12,9 +12,7 @@ from tomo_polysplat.report.linked import LinkedSlices
 from tomo_polysplat.report.page import data_uri, rows, text
 from tomo_polysplat.report.slices import display_window, planes_through
 from tomo_polysplat.report.style import OURS, full_name
-
-if TYPE_CHECKING:
-    from tomo_polysplat.result.result import Result
+from tomo_polysplat.result.data import ResultData
 
 __all__ = ["show", "snippet"]
 
@@ -23,7 +21,9 @@ _THUMBNAIL = 220
 
 
 def show(
-    result: Result, others: Mapping[str, Any] | Result | np.ndarray | None, window: tuple[float, float] | None
+    result: ResultData,
+    others: Mapping[str, Any] | ResultData | np.ndarray | None,
+    window: tuple[float, float] | None,
 ) -> Any:
     """See :meth:`tomo_polysplat.result.result.Result.show`."""
     widgets = _widgets()
@@ -70,23 +70,21 @@ def _widgets() -> Any:
     return ipywidgets
 
 
-def _volumes(result: Result, others: Any) -> dict[str, np.ndarray]:
+def _volumes(result: ResultData, others: Any) -> dict[str, np.ndarray]:
     """Volumes (z, y, x) by name, ours first."""
-    from tomo_polysplat.result.result import Result
-
     if others is None:
         others = {}
     elif not isinstance(others, Mapping):
         others = {"other": others}
     volumes = {full_name(OURS): result.volume}
     for name, other in others.items():
-        values = np.asarray(other.volume if isinstance(other, Result) else other, np.float32)
+        values = np.asarray(other.volume if isinstance(other, ResultData) else other, np.float32)
         require_shape(name, values, result.volume.shape, "of the result's volume")
         volumes[str(name)] = values
     return {name: v[None, ::-1] if v.ndim == 2 else v for name, v in volumes.items()}
 
 
-def snippet(result: Result) -> str:
+def snippet(result: ResultData) -> str:
     """A slice through the middle and the main numbers, as a piece of HTML."""
     nz, ny, nx = result.grid.shape
     energy = "unknown" if result.energy_kev is None else f"{result.energy_kev:.1f} keV"
@@ -104,7 +102,7 @@ def snippet(result: Result) -> str:
     return f'<div style="{layout}">{picture}<div>{head}{rows(facts)}</div></div>'
 
 
-def _thumbnail(result: Result) -> bytes:
+def _thumbnail(result: ResultData) -> bytes:
     """PNG of the middle slice; of that alone, for the whole volume may take a while."""
     import io
 

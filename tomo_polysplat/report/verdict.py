@@ -14,8 +14,8 @@ from tomo_polysplat.report.decided import (
 )
 
 if TYPE_CHECKING:
-    from tomo_polysplat.report.residuals import Residuals
-    from tomo_polysplat.result.result import Result
+    from tomo_polysplat.result.data import ResultData
+    from tomo_polysplat.result.residuals import Residuals
 
 __all__ = ["distrusted", "explained", "verdict"]
 
@@ -33,12 +33,12 @@ _FAR_OFF = 5.0
 _NORMAL = 0.9973
 
 
-def verdict(result: Result, residuals: Residuals | None) -> list[str]:
+def verdict(result: ResultData, residuals: Residuals | None) -> list[str]:
     """The three sentences."""
     return [explained(result, residuals), found_about_the_scanner(result.plan), distrusted(result, residuals)]
 
 
-def explained(result: Result, residuals: Residuals | None) -> str:
+def explained(result: ResultData, residuals: Residuals | None) -> str:
     """How well the model explains the rays, in units of their noise where the scan is at hand."""
     if residuals is not None:
         if not np.isfinite(residuals.photons):
@@ -61,7 +61,7 @@ def explained(result: Result, residuals: Residuals | None) -> str:
     )
 
 
-def distrusted(result: Result, residuals: Residuals | None) -> str:
+def distrusted(result: ResultData, residuals: Residuals | None) -> str:
     """What to distrust, and where."""
     found = doubts(result.plan)
     found += [] if residuals is None else _doubts_of_residuals(result, residuals)
@@ -81,7 +81,7 @@ def distrusted(result: Result, residuals: Residuals | None) -> str:
     return f"Distrust {'; '.join(found)}."
 
 
-def _doubts_of_residuals(result: Result, residuals: Residuals) -> list[str]:
+def _doubts_of_residuals(result: ResultData, residuals: Residuals) -> list[str]:
     doubts = []
     usual = residuals.usual_value
     if usual > 0 and residuals.worst_value > _ODD_PLACE * usual and residuals.worst_value > 2.0:
@@ -137,7 +137,7 @@ def _views(odd: np.ndarray) -> str:
     )
 
 
-def _doubts_of_counts(result: Result) -> list[str]:
+def _doubts_of_counts(result: ResultData) -> list[str]:
     counts = result.counts
     doubts: list[str] = []
     rays = counts.get("rays") or 0

@@ -14,7 +14,7 @@ import json
 import math
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -23,9 +23,9 @@ from tomo_polysplat.files import replacing, write_text
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.plain_file import PlainFile
 from tomo_polysplat.plan.answer import Answer
+from tomo_polysplat.result.data import GAUSSIAN_PARTS, ResultData
 from tomo_polysplat.result.image import Image
 from tomo_polysplat.result.residuals_file import read_residuals, write_residuals
-from tomo_polysplat.result.result import GAUSSIAN_PARTS, Result
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.scan.hdf5 import (
     find_array,
@@ -45,6 +45,8 @@ from tomo_polysplat.scan.hdf5_writer import new_hdf5
 from tomo_polysplat.units import LENGTH_UNITS
 
 __all__ = ["load_hdf5", "plain", "save_hdf5", "write_json", "write_npy"]
+
+Made = TypeVar("Made", bound=ResultData)
 
 FORMAT = 1
 # In any unit; squares of larger ones are beyond single precision.
@@ -85,7 +87,7 @@ def write_json(path: str | os.PathLike, content: Any, *, overwrite: bool) -> Non
     write_text(path, json.dumps(plain(content), indent=2) + "\n", overwrite=overwrite)
 
 
-def save_hdf5(result: Result, path: str | os.PathLike, *, overwrite: bool = False) -> None:
+def save_hdf5(result: ResultData, path: str | os.PathLike, *, overwrite: bool = False) -> None:
     """See :meth:`Result.save`."""
     arrays = [result.basis, result.basis[0], *result.gaussians.values()]
     needed = sum(np.asarray(array).nbytes for array in arrays)
@@ -108,7 +110,7 @@ def save_hdf5(result: Result, path: str | os.PathLike, *, overwrite: bool = Fals
         _write_model(file.create_group("polysplat"), result)
 
 
-def _write_model(group: Any, result: Result) -> None:
+def _write_model(group: Any, result: ResultData) -> None:
     grid = result.grid
     group.attrs.update(format=FORMAT, unit=result.unit, seconds=result.seconds, flipped_2d=result.flipped_2d)
     group.attrs.update(lower=grid.lower, upper=grid.upper)
@@ -132,8 +134,8 @@ def _write_model(group: Any, result: Result) -> None:
         group[name] = json.dumps(plain({} if part is None else part))
 
 
-def load_hdf5(path: str | os.PathLike) -> Result:
-    """See :meth:`Result.load`."""
+def load_hdf5(path: str | os.PathLike, make: type[Made]) -> Made:
+    """See :meth:`Result.load`; `make` is the class to make of it."""
     with opened(Path(path)) as file:
         group = find_group(file, "polysplat")
         if group is None or number_attribute(group, "format") is None:
@@ -148,7 +150,7 @@ def load_hdf5(path: str | os.PathLike) -> Result:
         materials = _read_materials(group)
         limit = _LARGEST if materials is None else _DENSEST
         _require_range("basis", basis, -limit, limit)
-        result = Result(
+        result = make(
             basis=basis,
             grid=VolumeGrid(basis.shape[1:], read_attribute(group, "lower"), read_attribute(group, "upper")),
             unit=require_choice("unit in the file", text_attribute(group, "unit"), LENGTH_UNITS),
@@ -168,7 +170,7 @@ def load_hdf5(path: str | os.PathLike) -> Result:
     return result
 
 
-def _take_volume(result: Result, file: Any) -> None:
+def _take_volume(result: ResultData, file: Any) -> None:
     """Map the volume of a result whose densities are mapped, instead of making it of these in memory."""
     if not is_mapped(result.basis) or result.flipped_2d:
         return

@@ -12,7 +12,7 @@ from tomo_polysplat.checks import did_you_mean, fail
 from tomo_polysplat.result.image import image_bytes, image_of, require_bits
 
 if TYPE_CHECKING:
-    from tomo_polysplat.result.result import Result
+    from tomo_polysplat.result.data import ResultData
 
 __all__ = ["ENDINGS", "Format", "format_of", "save_as"]
 
@@ -111,7 +111,7 @@ def format_of(path: str | bytes | os.PathLike, argument: str = "path") -> Format
 
 
 def save_as(
-    result: Result,
+    result: ResultData,
     path: str | os.PathLike,
     *,
     overwrite: bool = False,

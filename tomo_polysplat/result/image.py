@@ -13,7 +13,7 @@ from tomo_polysplat.checks import fail
 from tomo_polysplat.units import CM_PER_UNIT, cm_per
 
 if TYPE_CHECKING:
-    from tomo_polysplat.result.result import Result
+    from tomo_polysplat.result.data import ResultData
 
 __all__ = ["Image", "image_bytes", "image_of", "require_bits"]
 
@@ -90,7 +90,7 @@ class Image:
         return json.dumps(self.about())
 
 
-def image_of(result: Result, *, hu: bool = False, bits: int = 32, unseen_nan: bool = False) -> Image:
+def image_of(result: ResultData, *, hu: bool = False, bits: int = 32, unseen_nan: bool = False) -> Image:
     """The volume of a result.
 
     Parameters
@@ -161,7 +161,7 @@ def require_bits(bits: int, argument: str = "bits") -> None:
         raise fail(argument, "16 or 32", repr(bits))
 
 
-def _water(result: Result) -> float:
+def _water(result: ResultData) -> float:
     """Attenuation of water at the energy of the volume, in 1/unit."""
     from tomo_polysplat.physics.materials import mass_attenuation
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from tomo_polysplat.checks import fail, require_shape
+from tomo_polysplat.result.residuals import Residuals
 from tomo_polysplat.scan.hdf5 import find_group, number_attribute, read_numbers
-
-if TYPE_CHECKING:
-    from tomo_polysplat.report.residuals import Residuals
 
 __all__ = ["read_residuals", "write_residuals"]
 
@@ -46,8 +44,6 @@ def read_residuals(group: Any) -> Residuals | None:
     kept = find_group(group, _GROUP)
     if kept is None:
         return None
-    from tomo_polysplat.report.residuals import Residuals
-
     arrays = {name: read_numbers(kept, name, most=_MOST).astype(np.float64) for name in _ARRAYS}
     numbers = {name: _number(kept, name) for name in _NUMBERS}
     for name, values in arrays.items():

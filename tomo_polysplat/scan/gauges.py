@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.scan.moves import Scanner
+from tomo_polysplat.scan.slopes import slope_at_zero
 
 __all__ = ["Effect", "common_offset", "effects", "view_gauge", "without_gauge"]
 
@@ -52,7 +53,7 @@ def effects(scanner: Scanner, names: list[str] | tuple[str, ...], radius: float)
     basis = _orthonormal(_of_object(part, points))
     found = {}
     for name in names:
-        slope = _slope(_falls(part, name, points + part.pivot))
+        slope = slope_at_zero(_falls(part, name, points + part.pivot)).flatten()
         rest = slope - basis @ (basis.T @ slope)
         whole, left = (float(x.square().mean().mul(2).sqrt()) for x in (slope, rest))
         found[name] = Effect(left, left / whole if whole > 0 else 0.0)
@@ -112,16 +113,9 @@ def _of_object(scanner: Scanner, points: torch.Tensor) -> torch.Tensor:
         def falls(step: torch.Tensor) -> torch.Tensor:
             return scanner.project({}, points + step * flow + scanner.pivot)
 
-        return _slope(falls)
+        return slope_at_zero(falls).flatten()
 
     return torch.stack([column(flow) for flow in flows], dim=1)
-
-
-def _slope(function: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
-    """Derivative of a function of a number at 0, flattened."""
-    at = torch.zeros((), dtype=torch.float64), torch.ones((), dtype=torch.float64)
-    slope: torch.Tensor = torch.autograd.functional.jvp(function, *at)[1]
-    return slope.flatten()
 
 
 def _orthonormal(columns: torch.Tensor) -> torch.Tensor:

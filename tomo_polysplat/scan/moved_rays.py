@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import torch
 
 from tomo_polysplat.scan.moves import Scanner
+from tomo_polysplat.scan.slopes import slope_at_zero
 
 __all__ = ["FALLS", "falls_of", "falls_on"]
 
@@ -44,9 +45,7 @@ def falls_of(scanner: Scanner, values: Mapping[str, torch.Tensor], names: Sequen
             parts = scanner.moved({**values, name: told + step})
             return torch.stack([parts.corner, parts.u, parts.v], dim=2)
 
-        at = torch.zeros((), dtype=torch.float64), torch.ones((), dtype=torch.float64)
-        slope: torch.Tensor = torch.autograd.functional.jvp(moved, *at)[1]
-        found.append(inverse @ slope)
+        found.append(inverse @ slope_at_zero(moved))
     falls = torch.stack(found)
     if not scanner.cone:
         # Along a parallel beam nothing shifts.

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -45,18 +46,18 @@ class Shape:
     semi: np.ndarray
     axes: np.ndarray
 
-    @property
+    @cached_property
     def to_local(self) -> np.ndarray:
         """(3, 3) matrix that takes ``point - centre`` to the frame of the unit solid."""
         return self.axes.T / self.semi[:, None]
 
-    @property
+    @cached_property
     def radius(self) -> float:
         """Radius of the smallest sphere about the centre that holds the solid, in cm."""
         around = self.semi[: self.round_axes].max(initial=0.0)
         return float(np.hypot(around, np.linalg.norm(self.semi[self.round_axes :])))
 
-    @property
+    @cached_property
     def half_extent(self) -> np.ndarray:
         """(3,) half sizes of the tightest box along x, y, z, in cm."""
         columns = self.axes * self.semi

@@ -109,13 +109,16 @@ def _labels(phantom, grid, index):
     start = grid.lower + np.array([0.0, 0.0, index]) * grid.voxel + (0.5 - beside) * step
     counts = np.array([grid.shape[2], grid.shape[1], 1]) * per_voxel + 2 * beside
     labels = np.zeros(counts[::-1], np.int32)
-    for label, part in enumerate(phantom.parts, start=1):
-        solid = part.shape
-        first = np.ceil((solid.centre - solid.half_extent - start) / step - 1e-6).astype(np.int64)
-        last = np.floor((solid.centre + solid.half_extent - start) / step + 1e-6).astype(np.int64) + 1
-        first, last = np.maximum(first, 0), np.minimum(last, counts)
-        if (first < last).all():
-            paint_labels(
-                labels, start, step, first, last, label, solid.round_axes, solid.centre, solid.to_local
-            )
+    solids = [part.shape for part in phantom.parts]
+    centres, halves = (
+        np.array([getattr(solid, name) for solid in solids]).reshape(-1, 3)
+        for name in ("centre", "half_extent")
+    )
+    first = np.ceil((centres - halves - start) / step - 1e-6).astype(np.int64)
+    last = np.floor((centres + halves - start) / step + 1e-6).astype(np.int64) + 1
+    first, last = np.maximum(first, 0), np.minimum(last, counts)
+    for k in np.flatnonzero((first < last).all(axis=1)):
+        solid, label = solids[k], int(k) + 1
+        ends = first[k], last[k]
+        paint_labels(labels, start, step, *ends, label, solid.round_axes, solid.centre, solid.to_local)
     return labels

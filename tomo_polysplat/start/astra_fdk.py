@@ -16,8 +16,15 @@ import numpy as np
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.filters import ramp_response
 from tomo_polysplat.start.orbit import Orbit
-from tomo_polysplat.start.shadow import ellipse_of, margins, slices_seen
-from tomo_polysplat.start.weights import ray_arcs
+from tomo_polysplat.start.shadow import ellipse_of, margins
+from tomo_polysplat.start.weights import (
+    arcs_of_rows,
+    horizontal_normal,
+    obliquity,
+    ray_arcs,
+    row_changes,
+    varies,
+)
 
 if TYPE_CHECKING:
     import torch
@@ -47,7 +54,8 @@ def fdk_cuda_tensor(
 ) -> torch.Tensor:
     """`fdk` of (views, rows, columns) float32 projections on a CUDA device, where the volume stays.
 
-    Corners of the volume beyond the ellipse inscribed in its window, and off the detector, miss a part.
+    The detector is level (`start.level`). Corners of the volume beyond the ellipse inscribed in its window, and off the
+    detector, miss a part; slices that no view sees are not emptied.
 
     Raises
     ------
@@ -79,9 +87,7 @@ def fdk_cuda_tensor(
             sinogram[:, some, :before] = filtered[..., length - before :]
         sinogram[:, some, before:] = filtered[..., : columns + after]
     with AstraPair(wide, grid, projections.device) as pair:
-        volume = pair.adjoint(sinogram.transpose(0, 1), np.arange(views))
-    volume[torch.from_numpy(~slices_seen(geometry, grid, orbit)).to(volume.device)] = 0.0
-    return volume
+        return pair.adjoint(sinogram.transpose(0, 1), np.arange(views))
 
 
 def weights_on(
@@ -91,23 +97,15 @@ def weights_on(
 
     Lengths of rays and their parts towards the axis are polynomials in row and column: no ray is stored.
     """
-    import torch
-
-    def there(values: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(values, np.float32)).to(device)
-
-    normal = np.cross(geometry.u, geometry.v)
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     scale = arcs / np.linalg.norm(geometry.u, axis=1)[:, None]
     if geometry.beam == "parallel":
-        beam = geometry.origin / np.linalg.norm(geometry.origin, axis=1, keepdims=True)
-        plain = there(scale / np.abs((normal * beam).sum(axis=1))[:, None])
-        return lambda some: plain[some, None]
+        return _shares_on(device, geometry, scale / obliquity(geometry)[:, None])
+    shares = _shares_on(device, geometry, scale)
     # Seen from the pixel in the middle, so that little is lost in float32.
-    rows, columns = (np.arange(count) - 0.5 * (count - 1) for count in (geometry.rows, geometry.columns))
+    rows, columns = _from_middle(geometry.rows), _from_middle(geometry.columns)
     u, v = geometry.u, geometry.v
     ray = geometry.corner - geometry.origin - rows[0] * v - columns[0] * u
-    depth = np.abs((normal * ray).sum(axis=1))
+    depth = np.abs((horizontal_normal(geometry) * ray).sum(axis=1))
     towards = np.pad(orbit.axis - geometry.origin[:, :2], ((0, 0), (0, 1))) / depth[:, None]
     pairs = (
         (ray, towards),
@@ -120,12 +118,40 @@ def weights_on(
         (ray, u),
         (u, v),
     )
-    products = there(np.stack([(a * b).sum(axis=1) for a, b in pairs]))[..., None, None]
-    row, column, scales = there(rows)[:, None], there(columns), there(scale)
+    products = _there(np.stack([(a * b).sum(axis=1) for a, b in pairs]), device)[..., None, None]
+    row, column = _there(rows, device)[:, None], _there(columns, device)
+    _, farther = row_changes(geometry)
+    tilted, change = bool(farther.any()), _there(farther, device)[:, None, None]
 
     def weights(some: slice) -> torch.Tensor:
         rt, vt, ut, rr, vv, uu, rv, ru, uv = products[:, some]
         squared = rr + row * (row * vv + 2 * rv) + column * (column * uu + 2 * ru + 2 * row * uv)
-        return scales[some, None] * (rt + row * vt + column * ut) * squared.rsqrt()
+        found = shares(some) * (rt + row * vt + column * ut) * squared.rsqrt()
+        return found / (1 + row * change[some]) if tilted else found
 
     return weights
+
+
+def _shares_on(
+    device: torch.device, geometry: Geometry, scale: np.ndarray
+) -> Callable[[slice], torch.Tensor]:
+    """What gives (views, rows, columns) of some views, or (views, 1, columns), for numbers of the middle row."""
+    scales = _there(scale, device)
+    along, farther = row_changes(geometry)
+    if not ((along.any() or farther.any()) and varies(scale)):
+        return lambda some: scales[some, None]
+    changes, rows = (
+        (_there(along, device), _there(farther, device)),
+        _there(_from_middle(geometry.rows), device),
+    )
+    return lambda some: arcs_of_rows(*(part[some] for part in (scales, *changes)), rows=rows)
+
+
+def _from_middle(count: int) -> np.ndarray:
+    return np.arange(count) - 0.5 * (count - 1)
+
+
+def _there(values: np.ndarray, device: torch.device) -> torch.Tensor:
+    import torch
+
+    return torch.from_numpy(np.ascontiguousarray(values, np.float32)).to(device)

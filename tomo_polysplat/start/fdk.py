@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 
 from tomo_polysplat.checks import require_array, require_choice, require_shape
 from tomo_polysplat.parallel import run_tasks, split_range
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.backproject import accumulate, voxel_maps
 from tomo_polysplat.start.filters import FILTERS, filter_rows
+from tomo_polysplat.start.level import Level
 from tomo_polysplat.start.orbit import Orbit, find_orbit
 from tomo_polysplat.start.shadow import corners_of, margins, slices_seen
-from tomo_polysplat.start.weights import object_fan, object_radius, pixel_weights, ray_arcs, ray_offsets
+from tomo_polysplat.start.weights import (
+    object_fan,
+    object_radius,
+    pixel_weights,
+    ray_arcs,
+    ray_offsets,
+    reach,
+)
 
 __all__ = ["fdk", "fits_fdk"]
 
@@ -31,7 +40,7 @@ _ROUNDING = 1e-9
 def fits_fdk(geometry: Geometry, grid: VolumeGrid) -> tuple[bool, str]:
     """Whether filtered backprojection suits a scan, and why (not).
 
-    It wants a circular orbit about an axis parallel to z, an untilted detector, and every line through the
+    It wants a circular orbit about an axis parallel to z, a detector tilted little, and every line through the
     object measured at least once; in part of a turn that takes a detector that sees both sides of it.
     """
     orbit, reason = find_orbit(geometry)
@@ -39,8 +48,9 @@ def fits_fdk(geometry: Geometry, grid: VolumeGrid) -> tuple[bool, str]:
         return False, reason
     if np.hypot(*(grid.centre[:2] - orbit.axis)) > 0.5 * orbit.radius:
         return False, "the volume lies far off the axis of rotation"
-    offsets = ray_offsets(geometry, orbit, (0, geometry.columns - 1))
-    shorter, longer = np.sort([-offsets.min(axis=1).max(), offsets.max(axis=1).min()])
+    level = Level(geometry).geometry
+    low, high = reach(level, orbit)
+    shorter, longer = np.sort([-low, high])
     if orbit.full:
         if shorter <= 0:
             return False, "the detector does not reach the shadow of the axis of rotation"
@@ -48,6 +58,7 @@ def fits_fdk(geometry: Geometry, grid: VolumeGrid) -> tuple[bool, str]:
     arc, step = np.rad2deg(orbit.arc), orbit.steps.max()
     needed = np.pi
     if geometry.beam == "cone":
+        offsets = ray_offsets(level, orbit, (0, geometry.columns - 1))
         seen = np.arcsin(min(np.abs(offsets).max() / orbit.radius, 1.0))
         fan = 2 * min(seen, object_fan(grid, orbit))
         # A fan narrower than half a step is as good as a parallel beam.
@@ -110,9 +121,11 @@ def fdk(
 def _fdk_cpu(
     projections: np.ndarray, geometry: Geometry, grid: VolumeGrid, orbit: Orbit, filter_name: str
 ) -> np.ndarray:
-    arcs = ray_arcs(geometry, orbit, grid)
-    before, after = margins(geometry, corners_of(grid))
-    maps = voxel_maps(geometry, grid)
+    level = Level(geometry)
+    flat = level.geometry
+    arcs = ray_arcs(flat, orbit, grid)
+    before, after = margins(flat, corners_of(grid))
+    maps = voxel_maps(flat, grid)
     # Columns are counted from the first one kept, so that the map must move by as many.
     maps[:, 0] += before * maps[:, 2]
     volume = np.zeros(grid.shape, np.float32)
@@ -120,12 +133,21 @@ def _fdk_cpu(
         chunk = slice(start, min(start + _CHUNK, geometry.views))
 
         def prepare(a: int, b: int) -> np.ndarray:
-            weighted = projections[a:b] * pixel_weights(geometry, orbit, arcs, slice(a, b))
+            weighted = _seen(projections, level, slice(a, b)) * pixel_weights(flat, orbit, arcs, slice(a, b))
             return filter_rows(weighted, filter_name, before, after)
 
-        pixels = (chunk.stop - chunk.start) * geometry.rows * geometry.columns
+        pixels = (chunk.stop - chunk.start) * flat.rows * flat.columns
         parts = split_range(chunk.stop - chunk.start, min(pixels // _FILTERED, _PARTS))
         filtered = run_tasks(prepare, [(start + a, start + b) for a, b in parts])
         accumulate(volume, np.concatenate(filtered), maps[chunk])
     volume[~slices_seen(geometry, grid, orbit)] = 0.0
     return volume
+
+
+def _seen(projections: np.ndarray, level: Level, views: slice) -> np.ndarray:
+    """What the level detector sees in some views."""
+    if not level.moved:
+        return projections[views]
+    # A copy: what the caller gave may not be written to, of which torch warns.
+    told = torch.from_numpy(projections[views].copy())
+    return level.values(told, views, (0, level.geometry.rows), torch.device("cpu")).numpy()

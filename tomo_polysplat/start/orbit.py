@@ -12,9 +12,12 @@ __all__ = ["Orbit", "find_orbit"]
 
 # A gap between neighbouring views this many times the usual one, and this wide, is a part not scanned.
 _GAP_RATIO, _GAP_RADIANS = 4.0, np.deg2rad(5.0)
-# Largest sine between the detector's rows and the plane of the orbit, or its columns and the axis. Ramp
-# filtering along rows that stray by more than this leaves visible streaks.
-_TILT = 0.02
+# Largest sine between the detector's rows and the plane of the orbit, or its columns and the axis: 15 degrees, up to
+# which errors grow by less than a tenth (spheres off the axis, 64^3, cone and parallel beams).
+_TILT = 0.26
+# Largest sine between parallel rays and that plane: 5 degrees, at which errors grow by a quarter, and runs are better
+# than from SIRT (bone of 26^3: 25.05 for 24.72 dB; of 3 degrees 24.87 for 24.54). At 15 they double.
+_BEAM = 0.0873
 # Largest relative deviation of the sources from a circle.
 _ROUND = 0.02
 
@@ -84,7 +87,7 @@ def _tilt(geometry: Geometry) -> str:
     if (np.abs(u[:, 2]) > _TILT).any() or (np.hypot(v[:, 0], v[:, 1]) > _TILT).any():
         return "the detector is tilted against the axis of rotation"
     beam = geometry.origin / np.linalg.norm(geometry.origin, axis=1, keepdims=True)
-    if geometry.beam == "parallel" and (np.abs(beam[:, 2]) > _TILT).any():
+    if geometry.beam == "parallel" and (np.abs(beam[:, 2]) > _BEAM).any():
         return "the beam is tilted against the axis of rotation"
     return ""
 

@@ -10,8 +10,9 @@ import numpy as np
 
 from tomo_polysplat.free_memory import free_bytes, give_back, in_gigabytes
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.start.level import Level
 from tomo_polysplat.start.orbit import Orbit
-from tomo_polysplat.start.shadow import corners_of, ellipse_of, margins
+from tomo_polysplat.start.shadow import corners_of, ellipse_of, margins, slices_seen
 
 if TYPE_CHECKING:
     import torch
@@ -71,7 +72,8 @@ def fdk_of_slabs(
         Of a scan that filtered backprojection fits.
     depth : int
     whole : (nz, ny, nx) tensor
-        The same as made in one piece, to rounding; it may lie anywhere.
+        The same as made in one piece, to rounding; it may lie anywhere. A tilted detector that is beside the axis has
+        more rays measured twice in some slabs than in all.
     """
     for wanted, first, last in slabs(grid.shape[0], depth):
         slab = slab_of(grid, first, last)
@@ -119,27 +121,32 @@ def fdk_on_device(
 
     from tomo_polysplat.start.astra_fdk import fdk_cuda_tensor
 
+    level = Level(geometry)
+    flat, resident = level.geometry, projections.is_cuda and not level.moved
+
     def make(rows: tuple[int, int], cropped: Geometry, slab: VolumeGrid) -> torch.Tensor:
-        piece = projections[:, rows[0] : rows[1]].to(device)
+        piece = level.values(projections, slice(None), rows, device)
         return fdk_cuda_tensor(piece, cropped, slab, orbit, filter_name)
 
     def tried(depth: int, place: torch.device) -> torch.Tensor:
         if depth >= nz and place == device:
-            return make((0, geometry.rows), geometry, grid)
-        whole = torch.empty(grid.shape, dtype=torch.float32, device=place)
-        fdk_of_slabs(make, geometry, grid, depth, whole)
-        logger.info("Filtered backprojection by slabs of %d of %d slices.", depth, nz)
+            whole = make((0, flat.rows), flat, grid)
+        else:
+            whole = torch.empty(grid.shape, dtype=torch.float32, device=place)
+            fdk_of_slabs(make, flat, grid, depth, whole)
+            logger.info("Filtered backprojection by slabs of %d of %d slices.", depth, nz)
+        whole[torch.from_numpy(~slices_seen(geometry, grid, orbit)).to(place)] = 0.0
         return whole
 
     nz, ny, nx = grid.shape
     of_whole = 4 * nz * ny * nx
     for attempt in range(_TIMES):
         room = _SHARE * free_bytes(device) / 2**attempt
-        depth = _depth(geometry, grid, room, projections.is_cuda)
+        depth = _depth(flat, grid, room, resident)
         # A second volume of this size is what whatever looks at it takes at least.
         place = device if 2 * of_whole < room else torch.device("cpu")
         if depth < nz and place.type == "cuda":
-            depth = _depth(geometry, grid, room - of_whole, projections.is_cuda)
+            depth = _depth(flat, grid, room - of_whole, resident)
         try:
             return tried(depth, place)
         except RuntimeError as problem:

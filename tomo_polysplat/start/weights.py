@@ -9,6 +9,10 @@ where S is the source, A the axis at its height, d the ray from the source to th
 magnification at x and h the ramp. For the central ray through the axis this is the formula of Feldkamp, Davis
 and Kress (J. Opt. Soc. Am. A 1, 612, 1984, doi:10.1364/JOSAA.1.000612). A parallel beam has no magnification
 and the obliquity of the detector in place of the last factor.
+
+The plane of the detector need not be upright. Each of its horizontal lines is, seen from the source, one of an upright
+detector that is as far away; so D is the distance to the upright plane through the pixel's own line, and s is measured
+on that. Where the detector is upright D is the same for all pixels.
 """
 
 from __future__ import annotations
@@ -16,19 +20,36 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.orbit import Orbit
 
-__all__ = ["object_fan", "object_radius", "pixel_weights", "ray_arcs", "ray_offsets"]
+__all__ = [
+    "arcs_of_rows",
+    "horizontal_normal",
+    "object_fan",
+    "object_radius",
+    "obliquity",
+    "pixel_weights",
+    "ray_arcs",
+    "ray_offsets",
+    "reach",
+    "row_changes",
+    "varies",
+]
 
 
-def ray_offsets(geometry: Geometry, orbit: Orbit, columns: Sequence[float] | None = None) -> np.ndarray:
-    """Signed distance from the axis to the rays of the middle row, (views, columns), all or those that are named.
+def ray_offsets(
+    geometry: Geometry, orbit: Orbit, columns: Sequence[float] | None = None, row: float | None = None
+) -> np.ndarray:
+    """Signed distance from the axis to the rays of a row, (views, columns), of all columns or those that are named.
 
-    The same ray measured from its other end has the opposite sign. The offsets rise or fall from column to column.
+    The row is the middle one unless told. The same ray measured from its other end has the opposite sign. The offsets
+    rise or fall from column to column.
     """
-    middle = geometry.corner + 0.5 * (geometry.rows - 1) * geometry.v
+    row = 0.5 * (geometry.rows - 1) if row is None else row
+    middle = geometry.corner + row * geometry.v
     column = np.asarray(range(geometry.columns) if columns is None else columns)[None, :, None]
     pixel = (middle[:, None] + column * geometry.u[:, None])[..., :2]
     if geometry.beam == "parallel":
@@ -38,6 +59,62 @@ def ray_offsets(geometry: Geometry, orbit: Orbit, columns: Sequence[float] | Non
     ray = ray / np.linalg.norm(ray, axis=2, keepdims=True)
     local = pixel - orbit.axis
     return ray[..., 0] * local[..., 1] - ray[..., 1] * local[..., 0]
+
+
+def reach(geometry: Geometry, orbit: Orbit) -> tuple[float, float]:
+    """Signed distances from the axis between which every row of every view measures."""
+    ends = np.stack(
+        [
+            np.sort(ray_offsets(geometry, orbit, (0, geometry.columns - 1), row), axis=1)
+            for row in (0, 0.5 * (geometry.rows - 1), geometry.rows - 1)
+        ]
+    )
+    return float(ends[..., 0].max()), float(ends[..., 1].min())
+
+
+def row_changes(geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
+    """How rows differ from the middle one on a detector whose columns are not upright, (views,) each, per row.
+
+    Returns
+    -------
+    along : (views,) float64
+        By how many columns a row's pixels are ahead of those whose rays are above or below them.
+    farther : (views,) float64
+        By which share the row is farther from the source, horizontally; 0 in a parallel beam.
+    """
+    u, v = geometry.u, geometry.v
+    if geometry.beam == "parallel":
+        return _turn(geometry.origin, v) / _turn(geometry.origin, u), np.zeros(geometry.views)
+    ray = geometry.corner + 0.5 * (geometry.rows - 1) * v - geometry.origin
+    return _turn(ray, v) / _turn(ray, u), _turn(u, v) / _turn(u, ray)
+
+
+def varies(arcs: np.ndarray) -> bool:
+    """Whether `ray_arcs` differ from column to column."""
+    return bool((arcs != arcs[:, :1]).any())
+
+
+def obliquity(geometry: Geometry) -> np.ndarray:
+    """What a parallel beam's projections are to be divided by, (views,).
+
+    That is the cosine between the rays and the normal of the upright planes, and the lengthening of rays that are not
+    horizontal.
+    """
+    beam = geometry.origin / np.linalg.norm(geometry.origin, axis=1, keepdims=True)
+    across = np.abs(np.einsum("vk,vk->v", horizontal_normal(geometry), beam))
+    return across / (1.0 - beam[:, 2] ** 2)
+
+
+def _turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The vertical part of the cross product, (views,)."""
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+def horizontal_normal(geometry: Geometry) -> np.ndarray:
+    """Unit normal of the upright planes through the detector's level lines, (views, 3)."""
+    normal = np.cross(geometry.u, geometry.v * (0.0, 0.0, 1.0))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return normal
 
 
 def object_radius(grid: VolumeGrid, orbit: Orbit) -> float:
@@ -53,6 +130,8 @@ def object_fan(grid: VolumeGrid, orbit: Orbit) -> float:
 def ray_arcs(geometry: Geometry, orbit: Orbit, grid: VolumeGrid) -> np.ndarray:
     """Part of half a turn that each ray stands for among all of its distance from the axis, (views, columns) radians.
 
+    Those are the rays of the middle row, of which `arcs_of_rows` makes those of the others.
+
     That is its view's share of the arc times a weight; the weights of a line's measurements sum to 1. A full turn
     measures every line twice: half each, or, where the detector is too short on one side, a smooth passage to the
     side that sees all (half-fan scans; the idea is Wang's, Med. Phys. 29, 1634, 2002, doi:10.1118/1.1489043). Part
@@ -61,8 +140,7 @@ def ray_arcs(geometry: Geometry, orbit: Orbit, grid: VolumeGrid) -> np.ndarray:
     """
     steps, every = orbit.steps[:, None], (geometry.views, geometry.columns)
     if orbit.full:
-        ends = ray_offsets(geometry, orbit, (0, geometry.columns - 1))
-        low, high = ends.min(axis=1).max(), ends.max(axis=1).min()
+        low, high = reach(geometry, orbit)
         overlap = min(-low, high)
         pitch = (high - low) / max(geometry.columns - 1, 1)
         if overlap >= object_radius(grid, orbit) or abs(high + low) < 2 * pitch:
@@ -107,6 +185,34 @@ def _risen(to: np.ndarray, half: np.ndarray) -> np.ndarray:
     return np.where(share < 1, half * (share - np.sin(np.pi * share) / np.pi), to - half)
 
 
+def arcs_of_rows(
+    arcs: torch.Tensor, along: torch.Tensor, farther: torch.Tensor, *, rows: torch.Tensor
+) -> torch.Tensor:
+    """What `ray_arcs` gives for the middle row, for rows whose pixels are not above and below those of that row.
+
+    Parameters
+    ----------
+    arcs : (views, columns) tensor
+    along, farther : (views,) tensors
+        From `row_changes`.
+    rows : (rows,) tensor
+        Counted from the middle one.
+
+    Returns
+    -------
+    (views, rows, columns) tensor
+    """
+    last = arcs.shape[1] - 1
+    column = torch.arange(last + 1, device=arcs.device, dtype=rows.dtype)
+    ahead, scale = (rows * change[:, None] for change in (along, farther))
+    place = ((column + ahead[..., None]) / (1 + scale[..., None])).clamp_(0, last)
+    below = place.floor().clamp_(max=max(last - 1, 0))
+    share, index = (place - below).to(arcs.dtype), below.long()
+    every = arcs[:, None].expand(index.shape)
+    low, high = every.gather(2, index), every.gather(2, (index + 1).clamp_(max=last))
+    return low + share * (high - low)
+
+
 def pixel_weights(geometry: Geometry, orbit: Orbit, arcs: np.ndarray, views: slice) -> np.ndarray:
     """All that multiplies some of the projections before the filter, (views, rows, columns) float32.
 
@@ -114,13 +220,15 @@ def pixel_weights(geometry: Geometry, orbit: Orbit, arcs: np.ndarray, views: sli
     """
     part = geometry.select(views)
     width = np.linalg.norm(part.u, axis=1)
-    normal = np.cross(part.u, part.v)
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     scale = (arcs[views] / width[:, None])[:, None, :]
+    along, farther = row_changes(part)
+    if (along.any() or farther.any()) and varies(arcs):
+        rows = torch.arange(part.rows, dtype=torch.float64) - 0.5 * (part.rows - 1)
+        told = (torch.from_numpy(part) for part in (scale[:, 0], along, farther))
+        scale = arcs_of_rows(*told, rows=rows).numpy()
+    normal = horizontal_normal(part)
     if part.beam == "parallel":
-        beam = part.origin / np.linalg.norm(part.origin, axis=1, keepdims=True)
-        obliquity = np.abs(np.einsum("vk,vk->v", normal, beam))
-        scale = np.broadcast_to(scale / obliquity[:, None, None], part.shape)
+        scale = np.broadcast_to(scale / obliquity(part)[:, None, None], part.shape)
         return scale.astype(np.float32)
     first = part.corner - part.origin
     depth = np.abs(np.einsum("vk,vk->v", normal, first))
@@ -129,4 +237,7 @@ def pixel_weights(geometry: Geometry, orbit: Orbit, arcs: np.ndarray, views: sli
     ray = first[:, None, None] + column * part.u[:, None, None] + row * part.v[:, None, None]
     to_axis = np.pad(orbit.axis - part.origin[:, :2], ((0, 0), (0, 1)))
     cosine = np.einsum("vijk,vk->vij", ray, to_axis / depth[:, None]) / np.linalg.norm(ray, axis=3)
+    if farther.any():
+        depths = np.einsum("vk,vik->vi", normal, first[:, None] + row[..., 0] * part.v[:, None])
+        cosine *= np.abs(depth[:, None] / depths)[..., None]
     return (scale * cosine).astype(np.float32)

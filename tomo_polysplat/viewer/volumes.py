@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from tomo_polysplat.checks import fail, require_shape, visible
 from tomo_polysplat.report.slices import display_window, planes_through
-
-if TYPE_CHECKING:
-    from tomo_polysplat.result.result import Result
+from tomo_polysplat.result.data import ResultData
 
 __all__ = ["Shown", "shown_of"]
 
@@ -82,7 +80,9 @@ class Shown:
         return np.ascontiguousarray(values.take(index, axis), dtype="<f2").tobytes()
 
 
-def shown_of(result: Result, others: Mapping[str, Result | np.ndarray], title: str, html: str = "") -> Shown:
+def shown_of(
+    result: ResultData, others: Mapping[str, ResultData | np.ndarray], title: str, html: str = ""
+) -> Shown:
     """From a result and what stands beside it.
 
     Parameters
@@ -99,13 +99,11 @@ def shown_of(result: Result, others: Mapping[str, Result | np.ndarray], title: s
     ValueError
         For a volume of another shape, or a result in another unit.
     """
-    from tomo_polysplat.result.result import Result
-
     arrays = {"tomo-polysplat": _spatial(result.volume)}
     for name, other in others.items():
-        if isinstance(other, Result) and other.unit != result.unit:
+        if isinstance(other, ResultData) and other.unit != result.unit:
             raise fail(name, f"a volume in 1/{result.unit}", f"1/{other.unit}")
-        values = _spatial(other.volume if isinstance(other, Result) else other)
+        values = _spatial(other.volume if isinstance(other, ResultData) else other)
         require_shape(name, values, arrays["tomo-polysplat"].shape, "of the first volume")
         arrays[name] = values
     first = arrays["tomo-polysplat"]

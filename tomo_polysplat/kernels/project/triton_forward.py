@@ -177,15 +177,21 @@ def _splat_pixels_kernel(
 
 
 def splat(
-    record, channels: int, views: DetectorViews, cutoff: float, largest: torch.Tensor | None = None
+    record,
+    channels: int,
+    views: DetectorViews,
+    cutoff: float,
+    largest: torch.Tensor | None = None,
+    image: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Image of the footprints in the layout of triton_image, without the factor of the pixel.
+    """Image of the footprints in the layout of triton_image, without the factor of the pixel; or ``image`` and it.
 
     With ``largest``, a float32 tensor of the largest value that such an image has had, it has the same bits every
     time: what is added is rounded to some 2e-7 of that (`grained`).
     """
     many, groups = record.shape[:2]
-    image = record.new_zeros((many, views.rows, views.columns, spread(channels)))
+    if image is None:
+        image = record.new_zeros((many, views.rows, views.columns, spread(channels)))
     if not (groups and image.numel()):
         return image
     parts = triton.next_power_of_2(max(1, min(_MOST_PARTS, _PROGRAMS // (groups * many))))

@@ -12,7 +12,7 @@ import torch
 from tomo_polysplat.kernels.portions import portions
 from tomo_polysplat.kernels.project.triton_backward import sum_moments
 from tomo_polysplat.kernels.project.triton_forward import splat
-from tomo_polysplat.kernels.project.triton_image import finish_image, lay_out_gradient
+from tomo_polysplat.kernels.project.triton_image import finish_image, lay_out_gradient, spread
 from tomo_polysplat.kernels.project.triton_pull_back import pull_back
 from tomo_polysplat.kernels.project.triton_setup import footprints
 from tomo_polysplat.kernels.triton_maths import require_scene
@@ -50,13 +50,19 @@ def project(
 def _image(
     scene: tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor],
     views: DetectorViews,
-    cutoff,
-    skipped,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Line integrals of some views, and their footprints."""
-    table, channels = views.table(scene[0].device), len(scene[-1])
-    record = footprints(*scene, views, table, cutoff, skipped)
-    return finish_image(splat(record, channels, views, cutoff), table, channels, views), record
+    cutoff: float,
+    skipped: torch.Tensor,
+) -> torch.Tensor:
+    """Line integrals of a cloud of any size, a portion after the other."""
+    position, scale, rotation, weight = scene
+    table, channels = views.table(position.device), len(weight)
+    image = position.new_zeros((len(views), views.rows, views.columns, spread(channels)))
+    for some in portions(len(position), len(views)):
+        drawn = position[some], scale[some], rotation[some], weight[:, some].contiguous()
+        record = footprints(*drawn, views, table, cutoff, skipped)
+        splat(record, channels, views, cutoff, image=image)
+        del record
+    return finish_image(image, table, channels, views)
 
 
 class _Project(torch.autograd.Function):
@@ -69,12 +75,13 @@ class _Project(torch.autograd.Function):
         ctx.mark_non_differentiable(skipped)
         scene = (position, scale, rotation, weight)
         if not any(ctx.needs_input_grad):
-            images = [_image(scene, part, cutoff, skipped)[0] for part in portions(views, len(position))]
-            return images[0] if len(images) == 1 else torch.cat(images, dim=1), skipped
-        image, record = _image(scene, views, cutoff, skipped)
+            return _image(scene, views, cutoff, skipped), skipped
+        table, channels = views.table(position.device), len(weight)
+        record = footprints(*scene, views, table, cutoff, skipped)
+        image = finish_image(splat(record, channels, views, cutoff), table, channels, views)
         # The image is read again only for what the factor of its pixels adds to the gradient of the vectors.
         kept = image if ctx.needs_input_grad[6] else None
-        ctx.save_for_backward(*scene, views.table(position.device), record, kept)
+        ctx.save_for_backward(*scene, table, record, kept)
         ctx.views = views
         return image, skipped
 

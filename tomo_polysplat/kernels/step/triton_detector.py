@@ -77,7 +77,7 @@ def _sharp_kernel(
 @triton.jit(do_not_specialize=SIZES)
 def _blurred_kernel(
     sharp, slopes, blur, grad_blur, chosen, projections, totals, behind, sums,
-    area, rows, columns, first, of_step, noise, held_out, corner,
+    area, rows, columns, of_step, noise, held_out, corner,
     FILTERED: tl.constexpr, HUBER: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     k = tl.program_id(1).to(tl.int64)
@@ -95,7 +95,7 @@ def _blurred_kernel(
             predicted += along_v * along_u * beside
             by_variance += (slope_v * along_u + along_v * slope_u) * beside
     slope = ray_misfit(
-        predicted, projections, totals, chosen, sums, first + k, pixel, inside, area, of_step, noise, held_out,
+        predicted, projections, totals, chosen, sums, k, pixel, inside, area, of_step, noise, held_out,
         corner, behind, HUBER, FILTERED,
     )  # fmt: skip
     slope = tl.where(inside, slope, 0.0)
@@ -167,7 +167,7 @@ def detected_misfit_gradient(splat: Splat, blur: torch.Tensor, grad_blur: torch.
         )  # fmt: skip
         _blurred_kernel[splat.blocks()](
             sharp, slopes, blur, grad_blur, splat.chosen, measurement.projections, measurement.totals,
-            behind, splat.sums, splat.area, rows, columns, splat.first, splat.of_step,
+            behind, splat.sums, splat.area, rows, columns, splat.of_step,
             measurement.noise, measurement.held_out, measurement.corner,
             FILTERED=filtered, HUBER=measurement.corner > 0, BLOCK=PIXELS_A_PROGRAM, num_warps=4,
         )  # fmt: skip

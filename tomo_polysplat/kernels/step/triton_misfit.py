@@ -97,8 +97,6 @@ class Splat:
         added.
     largest : float32 tensor of one number
         Raised to the largest value of ``raw``.
-    first : int
-        Which of the step's views is the first of these.
     """
 
     raw: torch.Tensor
@@ -109,7 +107,6 @@ class Splat:
     measurement: Measurement
     sums: torch.Tensor
     largest: torch.Tensor
-    first: int = 0
 
     @property
     def of_step(self) -> int:
@@ -283,7 +280,7 @@ def store_gradients(pixels, to, slope, d0, d1, d2, live, CURVES: tl.constexpr):
 @triton.jit(do_not_specialize=SIZES)
 def _misfit_kernel(
     raw, pixels, table, chosen, projections, totals, log_weights, attenuation, behind, by_node, sums, largest,
-    area, columns, room, beyond, many, first, of_step, nodes, noise, held_out, corner, areal_scale,
+    area, columns, room, beyond, many, of_step, nodes, noise, held_out, corner, areal_scale,
     CURVES: tl.constexpr, FILTERED: tl.constexpr, CONE: tl.constexpr, HUBER: tl.constexpr, FOLD: tl.constexpr,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -299,7 +296,7 @@ def _misfit_kernel(
     )  # fmt: skip
     tl.atomic_max(largest, tl.max(most, 0), sem="relaxed")
     slope = ray_misfit(
-        predicted, projections, totals, chosen, sums, first + k, pixel, inside, area, of_step, noise, held_out,
+        predicted, projections, totals, chosen, sums, k, pixel, inside, area, of_step, noise, held_out,
         corner, behind, HUBER, FILTERED,
     )  # fmt: skip
     to = k * room + place(pixel, columns, FOLD)
@@ -314,7 +311,7 @@ def misfit_gradient(splat: Splat) -> torch.Tensor:
         _misfit_kernel[splat.gradient_blocks()](
             splat.raw, pixels, splat.table, splat.chosen, measurement.projections, measurement.totals,
             log_weights, attenuation, *splat.filters(), splat.sums, splat.largest,
-            splat.area, splat.views.columns, *gradient_room(splat.views), len(splat.views), splat.first,
+            splat.area, splat.views.columns, *gradient_room(splat.views), len(splat.views),
             splat.of_step, nodes, measurement.noise, measurement.held_out, measurement.corner, measurement.areal_scale,
             CURVES=measurement.curves, FILTERED=measurement.behind is not None,
             CONE=splat.views.cone, HUBER=measurement.corner > 0,

@@ -164,11 +164,17 @@ def _splat_voxels_kernel(
 
 
 def splat(
-    record, channels: int, box: VoxelBox, cutoff: float, largest: torch.Tensor | None = None
+    record,
+    channels: int,
+    box: VoxelBox,
+    cutoff: float,
+    largest: torch.Tensor | None = None,
+    volume: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Volume (channels, nz, ny, nx) of the ellipsoids; with ``largest`` as in the projection's, to the bit."""
+    """Volume (channels, nz, ny, nx) of the ellipsoids; ``largest`` and ``volume`` as in the projection's splat."""
     count = len(record)
-    volume = record.new_zeros((channels, *box.shape))
+    if volume is None:
+        volume = record.new_zeros((channels, *box.shape))
     if not (count and volume.numel()):
         return volume
     groups = triton.cdiv(count, GROUP)

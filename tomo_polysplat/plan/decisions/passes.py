@@ -30,6 +30,9 @@ _MANY_VIEWS, _MOST_TIMES = 45, 3.0
 # to 28.3, soft tissue 44.2 to 45.4), but not the fan-beam slices (22 000 seeds, 1.5 times the passes: 39.6 to 39.6,
 # 37.7 to 37.5): theirs go with the root.
 _LONGER, _LONGER_PLANAR = (2.0, 18_000), (2.0, 36_000)
+# A run of more seeds than the first uses so many views in all, in no fewer passes than the last: its time goes with
+# both, and more Gaussians in fewer passes are worth more (docs/decisions/passes.md).
+_LARGE, _ENOUGH_VIEWS, _FEWEST = 1e7, 9000, 4.0
 
 
 class Passes(Decision):
@@ -51,11 +54,13 @@ class Passes(Decision):
         )
 
     def ask(self, known: Known, lab: Lab) -> Answer:
-        """The usual number for the views there are, and more of them for a small cloud."""
+        """The usual number for the views there are, more of them for a small cloud, and fewer for a very large one."""
         problem = lab.problem
         passes = usual_passes(problem)
         more = longer(lab.support, known[SeedSpacing], problem)
         passes *= more if problem.planar else (2 + more) / 3
+        if not problem.planar and _seeds(lab.support, known[SeedSpacing], problem) > _LARGE:
+            passes = min(passes, max(_FEWEST, round(_ENOUGH_VIEWS / problem.geometry.views, 1)))
         patience = lab.settings.patience or usual_patience(passes)
         words = f"at most, fewer where {lab.settings.held_out:.1%} of the rays, held out of the fit,"
         return Answer(passes, f"{words} have not improved for {patience}", Status.USUAL)
@@ -73,7 +78,10 @@ def usual_passes(problem: Problem) -> float:
 
 def longer(support: int, spacing: float, problem: Problem) -> float:
     """Factor of the passes for a cloud of few seeds, which lie ``spacing`` apart in ``support`` voxels of matter."""
-    seeds = cells(support, problem) / spacing**problem.dimensions
     most, many = _LONGER_PLANAR if problem.planar else _LONGER
-    ratio = many / max(1.0, seeds)
+    ratio = many / max(1.0, _seeds(support, spacing, problem))
     return round(min(most, max(1.0, math.sqrt(ratio) if problem.planar else ratio)), 2)
+
+
+def _seeds(support: int, spacing: float, problem: Problem) -> float:
+    return cells(support, problem) / spacing**problem.dimensions

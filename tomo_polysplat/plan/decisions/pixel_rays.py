@@ -113,7 +113,7 @@ def _at_metal(fitter: Fitter, views: DetectorViews) -> torch.Tensor:
     """(views, rows, columns) whether a ray meets metal, or one beside it does."""
     gaussians, scene = fitter.gaussians, fitter.scene
     metal = torch.where(gaussians.group > 0, gaussians.attenuation, 0.0)
-    seen, _ = project_gaussians(gaussians, metal[None], views, scene.kernel, scene.cutoff)
+    seen, _ = project_gaussians(gaussians, metal[None], views, scene.kernel)
     met = (seen > _SEEN * seen.max()).to(seen.dtype)
     reach = (min(views.rows, 3), min(views.columns, 3))
     padding = (reach[0] // 2, reach[1] // 2)

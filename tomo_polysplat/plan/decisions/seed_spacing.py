@@ -7,7 +7,6 @@ import math
 import numpy as np
 import torch
 
-from tomo_polysplat.kernels.portions import FEW_VIEWS
 from tomo_polysplat.model.seed_samples import box_mean, widened
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.decision import Decision, Known
@@ -16,7 +15,10 @@ from tomo_polysplat.plan.first_gaussians import room_for_seeds
 from tomo_polysplat.plan.lab import Lab
 from tomo_polysplat.plan.resolution import cells, finest_spacing, most_seeds
 
-__all__ = ["SeedSpacing"]
+__all__ = ["MOST_VIEWS", "SeedSpacing"]
+
+# Views of a step at most, by the kind of device: what a step makes of them takes memory, too.
+MOST_VIEWS = {"cpu": 12, "cuda": 6}
 
 # Gaussians that a laptop fits in a time people wait for. Of what a GPU has memory for metal, seeded twice as closely
 # and not counted, may take half.
@@ -60,7 +62,7 @@ def _most_gaussians(lab: Lab) -> tuple[int, str]:
     problem, settings, start = lab.problem, lab.settings, lab.start
     if settings.max_gaussians or lab.device.type == "cpu":
         return settings.max_gaussians or _MOST_ON_CPU, ""
-    views = settings.views_per_step or FEW_VIEWS
+    views = settings.views_per_step or MOST_VIEWS["cuda"]
     room = _SHARE_OF_SEEDS * room_for_seeds(views, problem, lab.device)
     # Few voxels hold more seeds than one each: rays tell what is inside them.
     worth = min(max(math.prod(start.shape), _NOT_TOO_MANY), most_seeds(problem))

@@ -8,7 +8,7 @@ from typing import Any
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.decision import Decision, Known
 from tomo_polysplat.plan.decisions.passes import Passes, longer, times_of_few_views, usual_passes
-from tomo_polysplat.plan.decisions.seed_spacing import SeedSpacing
+from tomo_polysplat.plan.decisions.seed_spacing import MOST_VIEWS, SeedSpacing
 from tomo_polysplat.plan.lab import Lab
 from tomo_polysplat.settings import Settings
 
@@ -18,7 +18,7 @@ __all__ = ["ViewsPerStep"]
 # steps cost little, makes more of them. The few rays of a planar view do with fewer steps (five fan-beam slices: 38.0
 # dB with 4 views a step, 38.3 with 8).
 _STEPS, _STEPS_PLANAR = 360, 300
-_MOST_VIEWS, _MOST_VIEWS_PLANAR = {"cpu": 12, "cuda": 6}, 8
+_MOST_VIEWS_PLANAR = 8
 # Passes that the number of steps is for.
 _PASSES = 15.0
 
@@ -54,7 +54,7 @@ class ViewsPerStep(Decision):
         of_scan, wanted = problem.geometry.views, lab.settings.views_per_step
         if wanted:
             return Answer(min(of_scan, wanted), "asked for", Status.GIVEN)
-        most = _MOST_VIEWS_PLANAR if problem.planar else _MOST_VIEWS[lab.device.type]
+        most = _MOST_VIEWS_PLANAR if problem.planar else MOST_VIEWS[lab.device.type]
         # By the root of its passes a longer run makes more steps and larger ones, a shorter one fewer and smaller ones.
         steps = (
             _STEPS_PLANAR

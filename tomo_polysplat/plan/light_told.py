@@ -1,0 +1,127 @@
+"""What the residuals of a fit tell of gains and drift, and whether held-out rays confirm it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.fit.residual_sums import ResidualSums
+from tomo_polysplat.nuisances.drift import Drift
+from tomo_polysplat.nuisances.gain_estimate import drift_of_views, gains_of_pixels, less_rings
+from tomo_polysplat.nuisances.gains import Gains
+from tomo_polysplat.nuisances.nuisance import Nuisance
+from tomo_polysplat.plan.answer import Answer, Status
+from tomo_polysplat.settings import Settings
+
+__all__ = ["EARLY_LIGHT", "LightTold", "light_told", "wanted_light"]
+
+# The fact of a plan that some was taken out before its questions.
+EARLY_LIGHT = "early_light"
+
+# Held-out rays that tell anything.
+_FEWEST_RAYS = 30
+_KINDS: tuple[type[Nuisance], ...] = (Drift, Gains)
+
+
+@dataclass(frozen=True)
+class LightTold:
+    """What was told of one kind.
+
+    Attributes
+    ----------
+    kept : bool
+        Whether it is taken out.
+    change : array
+        What is taken out from now on, less what was before: (views,) of drift, (rows, columns) of gains.
+    why : str
+    evidence : dict of str to float
+        See `nuisances.light_factor.LightFactor.gate`.
+    """
+
+    kept: bool
+    change: np.ndarray
+    why: str
+    evidence: dict[str, float]
+
+    def answer(self, **more: float) -> Answer:
+        """For the plan, with ``more`` evidence."""
+        told = {name: number for name, number in self.evidence.items() if math.isfinite(number)}
+        told |= {name: float(number) for name, number in more.items()}
+        return Answer(self.evidence["rms"] if self.kept else 0.0, self.why, Status.ASKED, told)
+
+
+def wanted_light(settings: Settings) -> dict[str, Any]:
+    """By name, what a caller says: False leaves it in, True takes it out unasked, None asks."""
+    return {kind.name: getattr(settings, kind.name) for kind in _KINDS}
+
+
+def light_told(problem: Problem, sums: ResidualSums, settings: Settings) -> dict[str, LightTold]:
+    """By name, drift first, and the gains as they are without it; what a caller wants left in is missing.
+
+    Parameters
+    ----------
+    problem : Problem
+        Tells what was taken out of the rays before: the whole of each is told anew.
+    sums : ResidualSums
+    settings : Settings
+    """
+    told, wanted = {}, wanted_light(settings)
+    if wanted[Drift.name] is not False:
+        taken = problem.taken.drift
+        found = drift_of_views(sums.count, sums.by_depth + sums.count * taken[:, None])
+        told[Drift.name] = drift = _judged(Drift, found, taken, sums, sums.view, settings)
+        sums = sums.without_drift(drift.change)
+    if wanted[Gains.name] is not False:
+        taken = problem.taken.gains
+        found = gains_of_pixels(sums.weight, sums.total + sums.weight * taken)
+        axis = _axis_column(problem)
+        # An axis that no view sees makes no rings.
+        found = less_rings(found, axis) if math.isfinite(axis) else found
+        told[Gains.name] = _judged(Gains, found, taken, sums, sums.pixel, settings)
+    return told
+
+
+def _judged(
+    kind: type[Nuisance],
+    found: np.ndarray,
+    taken: np.ndarray,
+    sums: ResidualSums,
+    where: np.ndarray,
+    settings: Settings,
+) -> LightTold:
+    """What was found, as far as held-out rays confirm it."""
+    evidence = _evidence(found, taken, sums, where, settings.huber_corner)
+    verdict = kind.gate(evidence)
+    kept = verdict.kept or (getattr(settings, kind.name) is True and evidence["rms"] > 0)
+    return LightTold(kept, found - taken if kept else -taken, verdict.why, evidence)
+
+
+def _axis_column(problem: Problem) -> float:
+    """Where the axis of rotation is seen, in the mean of the views."""
+    seen = problem.geometry.project_points(-problem.centre[None] / problem.length)
+    return float(np.mean(seen[..., 0]))
+
+
+def _evidence(
+    found: np.ndarray, taken: np.ndarray, sums: ResidualSums, where: np.ndarray, corner: float
+) -> dict[str, float]:
+    """How much better the held-out rays are explained, each with what was found and without any."""
+    rays, rms = len(sums.residual), float(np.sqrt(np.mean(found**2)))
+    if rays < _FEWEST_RAYS:
+        return {"rms": rms, "better": math.nan, "error": math.nan}
+    without = sums.residual + taken.ravel()[where]
+    left = (without, without - found.ravel()[where])
+    before, after = (_misfit(residual / sums.deviation, corner) for residual in left)
+    mean = max(float(before.mean()), 1e-300)
+    better, error = float((before - after).mean()), float((before - after).std()) / math.sqrt(rays)
+    return {"rms": rms, "better": better / mean, "error": error / mean}
+
+
+def _misfit(deviations: np.ndarray, corner: float) -> np.ndarray:
+    """Huber's, with the corner that the fit has (`fit.loss.weighted_huber`), ray by ray."""
+    size = np.abs(deviations)
+    return np.where(size < corner, 0.5 * size**2, corner * (size - 0.5 * corner))
