@@ -21,7 +21,6 @@ from tomo_polysplat.cli.options import (
     spectrum_from,
 )
 from tomo_polysplat.cli.recon_outputs import require_outputs, require_room_of, write_outputs
-from tomo_polysplat.fit.filtered import FIT
 from tomo_polysplat.fit.stopping import StopReason
 from tomo_polysplat.interrupts import postponed_interrupts
 from tomo_polysplat.progress import progress_reports
@@ -218,6 +217,8 @@ def _follow(device: str) -> int:
 
 def _filtered(scan: Scan, told: str | None) -> tuple[Scan, str | None]:
     """The scan with the filter that is told, and "fit" where one is to be found."""
+    from tomo_polysplat.fit.filtered import FIT
+
     if told is None or told == FIT:
         return scan, told
     return replace(scan, filter_map=filter_map_from(told)), None

@@ -19,11 +19,7 @@ from tomo_polysplat.fit.surroundings import cut_out
 from tomo_polysplat.kernels.compile_time import compiled_seconds, working_time
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.plan.answer import Answer, Status
-<<<<<<< HEAD
-from tomo_polysplat.plan.axis import aligned, find_axis
-from tomo_polysplat.plan.bowtie import behind_bowtie, find_bowtie
-=======
->>>>>>> main
+from tomo_polysplat.plan.bowtie import without_bowtie
 from tomo_polysplat.plan.calibration import Calibration
 from tomo_polysplat.plan.checkpoint import Checkpoint
 from tomo_polysplat.plan.decision import When
@@ -51,11 +47,6 @@ logger = logging.getLogger(__name__)
 
 # Seconds that are kept for what comes after the fit besides the volume, where there is a time budget.
 _FINISHING = 0.03
-<<<<<<< HEAD
-# Facts that a run which begins anew does not find again.
-_STAYS = ("alignment", "bowtie", "gains", "drift")
-=======
->>>>>>> main
 
 
 @dataclass(frozen=True)
@@ -74,8 +65,6 @@ class Solver:
         Which moves of the scanner the rays are asked about (`plan.alignment`).
     report : callable
         Gets the share done, and words.
-    bowtie : bool
-        Whether the rays are asked about a bowtie filter (`plan.bowtie`).
     compiled : float
         Seconds that this process had compiled for before.
     """
@@ -86,7 +75,6 @@ class Solver:
     flipped: bool
     report: Callable[[float, str], Any]
     moved: str | Sequence[str] | None = None
-    bowtie: bool = False
     compiled: float = field(default_factory=compiled_seconds)
 
     def solve(
@@ -107,13 +95,6 @@ class Solver:
         KeyboardInterrupt
             After Ctrl-C before the fit has begun.
         """
-<<<<<<< HEAD
-        problem, alignment = self._aligned(problem)
-        problem, filters = self._filtered(problem)
-        problem, plan = physics(problem, wanted, self.run_options, self.saved, self.report)
-        plan.facts |= alignment | filters
-        prepared = prepare(problem, plan, self.run_options, self.saved, self.report)
-=======
         with no_result_yet():
             told, facts, lab = scanner_as_it_was(
                 problem, self.moved, self.run_options, self.saved, self.report
@@ -125,7 +106,6 @@ class Solver:
         prepared = prepare(problem, plan, self.run_options, self.saved, self.report, lab)
         # A GPU has room for its short fits no longer.
         del lab
->>>>>>> main
         if self.saved is not None:
             self.saved.share_taken(problem)
         outcome = self._fit(prepared, problem, ask_scatter)
@@ -153,36 +133,6 @@ class Solver:
         prepared.plan.note("returned", "start", f"{words}: the volume is the one that it began from")
         logger.warning("The start volume is returned: %s.", prepared.plan.facts["returned"].why)
 
-<<<<<<< HEAD
-    def _aligned(self, problem: Problem) -> tuple[Problem, dict[str, Answer]]:
-        """The problem by the scanner as it stood, and what the plan tells of that; a checkpoint's plan knows it."""
-        if self.moved is None:
-            return problem, {}
-        options = self.run_options
-        if self.saved is not None and self.saved.plan is not None:
-            found = self.saved.plan.facts["alignment"]
-        elif self.moved == "auto":
-            found = find_axis(problem, options, self.report)
-            if options.time_budget is None:
-                found = realigned(problem, found, options, self.report)
-        else:
-            # Names are asked for as they stand: who leaves out "u" does not want the axis moved.
-            axis = find_axis(problem, options, self.report) if self.moved == "usual" else None
-            found = align(problem, self.moved, options, axis, self.report)
-        return aligned(problem, found.value), {"alignment": found}
-
-    def _filtered(self, problem: Problem) -> tuple[Problem, dict[str, Answer]]:
-        """The problem behind the bowtie that the rays tell, and the plan's word of it, which a checkpoint knows."""
-        if not self.bowtie:
-            return problem, {}
-        if self.saved is not None and self.saved.plan is not None:
-            found = self.saved.plan.facts["bowtie"]
-        else:
-            found = find_bowtie(problem, self.run_options, self.report)
-        return behind_bowtie(problem, found.value), {"bowtie": found}
-
-=======
->>>>>>> main
     def _anew(
         self, problem: Problem, prepared: PreparedFit, so_far: FitOutcome
     ) -> tuple[Problem, PreparedFit, FitOutcome]:

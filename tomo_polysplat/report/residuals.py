@@ -20,11 +20,8 @@ from tomo_polysplat.render.renderer import RAY_CUTOFF, detector_views
 from tomo_polysplat.report.decided import RayPhysics, ray_physics
 from tomo_polysplat.report.held_out import HeldOut
 from tomo_polysplat.report.where import MisfitMap
-<<<<<<< HEAD
 from tomo_polysplat.result.filter_found import filter_of
-=======
 from tomo_polysplat.result.residuals import Residuals
->>>>>>> main
 from tomo_polysplat.scan.geometry import from_astra, is_planar_geometry
 from tomo_polysplat.scan.noise import photons_per_ray
 from tomo_polysplat.scan.usable import usable_rays
