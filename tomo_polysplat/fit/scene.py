@@ -133,7 +133,7 @@ class FitScene:
         ``quadrature`` has nodes that know the filter; rays are infinitely thin, and not blurred.
         """
         weights = gaussians.weights(self.reference_curve)
-        areal, _ = project_gaussians(gaussians, weights, views, self.kernel, self.cutoff)
+        areal, _ = project_gaussians(gaussians, weights, views, self.kernel)
         behind = areal.new_zeros(areal.shape[2:]) if self.behind is None else self.behind[0]
         return filter_slope(areal * self.areal_scale, quadrature, behind)
 
