@@ -152,7 +152,7 @@ def test_one_energy_is_dimmed_and_not_hardened():
 
 
 def test_one_that_is_found_is_as_one_that_is_told(monkeypatch, tmp_path):
-    found = Answer({"u2": 1.0}, "as planted", Status.ASKED)
+    found = Answer({"parabola": 1.0}, "as planted", Status.ASKED)
     monkeypatch.setattr("tomo_polysplat.plan.solver.find_bowtie", lambda *_: found)
     scan = disc(BOWTIE)
     quick = {"settings": small_scans.QUICK, "align": False}
@@ -161,7 +161,9 @@ def test_one_that_is_found_is_as_one_that_is_told(monkeypatch, tmp_path):
     same = bowtie_map(found.value, 1, COLUMNS)
     told = tps.reconstruct(scan, filter_map=same, **quick)
     np.testing.assert_array_equal(np.asarray(by_fit.volume), np.asarray(told.volume))
-    assert by_fit.plan["bowtie"] is found and "a bowtie of +1 u2 cm" in found_about_the_scanner(by_fit.plan)
+    assert by_fit.plan[
+        "bowtie"
+    ] is found and "a bowtie of aluminium in cm, parabola 1" in found_about_the_scanner(by_fit.plan)
     np.testing.assert_array_equal(filter_of(by_fit, scan)[1], same[1])
     monkeypatch.undo()
     again = tps.reconstruct(scan, filter_map="fit", checkpoint=path, resume=True, **quick)

@@ -10,7 +10,7 @@ from tomo_polysplat.nuisances.bowtie_estimate import filter_left
 from tomo_polysplat.physics.filter_shape import filter_shapes
 
 ROWS, COLUMNS, VIEWS = 3, 20, 30
-SHAPES = filter_shapes(ROWS, COLUMNS, ("u2", "u"))
+SHAPES = filter_shapes(ROWS, COLUMNS, ("parabola", "slope"))
 ANY = np.full(2, -math.inf)
 
 
@@ -49,5 +49,5 @@ def test_it_is_kept_where_it_is_thick_and_not_contradicted():
         not Bowtie.gate(kept | {"better": math.nan}).kept
         and not Bowtie.gate(kept | {"thickest": math.nan}).kept
     )
-    assert Bowtie.told({"bowtie": {"u2": 0.8}}) == "a bowtie of +0.8 u2 cm of aluminium"
+    assert Bowtie.told({"bowtie": {"parabola": 0.8}}) == "a bowtie of aluminium in cm, parabola 0.8"
     assert Bowtie.told({}) == "" and Bowtie.told({"bowtie": {}}) == ""

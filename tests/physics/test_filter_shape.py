@@ -28,16 +28,16 @@ def test_the_slope_is_that_of_what_is_measured_relative_to_the_open_beam():
 
 
 def test_a_filter_has_nothing_where_it_is_thinnest():
-    thickness = filter_thickness({"u2": 2.0, "u": 0.5}, 3, 40)
+    thickness = filter_thickness({"parabola": 2.0, "slope": 0.5}, 3, 40)
     assert thickness.min() == 0.0 and (thickness == thickness[:1]).all()
-    u = filter_shapes(3, 40, ("u",))[0]
+    u = filter_shapes(3, 40, ("slope",))[0]
     np.testing.assert_allclose(
         thickness - thickness[0, 20], 2 * u**2 + u / 2 - (2 * u**2 + u / 2)[0, 20], atol=1e-12
     )
 
 
 def test_its_map_is_in_the_unit_of_the_scan():
-    material, thickness, grams = bowtie_map({"u2": 1.0}, 2, 9, "mm")
+    material, thickness, grams = bowtie_map({"parabola": 1.0}, 2, 9, "mm")
     assert material == "Al" and grams == pytest.approx(2.7, abs=0.01)
-    np.testing.assert_allclose(thickness, 10 * filter_thickness({"u2": 1.0}, 2, 9), rtol=1e-6)
+    np.testing.assert_allclose(thickness, 10 * filter_thickness({"parabola": 1.0}, 2, 9), rtol=1e-6)
     assert bowtie_map({}, 2, 9) is None

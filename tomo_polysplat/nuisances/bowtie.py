@@ -23,8 +23,8 @@ class Bowtie(Nuisance):
     name = "bowtie"
     place = Place.SPECTRUM
     parameters = {
-        "u2": Parameter("cm of aluminium at both sides, as the square", 0.0, 0.0, 5.0),
-        "u": Parameter("cm of aluminium from the middle to one side, as a straight line", 0.0, -2.5, 2.5),
+        "parabola": Parameter("cm of aluminium at both sides, more than in the middle", 0.0, 0.0, 5.0),
+        "slope": Parameter("cm of aluminium at the last column, more than in the middle", 0.0, -2.5, 2.5),
     }
     found_by = Found.RESIDUALS
     gauge = (
@@ -47,7 +47,7 @@ class Bowtie(Nuisance):
 
     @classmethod
     def told(cls, values: Mapping[str, Any]) -> str:
-        """The coefficients."""
+        """How thick it is."""
         found = values.get(cls.name) or {}
-        parts = [f"{found[name]:+.2g} {name}" for name in cls.parameters if found.get(name)]
-        return f"a bowtie of {' '.join(parts)} cm of aluminium" if parts else ""
+        parts = [f"{name} {found[name]:.2g}" for name in cls.parameters if found.get(name)]
+        return f"a bowtie of aluminium in cm, {', '.join(parts)}" if parts else ""

@@ -11,18 +11,15 @@ from tomo_polysplat.units import cm_per
 
 __all__ = ["bowtie_map", "filter_shapes", "filter_thickness"]
 
-# Powers of the place, -1 to 1 over the detector, along its columns (u) and its rows (v).
-_POWERS = {"u": (1, 0), "u2": (2, 0), "v": (0, 1)}
+# Powers of the place along the detector's columns, -1 to 1.
+_POWERS = {"parabola": 2, "slope": 1}
 
 
 def filter_shapes(rows: int, columns: int, names: Sequence[str]) -> np.ndarray:
     """(names, rows, columns) float64: each power of the place, at the pixels' middles."""
-    u, v = ((2 * np.arange(n) + 1) / n - 1 for n in (columns, rows))
-    shapes = np.empty((len(names), rows, columns))
-    for shape, name in zip(shapes, names):
-        across, down = _POWERS[name]
-        shape[:] = u**across * v[:, None] ** down
-    return shapes
+    place = (2 * np.arange(columns) + 1) / columns - 1
+    powers = np.stack([place ** _POWERS[name] for name in names])
+    return np.repeat(powers[:, None], rows, axis=1)
 
 
 def filter_thickness(coefficients: Mapping[str, float], rows: int, columns: int) -> np.ndarray:
