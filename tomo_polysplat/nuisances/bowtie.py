@@ -9,11 +9,11 @@ from tomo_polysplat.nuisances.nuisance import Found, Nuisance, Parameter, Place,
 
 __all__ = ["Bowtie"]
 
-# In cm of aluminium at the thickest place. Scans without a bowtie came to 0.12 at most (bone, teeth of 24^3, with and
-# without metal), as a fit leaves some cupping.
+# In cm of aluminium at the thickest place. Scans without a bowtie came to 0.12 at most (bone, grains, teeth of 24^3),
+# as a fit leaves some cupping; a pepper came to 0.34, and foam is contradicted.
 _LEAST = 0.2
-# It is taken at its word unless held-out rays contradict it by as much: a fit that an object has made up for hardly
-# misses them more.
+# It is taken at its word unless held-out rays contradict it by as much: an object makes up for most of it. Behind
+# bowties of 0.3 to 3 cm the misfit fell by -8 to 14 %; of foam without one by -28 %.
 _CONTRADICTION = 0.1
 
 
