@@ -171,6 +171,7 @@ FILES = {
     "SkyScan": (read_folder, folders("skyscan")),
     "Nikon": (read_folder, folders("nikon")),
     "EDF": (read_folder, folders("edf")),
+    "ESRF": (read_folder, folders("esrf")),
     ".npy": (read_folder, folders("npy")),
     "RTK and MetaImage": (read_folder, folders("rtk")),
     "Zeiss .txrm and .xrm": (read_folder, XRADIA),

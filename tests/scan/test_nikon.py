@@ -144,3 +144,41 @@ def test_texts_of_another_country(folder):
     np.testing.assert_array_equal(scan.proj_geom["Vectors"], exact.proj_geom["Vectors"])
     assert scan.notes["scanner"]["filter"] == "1 mm Aluminium"
     assert scan.notes["scanner"]["keys"]["CTPro/By"] == "Núria µ"
+
+
+@pytest.mark.parametrize(
+    ("material", "thickness", "filters", "said"),
+    [
+        ("", "0.000", "no filter", ""),  # as Inspect-X writes it without a filter
+        ("None", "", "no filter", ""),
+        ("Copper", "0.125", "0.125 mm Copper", ""),
+        ("Copper", "", "not known", "a filter of Copper without its thickness"),
+    ],
+)
+def test_filters_as_the_scanner_writes_them(folder, material, thickness, filters, said):
+    change(
+        folder,
+        ("Filter_ThicknessMM=1.000", f"Filter_ThicknessMM={thickness}"),
+        ("Filter_Material=Aluminium", f"Filter_Material={material}"),
+    )
+    told = tps.load_scan(folder).notes["scanner"]
+    assert told.get("filter", "not known") == filters
+    assert said in " | ".join(told["guessed"])
+
+
+def test_pictures_that_were_binned_or_cut_out_afterwards_are_refused(folder):
+    """Half of the pixels in a picture of the same name would make everything half as large, in silence."""
+    change(folder, ("DetectorPixelsX=37", "DetectorPixelsX=74"), ("DetectorPixelsY=33", "DetectorPixelsY=66"))
+    with pytest.raises(
+        ValueError, match="pictures of 66 x 74 pixels, as DetectorPixelsY .* got 33 x 37; write"
+    ):
+        tps.load_scan(folder)
+
+
+def test_the_text_beside_a_folder_of_the_pictures(folder):
+    """Where InputFolderName is empty, because somebody sorted the files."""
+    expected = np.asarray(tps.load_scan(folder).projections)
+    (folder / "projections").mkdir()
+    for file in folder.glob("*.tif"):
+        file.rename(folder / "projections" / file.name)
+    np.testing.assert_array_equal(tps.load_scan(folder).projections, expected)

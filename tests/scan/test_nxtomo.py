@@ -77,3 +77,127 @@ def test_an_entry_within_an_entry(path):
         file.create_group("entry1/before_scan")
         file.move("later", "entry1/tomo_entry")
     np.testing.assert_array_equal(tps.load_scan(path).projections, exact.projections)
+
+
+def flipped(path, axes):
+    """The stored pictures exchanged along these axes of (pictures, rows, columns)."""
+    with h5py.File(path, "a") as file:
+        data = file["entry0000/instrument/detector/data"]
+        data[...] = np.flip(data[()], axes)
+
+
+def turn(path, name, axis, degrees=180, kind="rotation"):
+    with h5py.File(path, "a") as file:
+        dataset = file.require_group("entry0000/instrument/detector/transformations").create_dataset(
+            name, data=degrees
+        )
+        dataset.attrs["transformation_type"], dataset.attrs["vector"] = kind, axis
+
+
+@pytest.mark.parametrize(
+    ("axes", "turns"),
+    [
+        # The ESRF's axes: x along the beam, z up. Left and right, top and bottom, both, and a turn by nothing.
+        ((2,), {"rz": (0, 0, 1)}),
+        ((1,), {"ry": (0, 1, 0)}),
+        ((1, 2), {"rz": (0, 0, 1), "ry": (0, 1, 0), "gravity": (0, 0, -1)}),
+        # McStas': z along the beam, y up, which gravity tells.
+        ((2,), {"ry": (0, 1, 0), "gravity": (0, -1, 0)}),
+        ((1,), {"rx": (1, 0, 0), "gravity": (0, -1, 0)}),
+    ],
+)
+def test_flips_that_the_file_tells_of_are_undone(path, axes, turns):
+    flipped(path, axes)
+    for name, axis in turns.items():
+        gravity = name == "gravity"
+        turn(path, name, axis, *((9.8, "gravity") if gravity else ()))
+    turn(path, "none", (0, 1, 0), 0)
+    turn(path, "shift", (0, 0, 1), 180, "translation")
+    if 2 in axes:
+        with h5py.File(path, "a") as file:
+            position = file["entry0000/instrument/detector/x_rotation_axis_pixel_position"]
+            position[()] = -position[()]
+    scan = tps.load_scan(path)
+    assert "exchanged, which is undone" in " | ".join(scan.notes["scanner"]["guessed"])
+    require_the_same_volume(scan, marked())
+
+
+def test_flips_as_older_files_tell_them(path):
+    flipped(path, (1,))
+    with h5py.File(path, "a") as file:
+        file["entry0000/instrument/detector/y_flipped"] = True
+        file["entry0000/instrument/detector/x_flipped"] = False
+    require_the_same_volume(tps.load_scan(path), marked())
+
+
+def test_an_axis_counted_from_the_first_column(path):
+    """Some beamlines write the column itself; with half a field of view the axis may be far from the middle."""
+    exact = tps.load_scan(path)
+    with h5py.File(path, "a") as file:
+        position = file["entry0000/instrument/detector/x_rotation_axis_pixel_position"]
+        position[()] += (37 - 1) / 2
+    scan = tps.load_scan(path)
+    assert "counted from the first" in " | ".join(scan.notes["scanner"]["guessed"])
+    np.testing.assert_allclose(scan.proj_geom["Vectors"], exact.proj_geom["Vectors"], atol=1e-9)
+    with h5py.File(path, "a") as file:
+        file["entry0000/instrument/detector/field_of_view"] = "Half"
+    scan = tps.load_scan(path)
+    assert "counted from the first" not in " | ".join(scan.notes["scanner"]["guessed"])
+
+
+DATA = "entry0000/instrument/detector/data"
+
+
+def taken_out(path, into):
+    """The pictures in three other files, and what they are."""
+    into.mkdir(exist_ok=True)
+    with h5py.File(path, "a") as file:
+        data = file[DATA][()]
+        del file[DATA]
+    parts = np.array_split(np.arange(len(data)), 3)
+    for number, part in enumerate(parts):
+        with h5py.File(into / f"raw_{number}.h5", "w") as file:
+            file["entry/data"] = data[part]
+    return data, parts
+
+
+def put_together(path, name, data, parts):
+    layout = h5py.VirtualLayout(data.shape, data.dtype)
+    for number, part in enumerate(parts):
+        shape = (len(part), *data.shape[1:])
+        layout[part[0] : part[-1] + 1] = h5py.VirtualSource(name.format(number), "entry/data", shape=shape)
+    with h5py.File(path, "a") as file:
+        file.create_virtual_dataset(DATA, layout)
+
+
+def test_pictures_behind_a_link_to_another_file(path):
+    expected = tps.load_scan(path).projections
+    with h5py.File(path, "a") as file, h5py.File(path.parent / "raw.h5", "w") as other:
+        other["entry/data"] = file[DATA][()]
+        del file[DATA]
+        file[DATA] = h5py.ExternalLink("raw.h5", "entry/data")
+    np.testing.assert_array_equal(tps.load_scan(path).projections, expected)
+
+
+# The second as a beamline writes it, from which somebody has copied all files into one folder.
+@pytest.mark.parametrize("name", ["scan1/raw_{}.h5", "/data/visitor/RAW_DATA/raw_{}.h5"])
+def test_pictures_of_several_files(path, name):
+    expected = tps.load_scan(path).projections
+    into = path.parent / "scan1" if name.startswith("scan1") else path.parent
+    put_together(path, name, *taken_out(path, into))
+    np.testing.assert_array_equal(tps.load_scan(path).projections, expected)
+
+
+def test_pictures_of_files_that_are_not_there(path):
+    """HDF5 itself would give zeros for them, or look elsewhere."""
+    put_together(path, "../other/raw_{}.h5", *taken_out(path, path.parent.parent / "other"))
+    with pytest.raises(
+        ValueError, match=r"a link to \.\./other/raw_..h5, which is not there.*put raw_..h5"
+    ) as told:
+        tps.load_scan(path)
+    for file in (path.parent.parent / "other").iterdir():
+        file.rename(path.parent / file.name)  # what the message says
+    assert str(path.parent) in str(told.value) and tps.load_scan(path).views == 48
+    (path.parent / "raw_1.h5").unlink()
+    with pytest.raises(ValueError, match="raw_1.h5, which is not there"):
+        tps.load_scan(path)

@@ -79,3 +79,15 @@ def test_two_commands_from_a_folder_to_a_file(tmp_path):
     assert "wrote scan.h5" in done.stdout and "flat panel" in done.stderr
     scan = tps.load_scan(tmp_path / "scan.h5")
     assert scan.views == 24 and scan.unit == "mm" and scan.notes["scanner"]["keys"] == {"operator": "nobody"}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_a_mac_leaves_on_a_disk_of_another_system(kind, tmp_path):
+    """Beside each file one of the same name after ``._``, which is none of its kind."""
+    write_folder(kind, tmp_path / "folder", marked())
+    expected = tps.load_scan(tmp_path / "folder")
+    for file in list((tmp_path / "folder").rglob("*")):
+        if file.is_file():
+            (file.parent / f"._{file.name}").write_bytes(b"\0\5\26\7\0\2\0\0Mac OS X" + bytes(16))
+    (tmp_path / "folder" / ".DS_Store").write_bytes(bytes(8))
+    np.testing.assert_array_equal(tps.load_scan(tmp_path / "folder").projections, expected.projections)

@@ -266,3 +266,34 @@ def test_pictures_that_have_moved_and_a_log_without_what_can_be_told_otherwise(f
     for words in ("by at most 9.0 rows and ? columns (marker_TS.csv)", "no Image Pixel Size", "the voltage"):
         assert words in guesses(scan)
     assert scan.spectrum is None
+
+
+def test_a_log_that_was_written_for_a_parallel_beam(tmp_path):
+    """Users of beamlines and of optical tomography write logs for NRecon, with the source hundreds of metres away."""
+    write_folder("skyscan", tmp_path / "light", marked("parallel"))
+    change(
+        tmp_path / "light",
+        ("Object to Source (mm)=100.000", "Object to Source (mm)=1000000"),
+        ("Camera to Source (mm)=250.000\n", ""),
+    )
+    scan = tps.load_scan(tmp_path / "light")
+    assert scan.proj_geom["type"].startswith("parallel") and "taken to be parallel" in guesses(scan)
+    require_the_same_volume(scan, marked("parallel"))
+
+
+def test_the_camera_stands_where_its_pixel_tells(folder):
+    """The log of an older scanner has the pixel of the camera and that in the object, and one of the distances."""
+    exact = tps.load_scan(folder)
+    change(folder, ("Camera to Source (mm)=250.000\n", ""))
+    scan = tps.load_scan(folder)
+    np.testing.assert_allclose(scan.proj_geom["Vectors"], exact.proj_geom["Vectors"], rtol=1e-6, atol=1e-9)
+    change(folder, ("Camera Pixel Size (um)", "Camera Pixel"))
+    with pytest.raises(ValueError, match="a number as 'Camera to Source"):
+        tps.load_scan(folder)
+
+
+def test_a_camera_that_was_offset_is_said_unless_its_pictures_were_put_together(folder):
+    change(folder, ("Image Rotation=0.00000", "Camera Offset=ON"))
+    assert "the camera was offset" in guesses(tps.load_scan(folder))
+    change(folder, ("Camera Offset=ON", "Camera Offset=ON\nNumber Of Horizontal Offset Positions=2"))
+    assert "the camera was offset" not in guesses(tps.load_scan(folder))

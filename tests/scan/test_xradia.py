@@ -74,7 +74,7 @@ def test_exposures_that_differ_from_that_of_the_open_beam(write):
     exact = tps.load_scan(write())
     scan = tps.load_scan(write({"ReferenceData/ExpTime": floats(0.25)}))
     np.testing.assert_allclose(scan.projections, exact.projections + np.log(2), atol=1e-5)
-    assert "pictures of 0.5 to 0.5 s are compared with an open beam of 0.25 s" in guesses(scan)
+    assert "pictures of 0.5 s are compared with an open beam of 0.25 s" in guesses(scan)
 
 
 def test_several_references_and_those_of_another_file(write, streams):

@@ -78,6 +78,11 @@ class StoredArray:
         """Whether HDF5 reads it without any filter or other file."""
         return self._sources is None and not self.filters
 
+    @property
+    def other_files(self) -> set[str]:
+        """Names of the files that it is put together from, but for its own."""
+        return {source.file for source in self._sources or ()} - {"."}
+
     def __len__(self) -> int:
         return self.shape[0]
 

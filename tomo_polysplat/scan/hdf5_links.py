@@ -22,7 +22,7 @@ from tomo_polysplat.scan.hdf5_heaps import heap_object, require_plain_start
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["MOST_LINKS", "beside", "dtype_of", "held_files", "member", "opened_beside"]
+__all__ = ["MOST_LINKS", "beside", "dtype_of", "held_files", "member", "moved", "opened_beside"]
 
 MOST_LINKS = 16
 # Names on the way to the data, those in the links included.
@@ -151,6 +151,11 @@ def beside(main: str, other: str, where: str) -> Path:
         f"a link to {other}, which is not there or not in this folder",
         f"put {last} (the file itself, not a link) into {folder}",
     )
+
+
+def moved(main: str, other: str, where: str) -> bool:
+    """Whether the file of the name `other` is elsewhere than HDF5 would look for it first; see `beside`."""
+    return Path(os.path.realpath(Path(os.path.realpath(main)).parent / other)) != beside(main, other, where)
 
 
 def dtype_of(dataset: Any) -> np.dtype | None:

@@ -10,7 +10,7 @@ const LETTERS = ["z", "y", "x"];
 const KEPT = 160; // slices in memory
 const byId = (id) => document.getElementById(id);
 
-let about, halves, greys;
+let about, halves, greys, windows = 0; // grey tables made so far
 const state = { point: [0, 0, 0], window: [0, 1], mode: "swipe", left: 0, right: 0, swipe: 0.5 };
 const cache = new Map();
 let panels = [];
@@ -55,13 +55,14 @@ async function slice(volume, axis, index) {
   return cache.get(key);
 }
 
-// A picture of a slice with its first row at the bottom.
-function picture(panel, slot, codes, other) {
+// A picture of a slice with its first row at the bottom; made anew only where another slice or window is asked for, as
+// a slider moves one plane of three.
+function picture(panel, slot, key, codes, other) {
   const { up, across } = panel.plane, width = about.shape[across], height = about.shape[up];
-  const canvas = (panel.buffers[slot] ??= new OffscreenCanvas(width, height));
-  const context = canvas.getContext("2d"), image = context.createImageData(width, height);
-  const pixels = new Uint32Array(image.data.buffer);
-  const times = 510 / Math.max(state.window[1] - state.window[0], 1e-30);
+  const kept = (panel.buffers[slot] ??= blank(width, height));
+  key = `${key}/${windows}`;
+  if (kept.key === key) return kept.canvas;
+  const { pixels } = kept, times = 510 / Math.max(state.window[1] - state.window[0], 1e-30);
   for (let row = 0; row < height; row++) {
     let from = row * width, to = (height - 1 - row) * width;
     for (const end = from + width; from < end; from++, to++) {
@@ -72,8 +73,15 @@ function picture(panel, slot, codes, other) {
       }
     }
   }
-  context.putImageData(image, 0, 0);
-  return canvas;
+  kept.context.putImageData(kept.image, 0, 0);
+  kept.key = key;
+  return kept.canvas;
+}
+
+function blank(width, height) {
+  const canvas = new OffscreenCanvas(width, height), context = canvas.getContext("2d");
+  const image = context.createImageData(width, height);
+  return { canvas, context, image, pixels: new Uint32Array(image.data.buffer), key: "" };
 }
 
 async function paint(panel) {
@@ -81,7 +89,9 @@ async function paint(panel) {
   const both = panel.volumes.length > 1;
   const codes = await Promise.all(panel.volumes.map((volume) => slice(volume, axis, index)));
   const difference = state.mode === "difference" && both;
-  const shown = difference ? [picture(panel, 0, codes[0], codes[1])] : codes.map((c, k) => picture(panel, k, c));
+  const shown = difference
+    ? [picture(panel, 0, `${panel.volumes}/${index}`, codes[0], codes[1])]
+    : codes.map((c, k) => picture(panel, k, `${panel.volumes[k]}/${index}`, c));
   const wide = Math.max(1, Math.round(canvas.clientWidth * devicePixelRatio));
   const tall = Math.round((wide * about.shape[up] * about.voxel[up]) / (about.shape[across] * about.voxel[across]));
   if (canvas.width !== wide || canvas.height !== tall) Object.assign(canvas, { width: wide, height: tall });
@@ -222,6 +232,7 @@ const toSlider = (value) => 1000 * Math.sqrt(Math.max(0, (value - about.range[0]
 function setWindow(low, high) {
   state.window = [Math.min(low, high), Math.max(low, high)];
   greys = greyTable(state.window);
+  windows++;
   byId("lowsays").textContent = state.window[0].toPrecision(3);
   byId("highsays").textContent = `${state.window[1].toPrecision(3)} 1/${about.unit}`;
   draw();

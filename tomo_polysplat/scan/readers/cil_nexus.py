@@ -30,6 +30,8 @@ from tomo_polysplat.scan.readers.stated import require_known, stated_over
 if TYPE_CHECKING:
     import h5py
 
+    from tomo_polysplat.scan.hdf5_array import StoredArray
+
 __all__ = ["KIND", "read", "recognises"]
 
 KIND = "NeXus of the Core Imaging Library"
@@ -42,9 +44,9 @@ class _Frames:
     """Pictures of a dataset whose axes come in any order; reads what is asked for."""
 
     def __init__(
-        self, path: Path, name: str, labels: tuple[str, ...], packing: tuple[float, float] | None
+        self, found: StoredArray, labels: tuple[str, ...], packing: tuple[float, float] | None
     ) -> None:
-        self._array, self._labels, self._packing = Hdf5Array(path, name), labels, packing
+        self._array, self._labels, self._packing = Hdf5Array(found), labels, packing
         opened = self._array.opened()
         sizes = dict(zip(labels, opened.shape))
         self.shape = (sizes["angle"], sizes.get("vertical", 1), sizes["horizontal"])
@@ -103,7 +105,7 @@ def _told(path: Path, entry: h5py.Group) -> Acquisition:
     if set(labels) not in ({"angle", "horizontal"}, set(_AXES)) or len(set(labels)) != len(labels):
         raise fail("dim0, dim1, ...", f"the axes {', '.join(_AXES)}", ", ".join(labels), "select one channel")
     scale, offset = number_attribute(data, "scale"), number_attribute(data, "offset")
-    frames = _Frames(path, data.name, labels, (scale, offset) if scale and offset is not None else None)
+    frames = _Frames(data, labels, (scale, offset) if scale and offset is not None else None)
     panel = text_attribute(data, "panel_origin") or "bottom-left"
     width = number_attribute(data, "pixel_size_h")
     height = number_attribute(data, "pixel_size_v") or width

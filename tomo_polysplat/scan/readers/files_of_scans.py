@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from tomo_polysplat.checks import fail
 from tomo_polysplat.scan.hdf5 import opened
+from tomo_polysplat.scan.readers.entries import entries_of
 
 if TYPE_CHECKING:
     import h5py
@@ -32,7 +33,7 @@ def the_one(
 
 def hdf5_files(path: Path, suffixes: Sequence[str], holds: Callable[[h5py.File], bool]) -> list[Path]:
     """The file, or those with such an ending in the folder, that are HDF5 and hold what is looked for."""
-    inside = [path] if path.is_file() else sorted(path.iterdir())
+    inside = [path] if path.is_file() else entries_of(path)
     named = [file for file in inside if file.is_file() and (file == path or file.suffix.lower() in suffixes)]
     return [file for file in named if _is_hdf5(file) and _holds(file, holds)]
 

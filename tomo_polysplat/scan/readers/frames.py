@@ -11,6 +11,8 @@ import numpy as np
 
 from tomo_polysplat.checks import fail
 from tomo_polysplat.files import existing_file, require_plausible_size
+from tomo_polysplat.scan.hdf5_array import StoredArray
+from tomo_polysplat.scan.hdf5_links import moved
 
 __all__ = ["ArrayFrames", "Frames", "Hdf5Array", "Hdf5Frames", "TiffFrames"]
 
@@ -48,11 +50,25 @@ class ArrayFrames:
 
 
 class Hdf5Array:
-    """A dataset of an HDF5 file that has been looked through already; the file is opened when it is asked for."""
+    """A dataset of an HDF5 file that has been looked through already; the file is opened when it is asked for.
 
-    def __init__(self, path: Path, name: str) -> None:
-        self._path, self._name = path, name
+    Parameters
+    ----------
+    found : StoredArray
+        It, in a file that is open now. A link may have led to another file than the one of the scan.
+
+    Raises
+    ------
+    ValueError
+        If it is put together from files that are not there; HDF5 itself would give zeros for them.
+    """
+
+    def __init__(self, found: StoredArray) -> None:
+        self._path, self._name = Path(found.file.filename), found.name
         self._array: Any = None
+        self._moved = any(
+            moved(found.file.filename, other, found.where) for other in sorted(found.other_files)
+        )
 
     def opened(self) -> Any:
         """The dataset itself."""
@@ -61,6 +77,8 @@ class Hdf5Array:
 
             # Closed with the last reference to its dataset.
             self._array = h5py.File(self._path, "r")[self._name]
+            if self._moved:
+                self._array = StoredArray(self._array, self._name)
         return self._array
 
     def read(self, where: tuple[Any, ...]) -> np.ndarray:
@@ -77,15 +95,13 @@ class Hdf5Frames:
 
     Parameters
     ----------
-    path : Path
-        Of a file that has been looked through already.
-    name : str
-        Of the dataset.
+    found : StoredArray
+        The dataset, in a file that is open now.
     chosen : array of int
     """
 
-    def __init__(self, path: Path, name: str, chosen: np.ndarray) -> None:
-        self._array, self._chosen = Hdf5Array(path, name), chosen
+    def __init__(self, found: StoredArray, chosen: np.ndarray) -> None:
+        self._array, self._chosen = Hdf5Array(found), chosen
         frames = ArrayFrames(self._array.opened(), chosen)
         self.shape, self.dtype = frames.shape, frames.dtype
 
@@ -157,7 +173,7 @@ def _page(file: Path, number: int) -> Iterator[Any]:
 
 
 def _unreadable(file: Path, error: Exception) -> Exception:
-    remedy = "install imagecodecs" if "imagecodecs" in str(error) else "copy or write the file again"
+    remedy = "pip install imagecodecs" if "imagecodecs" in str(error) else "copy or write the file again"
     return fail("path", "a readable TIFF file", f"{file} ({str(error)[:120]})", remedy)
 
 

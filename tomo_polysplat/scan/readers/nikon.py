@@ -17,6 +17,7 @@ import numpy as np
 from tomo_polysplat.checks import fail, require_number
 from tomo_polysplat.physics.filter_text import filters_of
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
+from tomo_polysplat.scan.readers.entries import entries_of
 from tomo_polysplat.scan.readers.files_of_scans import the_one
 from tomo_polysplat.scan.readers.frames import TiffFrames
 from tomo_polysplat.scan.readers.ini_text import IniText
@@ -50,7 +51,9 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
         said.append(f"{frames.shape[0]} pictures are there, the .xtekct tells of {expected}")
     if gaps := gaps_in(files):
         said.append(f"the numbers of the pictures jump ({gaps}): each keeps the angle of its number")
+    _require_size(text, frames)
     setup, more = _setup(text, folder, np.arange(len(files)) if numbers is None else numbers)
+    tube, unclear = _tube(text)
     told = Acquisition(
         KIND,
         frames,
@@ -60,21 +63,23 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
         # White is corrected to a level below the largest number: air may be brighter.
         saturates=False,
         from_detector=True,
-        tube=_tube(text),
-    ).saying(*said, *more)
+        tube=tube,
+    ).saying(*said, *more, *unclear)
     told = stated_over(told, require_known(stated, "scanner"), folder)
     return replace(told, other=text.others())
 
 
 def _texts(path: Path) -> list[Path]:
-    files = [path] if path.is_file() else path.iterdir()
+    files = [path] if path.is_file() else entries_of(path)
     return sorted(file for file in files if file.suffix.lower() == ".xtekct" and file.is_file())
 
 
 def _pictures(folder: Path, text: IniText, name: str) -> list[Path]:
-    """TIFFs of that name and a number, in the folder or in the one that the text names."""
+    """TIFFs of that name and a number: in the folder, in the one that the text names, or in one called projections."""
     inner = folder / Path(text.text("InputFolderName").replace("\\", "/")).name
-    for place in (folder, inner):
+    # One of the scan's own name holds the slices, as Inspect-X writes them.
+    within = [place for place in entries_of(folder) if has_word(place.name, "projections")]
+    for place in (folder, inner, *within):
         tiffs = tiffs_in(place) if place.is_dir() else []
         named = [f for f in tiffs if re.fullmatch(rf"{re.escape(name)}_*\d+", f.stem, re.I)]
         numbered = [f for f in tiffs if re.search(r"\d+$", f.stem)]
@@ -82,6 +87,17 @@ def _pictures(folder: Path, text: IniText, name: str) -> list[Path]:
         if named or rest:
             return in_order(named or rest)
     raise fail("path", f"TIFFs named {name}_0001.tif and so on", f"none in {folder}")
+
+
+def _require_size(text: IniText, frames: TiffFrames) -> None:
+    """Refuse pictures that are not of the detector's pixels: whether they were binned or cut out, nothing tells."""
+    rows, columns = frames.shape[1:]
+    told = [text.number(f"DetectorPixels{axis}", otherwise=size) for axis, size in zip("YX", (rows, columns))]
+    if told == [rows, columns]:
+        return
+    expected = f"pictures of {told[0]:g} x {told[1]:g} pixels, as DetectorPixelsY and DetectorPixelsX say"
+    remedy = "write the size and the pixel of these pictures into the .xtekct; of those cut out, also DetectorOffset"
+    raise fail("path", expected, f"{rows} x {columns}", remedy)
 
 
 def _setup(text: IniText, folder: Path, numbers: np.ndarray) -> tuple[Setup, list[str]]:
@@ -132,7 +148,7 @@ def _degrees(text: IniText, folder: Path, numbers: np.ndarray) -> tuple[np.ndarr
 
 
 def _angle_files(folder: Path) -> list[Path]:
-    files = sorted(file for file in folder.iterdir() if file.is_file())
+    files = [file for file in entries_of(folder) if file.is_file()]
     tables = [file for file in files if file.name.lower().endswith("_ctdata.txt")]
     return tables + [file for file in files if file.suffix.lower() == ".ang"]
 
@@ -150,10 +166,13 @@ def _measured(file: Path) -> np.ndarray:
     return np.array([angle for _, angle in sorted(found)])
 
 
-def _tube(text: IniText) -> Tube:
+def _tube(text: IniText) -> tuple[Tube, list[str]]:
+    """The tube, and what is unclear about its filter."""
     kvp = text.number("XraykV", otherwise=0.0) or None
-    material, size = text.text("Filter_Material"), text.number("Filter_ThicknessMM", otherwise=0.0)
-    if not material:
-        return Tube(kvp)
-    nothing = material.lower() == "none" or size == 0
-    return Tube(kvp, {} if nothing else filters_of(f"{material} {size}mm"))
+    material, told = text.text("Filter_Material"), text.text("Filter_ThicknessMM")
+    size = text.number("Filter_ThicknessMM", otherwise=0.0)
+    if material.lower() == "none" or (told and size == 0):
+        return Tube(kvp, {}), []
+    if material and not told:
+        return Tube(kvp), [f"a filter of {material} without its thickness: give filter='{material} ...mm'"]
+    return Tube(kvp, filters_of(f"{material} {size}mm") if material else None), []

@@ -15,6 +15,7 @@ import numpy as np
 from tomo_polysplat.checks import fail
 from tomo_polysplat.scan.archive import archive_names, read_archive
 from tomo_polysplat.scan.readers.acquisition import Acquisition
+from tomo_polysplat.scan.readers.entries import entries_of
 from tomo_polysplat.scan.readers.files_of_scans import the_one
 from tomo_polysplat.scan.readers.frames import ArrayFrames
 from tomo_polysplat.scan.readers.picture_names import pictures_in
@@ -58,7 +59,7 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
 def _files(path: Path) -> list[Path]:
     if path.is_file():
         return [path] if path.suffix.lower() == ".npz" and _is_stack(path) else []
-    inside = sorted(file for file in path.iterdir() if file.suffix.lower() == ".npz" and file.is_file())
+    inside = [file for file in entries_of(path) if file.suffix.lower() == ".npz" and file.is_file()]
     return [file for file in inside if _is_stack(file)] if inside and not pictures_in(path) else []
 
 

@@ -1,7 +1,9 @@
 """NXtomo: an HDF5 file of NeXus' in which ``image_key`` tells projections from flats and darks.
 
 Rows are taken to begin at the top, pictures to be as seen from the source, and ``rotation_angle`` to count as ASTRA's
-angles do.
+angles do. Flips that the file tells of (``detector/transformations``, in older files ``x_flipped``, ``y_flipped``)
+are undone, as the ESRF's own programs undo them: half a turn about the vertical exchanges left and right, half a turn
+about another axis top and bottom.
 """
 
 from __future__ import annotations
@@ -15,7 +17,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.scan.hdf5 import find_array, find_group, opened, read_numbers, read_text, text_attribute
+from tomo_polysplat.scan.hdf5 import (
+    find_array,
+    find_group,
+    opened,
+    read_attribute,
+    read_numbers,
+    read_text,
+    text_attribute,
+)
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup
 from tomo_polysplat.scan.readers.files_of_scans import hdf5_files, the_one
 from tomo_polysplat.scan.readers.frames import Hdf5Frames
@@ -34,6 +44,9 @@ _DETECTOR, _SOURCE = "instrument/detector", "instrument/source/distance"
 _MM = {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3, "micron": 1e-3, "meter": 1e3, "metre": 1e3}
 # A source so many times as far from the object as the detector is sends a parallel beam.
 _FAR = 200.0
+# Degrees by which a turn may miss half of one; the ESRF's vertical where no gravity is told.
+_HALF_TURN, _UP = 1.0, (0.0, 0.0, 1.0)
+_MOST_TURNS = 20
 _MOST_ENTRIES = 100
 
 
@@ -101,8 +114,8 @@ def _told(path: Path, entry: h5py.Group) -> Acquisition:
         raise fail(
             "path", "pictures of image_key 0, the projections", f"keys {sorted(set(keys.tolist()))}"[:200]
         )
-    stacks = {key: Hdf5Frames(path, data.name, chosen) for key, chosen in frames.items() if len(chosen)}
-    setup, unit, said = _setup(entry, angles[frames[_PROJECTION]])
+    stacks = {key: Hdf5Frames(data, chosen) for key, chosen in frames.items() if len(chosen)}
+    setup, unit, said = _setup(entry, angles[frames[_PROJECTION]], data.shape[2])
     told = Acquisition(
         KIND,
         stacks[_PROJECTION],
@@ -116,10 +129,66 @@ def _told(path: Path, entry: h5py.Group) -> Acquisition:
     )
     if _DARK not in stacks:
         said.append("no dark pictures: without light a pixel is taken to count 0")
-    return told.saying(*said)
+    return _unflipped(told.saying(*said), entry)
 
 
-def _setup(entry: h5py.Group, degrees: np.ndarray) -> tuple[Setup, str, list[str]]:
+def _unflipped(told: Acquisition, entry: h5py.Group) -> Acquisition:
+    """With what the file tells of exchanged sides; the axis is that of the pictures as they are stored."""
+    sideways, upside_down = _flips(entry)
+    setup = told.setup
+    if not (sideways or upside_down) or not isinstance(setup, Setup):
+        return told
+    if sideways:
+        setup = replace(setup, offset=(-setup.offset[0], setup.offset[1]))
+    ways = " and ".join(["left and right"] * sideways + ["top and bottom"] * upside_down)
+    words = f"the file says that {ways} are exchanged, which is undone; the axis is that of its pictures"
+    return replace(told, setup=setup, top_first=not upside_down, from_detector=sideways).saying(words)
+
+
+def _flips(entry: h5py.Group) -> tuple[bool, bool]:
+    """Whether left and right, and top and bottom, are exchanged."""
+    old = (_first(entry, f"{_DETECTOR}/{axis}_flipped") for axis in "xy")
+    sideways, upside_down = (bool(value) for value in old)
+    turns = _group(entry, f"{_DETECTOR}/transformations")
+    if turns is None:
+        return sideways, upside_down
+    about = {name: _axis(turns, name) for name in list(turns)[:_MOST_TURNS]}
+    gravity = about.pop("gravity", None)
+    up = np.abs(_UP if gravity is None else gravity)
+    for name, axis in about.items():
+        if axis is not None and abs(abs(_first(turns, name) or 0.0) - 180) < _HALF_TURN:
+            vertical = bool(np.abs(axis) @ up > 0.5 * np.linalg.norm(axis) * np.linalg.norm(up))
+            sideways, upside_down = sideways ^ vertical, upside_down ^ (not vertical)
+    return sideways, upside_down
+
+
+def _axis(turns: h5py.Group, name: str) -> np.ndarray | None:
+    """Of a rotation, or the direction of gravity."""
+    dataset = find_array(turns, name)
+    kind = "" if dataset is None else text_attribute(dataset, "transformation_type")
+    if kind not in ("rotation", "gravity"):
+        return None
+    vector = np.asarray(read_attribute(dataset, "vector"))
+    told = vector.dtype.kind in "fiu" and vector.shape == (3,) and vector.any() and np.isfinite(vector).all()
+    return vector.astype(np.float64) if told else None
+
+
+def _axis_column(entry: h5py.Group, columns: int) -> tuple[float | None, list[str]]:
+    """Columns by which the axis is to the right of the middle.
+
+    Files of the ESRF count from the middle, others from the first column; a full view has its axis near the middle.
+    """
+    told = _first(entry, f"{_DETECTOR}/x_rotation_axis_pixel_position")
+    half = (read_text(entry, f"{_DETECTOR}/field_of_view") or "").lower() == "half"
+    if told is None or told <= columns / (2 if half else 4):
+        return told, []
+    shift = told - (columns - 1) / 2
+    return shift, [
+        f"the axis at column {told:g} is taken to be counted from the first: {shift:g} from the middle"
+    ]
+
+
+def _setup(entry: h5py.Group, degrees: np.ndarray, columns: int) -> tuple[Setup, str, list[str]]:
     sides = [_length(entry, f"{_DETECTOR}/{axis}_pixel_size") for axis in "xy"]
     behind, before = _length(entry, f"{_DETECTOR}/distance"), _length(entry, _SOURCE)
     width, height = (side or sides[1 - k] or 0.0 for k, side in enumerate(sides))
@@ -128,7 +197,8 @@ def _setup(entry: h5py.Group, degrees: np.ndarray) -> tuple[Setup, str, list[str
         width = height = 1.0
         unit, before = "pixel", None
         said.append("the pixel is not known: lengths are in pixels; give pixel=")
-    shift = _first(entry, f"{_DETECTOR}/x_rotation_axis_pixel_position")
+    shift, counted = _axis_column(entry, columns)
+    said += counted
     if shift is None:
         said.append("the axis is taken to fall on the detector's middle; give offset= if it does not")
     setup = Setup(degrees, (width, height), offset=(-(shift or 0.0) * width, 0.0))

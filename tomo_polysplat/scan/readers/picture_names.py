@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from tomo_polysplat.checks import fail
+from tomo_polysplat.scan.readers.entries import entries_of
 
 __all__ = [
     "PICTURE_SUFFIXES",
@@ -92,7 +93,7 @@ def pictures_in(folder: Path) -> list[Path]:
 
 
 def _of_kind(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    return in_order(file for file in folder.iterdir() if file.suffix.lower() in suffixes and file.is_file())
+    return in_order(file for file in entries_of(folder) if file.suffix.lower() in suffixes and file.is_file())
 
 
 def has_word(name: str, kind: str) -> bool:
@@ -109,7 +110,7 @@ def named_files(folder: Path, names: Any, argument: str) -> list[Path]:
         if here is not None:
             files += pictures_in(here) if here.is_dir() else [here]
         elif not Path(text).is_absolute():
-            files += in_order(folder.glob(str(text)))
+            files += in_order(file for file in folder.glob(str(text)) if not file.name.startswith("."))
     if not files:
         raise fail(argument, "files of pictures", f"{names}, of which there is none in {folder}")
     return files

@@ -11,6 +11,8 @@ import numpy as np
 
 from tomo_polysplat.checks import fail
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup
+from tomo_polysplat.scan.readers.entries import entries_of
+from tomo_polysplat.scan.readers.other_makers import what_is_told
 from tomo_polysplat.scan.readers.picture_files import frames_of
 from tomo_polysplat.scan.readers.picture_names import (
     PICTURE_SUFFIXES,
@@ -21,7 +23,7 @@ from tomo_polysplat.scan.readers.picture_names import (
 )
 from tomo_polysplat.scan.readers.stated import read_toml, require_known, stated_over
 
-__all__ = ["full_turn", "guessed", "read", "recognises", "stated_beside", "written_beside"]
+__all__ = ["full_turn", "guessed", "read", "recognises", "stated_beside", "toml_files", "written_beside"]
 
 KIND = "stack of TIFFs, EDF or .npy files"
 _REMEDY = (
@@ -34,7 +36,9 @@ def recognises(path: Path) -> bool:
     """Whether it is a picture, a TOML file, or a folder with pictures in it or in folders of it."""
     if path.is_file():
         return path.suffix.lower() in (*PICTURE_SUFFIXES, ".toml")
-    return bool(pictures_in(path)) or any(pictures_in(folder) for folder in path.iterdir() if folder.is_dir())
+    return bool(pictures_in(path)) or any(
+        pictures_in(folder) for folder in entries_of(path) if folder.is_dir()
+    )
 
 
 def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
@@ -44,6 +48,7 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     known = stated_beside(written, stated)
     if path.suffix.lower() in PICTURE_SUFFIXES and path.is_file():
         known.setdefault("projections", path)
+    _require_lengths(folder, known)
     files = _sorted_out(folder, known)
     frames = frames_of(files["projections"])
     known |= {name: files[name] for name in ("flats", "darks") if files[name]}
@@ -56,14 +61,33 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     return guessed(stated_over(told, known, folder), known)
 
 
+def _require_lengths(folder: Path, known: Mapping[str, Any]) -> None:
+    """Refuse pictures beside the text of a scanner that is not read, until somebody says what it tells."""
+    if "pixel" in known or known.get("beam") == "parallel":
+        return
+    told = what_is_told(folder)
+    if told is not None:
+        raise fail(
+            "path",
+            "the distances and the pixel of the scanner",
+            f"{told[0]}, which is not read",
+            f"pass {told[1]} (or the same in scan.toml), then 'tomo-polysplat check' tells the sense of rotation",
+        )
+
+
 def full_turn(views: int) -> Setup:
     """What is taken where nothing is told: even steps, and a pixel that has yet to be known."""
     return Setup(np.arange(views) * (360.0 / views), np.nan)
 
 
+def toml_files(folder: Path) -> list[Path]:
+    """Those beside the pictures."""
+    return [file for file in entries_of(folder) if file.suffix.lower() == ".toml"]
+
+
 def written_beside(path: Path) -> tuple[dict[str, Any], dict[str, str]]:
     """Known and other keys of the TOML file that is meant, or the only one in the folder."""
-    beside = sorted(path.glob("*.toml")) if path.is_dir() else []
+    beside = toml_files(path) if path.is_dir() else []
     if len(beside) > 1:
         raise fail("path", "one TOML file in the folder", ", ".join(file.name for file in beside), "name one")
     file = beside[0] if beside else path
@@ -96,7 +120,7 @@ def _sorted_out(folder: Path, known: Mapping[str, Any]) -> dict[str, list[Path]]
     kinds = ("projections", "flats", "darks")
     files = {name: named_files(folder, known[name], name) for name in kinds if name in known}
     taken = {file for some in files.values() for file in some}
-    inside = [inner for inner in sorted(folder.iterdir()) if inner.is_dir()]
+    inside = [inner for inner in entries_of(folder) if inner.is_dir()]
     for name in ("flats", "darks"):
         if name not in files:
             matching = [

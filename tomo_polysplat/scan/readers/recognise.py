@@ -11,6 +11,7 @@ from typing import Any
 from tomo_polysplat.checks import fail
 from tomo_polysplat.scan.readers import (
     cil_nexus,
+    esrf,
     nikon,
     npz_stack,
     nxtomo,
@@ -20,7 +21,9 @@ from tomo_polysplat.scan.readers import (
     xradia,
 )
 from tomo_polysplat.scan.readers.acquisition import Acquisition
+from tomo_polysplat.scan.readers.entries import entries_of
 from tomo_polysplat.scan.readers.files_of_scans import the_one
+from tomo_polysplat.scan.readers.other_makers import what_is_told
 from tomo_polysplat.scan.readers.picture_names import pictures_in
 
 __all__ = ["acquisition_of"]
@@ -29,7 +32,7 @@ __all__ = ["acquisition_of"]
 _RECONSTRUCTED = re.compile(r"rec\w*|slices|volume", re.I)
 _MOST_FOLDERS = 100
 # The first one that recognises what it is shown reads it: what any folder of pictures is comes last.
-READERS = (skyscan, nikon, xradia, nxtomo, cil_nexus, rtk, npz_stack, picture_stack)
+READERS = (skyscan, nikon, xradia, nxtomo, cil_nexus, rtk, esrf, npz_stack, picture_stack)
 _REMEDY = (
     "name the folder or the file that the scanner wrote; docs/scanner_files.md tells what is read of each"
 )
@@ -52,7 +55,7 @@ def acquisition_of(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     for reader in READERS[:-1]:
         if reader.recognises(path):
             return reader.read(path, stated)
-    if path.is_dir() and not (pictures_in(path) or list(path.glob("*.toml"))):
+    if path.is_dir() and not (pictures_in(path) or picture_stack.toml_files(path)):
         inside = [(folder, reader) for folder in _folders_of_scans(path) for reader in READERS[:-1]]
         scans = [(folder, reader) for folder, reader in inside if reader.recognises(folder)]
         if scans:
@@ -60,6 +63,12 @@ def acquisition_of(path: Path, stated: Mapping[str, Any]) -> Acquisition:
             return scans[0][1].read(folder, stated).saying(f"what is read is {folder.name} in {path.name}")
     if picture_stack.recognises(path):
         return picture_stack.read(path, stated)
+    told = what_is_told(path)
+    if told is not None:
+        remedy = (
+            f"import the folder of its TIFFs with {told[1]}; ImageJ makes TIFFs of raw pictures (Import, Raw)"
+        )
+        raise fail("path", "the pictures of a scan", f"{told[0]}, which is not read", remedy)
     kinds = ", ".join(reader.KIND.split(" (")[0] for reader in READERS)
     raise fail(
         "path",
@@ -71,6 +80,6 @@ def acquisition_of(path: Path, stated: Mapping[str, Any]) -> Acquisition:
 
 def _folders_of_scans(path: Path) -> list[Path]:
     inside = sorted(
-        folder for folder in path.iterdir() if folder.is_dir() and os.access(folder, os.R_OK | os.X_OK)
+        folder for folder in entries_of(path) if folder.is_dir() and os.access(folder, os.R_OK | os.X_OK)
     )
     return [folder for folder in inside if not _RECONSTRUCTED.fullmatch(folder.name)][:_MOST_FOLDERS]

@@ -19,6 +19,7 @@ from tomo_polysplat.checks import fail, require_number
 from tomo_polysplat.files import file_content
 from tomo_polysplat.scan.geometry import Geometry
 from tomo_polysplat.scan.readers.acquisition import Acquisition
+from tomo_polysplat.scan.readers.entries import entries_of
 from tomo_polysplat.scan.readers.files_of_scans import the_one
 from tomo_polysplat.scan.readers.frames import Frames, TiffFrames
 from tomo_polysplat.scan.readers.metaimage import METAIMAGE_SUFFIXES, MetaImageFrames
@@ -104,7 +105,7 @@ def _about(axis: int, angle: np.ndarray) -> np.ndarray:
 
 
 def _texts(path: Path) -> list[Path]:
-    files = [path] if path.is_file() else path.iterdir()
+    files = [path] if path.is_file() else entries_of(path)
     return sorted(
         file for file in files if file.suffix.lower() == ".xml" and file.is_file() and _is_rtk(file)
     )
@@ -157,7 +158,7 @@ def _pictures(
     if "projections" in known:
         files = named_files(folder, known["projections"], "projections")
     else:
-        files = [file for file in sorted(folder.iterdir()) if file.suffix.lower() in METAIMAGE_SUFFIXES]
+        files = [file for file in entries_of(folder) if file.suffix.lower() in METAIMAGE_SUFFIXES]
         files = files or [
             f for f in tiffs_in(folder) if not (has_word(f.stem, "flats") or has_word(f.stem, "darks"))
         ]

@@ -21,6 +21,7 @@ import numpy as np
 from tomo_polysplat.checks import fail, require_number
 from tomo_polysplat.physics.filter_text import filters_of
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
+from tomo_polysplat.scan.readers.entries import entries_of
 from tomo_polysplat.scan.readers.files_of_scans import the_one
 from tomo_polysplat.scan.readers.frames import TiffFrames
 from tomo_polysplat.scan.readers.ini_text import IniText
@@ -36,8 +37,8 @@ _ROUND = 0.005
 _MOST_DIGITS = 20
 # Logs of a reconstruction, which NRecon may write beside the pictures.
 _RECONSTRUCTION = re.compile(r".*_rec", re.I)
-# By which the pixel of the log may be off that of the camera, rounded to 0.01 um.
-_PIXEL = 0.01
+# From this many mm on a beam is parallel: so tell of synchrotrons and light those who write a log for NRecon.
+_PARALLEL = 1e4
 
 
 def recognises(path: Path) -> bool:
@@ -85,7 +86,7 @@ def _logs(path: Path) -> list[Path]:
 
 
 def _all_logs(folder: Path) -> list[Path]:
-    files = [file for file in folder.iterdir() if file.is_file()]
+    files = [file for file in entries_of(folder) if file.is_file()]
     return sorted(file for file in files if file.suffix.lower() == ".log" and _is_skyscan(file))
 
 
@@ -138,8 +139,11 @@ def _require_size(log: IniText, frames: TiffFrames) -> None:
 def _setup(log: IniText, numbers: np.ndarray, rows: int) -> tuple[Setup, list[str]]:
     """Of pictures of these numbers, but for the axis' shift."""
     near = require_number("Object to Source (mm)", log.number("Object to Source (mm)"), above=0.0)
-    far = log.number("Camera to Source (mm)")
+    parallel = near > _PARALLEL
+    far = near if parallel else _camera_distance(log, near)
     object_pixel, said = _pixel(log, far / near)
+    if parallel:
+        said.append(f"the source is {near:g} mm away: the beam is taken to be parallel")
     # Brought to the detector, where it is the camera's as far as the distances are exact.
     width = object_pixel * far / near
     ratio = log.number("CameraXYRatio", "Camera X/Y Ratio", otherwise=1.0)
@@ -155,11 +159,22 @@ def _setup(log: IniText, numbers: np.ndarray, rows: int) -> tuple[Setup, list[st
             f"the camera's rotation of {tilt:g} degrees is not undone; give roll={tilt:g} or roll={-tilt:g}, or "
             "reconstruct with align=True (--align), which finds it"
         )
-    if "ON" in log.text("Camera Offset").upper():
+    # Of several positions the scanner has put the pictures together.
+    together = log.number("Number Of Horizontal Offset Positions", otherwise=1.0) > 1
+    if "ON" in log.text("Camera Offset").upper() and not together:
         said.append("the camera was offset: is that in the pictures? give offset= if it is not")
     sense, guess = _sense(log)
     degrees = sense * _step(log, numbers) * numbers
-    return Setup(degrees, (width, height), near, far, (0.0, ((rows - 1) / 2 - line) * height)), said + guess
+    setup = Setup(degrees, (width, height), offset=(0.0, ((rows - 1) / 2 - line) * height))
+    return setup if parallel else replace(setup, source_object=near, source_detector=far), said + guess
+
+
+def _camera_distance(log: IniText, near: float) -> float:
+    """From the source, as told, else as the pixel of the camera and that in the object have it."""
+    camera = 1e-3 * _camera_pixel(log)
+    in_object = 1e-3 * log.number("Image Pixel Size (um)", otherwise=0.0)
+    computed = near * camera / in_object if camera > in_object > 0 else None
+    return log.number("Camera to Source (mm)", otherwise=computed)
 
 
 def _step(log: IniText, numbers: np.ndarray) -> float:
@@ -173,9 +188,7 @@ def _step(log: IniText, numbers: np.ndarray) -> float:
 def _pixel(log: IniText, magnification: float) -> tuple[float, list[str]]:
     """The side of a pixel in the object, in mm, beside that of the camera."""
     told = log.number("Image Pixel Size (um)", "Scaled Image Pixel Size (um)", otherwise=0.0)
-    binning = re.match(r"\d+", log.text("Camera binning"))
-    camera = log.number("Camera Pixel Size (um)", otherwise=0.0) * (int(binning[0]) if binning else 1)
-    said = []
+    camera, said = _camera_pixel(log), []
     scaled = log.number("Scaled Image Pixel Size (um)", otherwise=told)
     if told and abs(scaled - told) > _ROUND * told:
         said.append(f"the pictures were scaled: their pixel is taken to be {scaled:g} um, not {told:g}")
@@ -186,6 +199,12 @@ def _pixel(log: IniText, magnification: float) -> tuple[float, list[str]]:
         said.append("no Image Pixel Size: it is taken to be the camera's, brought down to the axis")
         return 1e-3 * camera / magnification, said
     return 1e-3 * told, said
+
+
+def _camera_pixel(log: IniText) -> float:
+    """In um, binned; 0 where it is not told."""
+    binning = re.match(r"\d+", log.text("Camera binning"))
+    return log.number("Camera Pixel Size (um)", otherwise=0.0) * (int(binning[0]) if binning else 1)
 
 
 def _postalignment(log: IniText, folder: Path) -> tuple[float, list[str]]:

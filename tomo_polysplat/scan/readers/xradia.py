@@ -18,6 +18,7 @@ from tomo_polysplat.checks import fail
 from tomo_polysplat.physics.filter_text import filters_of
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
 from tomo_polysplat.scan.readers.compound import CompoundFile, is_compound
+from tomo_polysplat.scan.readers.entries import entries_of
 from tomo_polysplat.scan.readers.files_of_scans import the_one
 from tomo_polysplat.scan.readers.stated import require_known, stated_over
 from tomo_polysplat.scan.readers.xradia_frames import (
@@ -117,7 +118,7 @@ def _told(file: CompoundFile | XrmSeries, frames: Frames, flats: Frames | None, 
 def _files(path: Path) -> list[Path]:
     if path.is_file():
         return [path] if path.suffix.lower() in _SUFFIXES and is_compound(path) else []
-    inside = sorted(file for file in path.iterdir() if file.is_file())
+    inside = [file for file in entries_of(path) if file.is_file()]
     kinds = ([file for file in inside if file.suffix.lower() == suffix] for suffix in _SUFFIXES)
     return next((files for some in kinds if (files := [file for file in some if is_compound(file)])), [])
 
@@ -136,7 +137,8 @@ def _exposures(
     light = beside / seconds
     if np.abs(light - 1).max() < _SAME:
         return None, usual, []
-    words = f"pictures of {seconds.min():.4g} to {seconds.max():.4g} s are compared with an open beam of {beside:.4g} s"
+    ends = dict.fromkeys(f"{end:.4g}" for end in (seconds.min(), seconds.max()))
+    words = f"pictures of {' to '.join(ends)} s are compared with an open beam of {beside:.4g} s"
     return light, usual, [words]
 
 

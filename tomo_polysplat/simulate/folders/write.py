@@ -17,6 +17,7 @@ KINDS = {
     "npy": arrays.write_npy,
     "npz": arrays.write_npz,
     "edf": arrays.write_edf,
+    "esrf": arrays.write_esrf,
     "skyscan": skyscan.write,
     "nikon": nikon.write,
     "nxtomo": nxtomo.write,
@@ -26,7 +27,7 @@ KINDS = {
     "xrm": xradia.write_single_views,
 }
 # Scans of a geometry that a kind has of its own.
-_SCANS = {"nikon": nikon.make}
+_SCANS = {"nikon": nikon.make, "esrf": lambda: marked_scan(columns_off=0.0, beam="parallel")}
 
 
 def write_folder(kind: str, folder: str | os.PathLike, scan: Scan | None = None) -> Scan:
