@@ -9,14 +9,31 @@ import small_scans
 
 import tomo_polysplat as tps
 from tomo_polysplat.cli.main import main
+from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.physics.beer_lambert import projection
+from tomo_polysplat.physics.filter_shape import bowtie_map
 from tomo_polysplat.physics.materials import density, mass_attenuation
+from tomo_polysplat.plan.answer import Answer, Status
+from tomo_polysplat.plan.bowtie import find_bowtie
+from tomo_polysplat.plan.preparation import RunOptions
+from tomo_polysplat.report.decided import found_about_the_scanner
+from tomo_polysplat.result.filter_found import filter_of
+from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.scan.io import load_scan, save_scan
 from tomo_polysplat.scan.scan import Scan
 
 SPECTRUM = tps.Spectrum.from_tube(70, filters={"Al": 0.05})
 COLUMNS, VIEWS, HALF = 61, 60, 0.5
 BOWTIE = ((np.arange(COLUMNS) - 30) / 30) ** 2
+# Discs of bone in a disc of water: places and radii in half widths.
+DISCS = (
+    (0.5, 0.2, 0.2),
+    (-0.4, 0.45, 0.15),
+    (-0.3, -0.5, 0.22),
+    (0.25, -0.45, 0.12),
+    (0.05, 0.6, 0.1),
+    (-0.1, 0.05, 0.1),
+)
 
 
 def disc(bowtie):
@@ -34,6 +51,27 @@ def disc(bowtie):
     row = projection(paths, logs, curves) - projection(paths * [[0], [0], [1]], logs, curves)
     values = np.broadcast_to(row, (1, VIEWS, COLUMNS)).astype(np.float32)
     return Scan(values, geometry, astra.create_vol_geom(45, 45, 1, *window), spectrum=SPECTRUM)
+
+
+def discs(thickest):
+    """As `disc`, of several discs of bone, behind so many cm of aluminium at the sides."""
+    width, angles = 2.4 * HALF / COLUMNS, np.arange(VIEWS) * np.pi / VIEWS
+    geometry = astra.create_proj_geom("parallel3d", width, width, 1, COLUMNS, angles)
+    across = (np.arange(COLUMNS) - 30) * width
+
+    def chord(x, y, radius):
+        place = HALF * (x * np.cos(angles) + y * np.sin(angles))
+        return 2 * np.sqrt(np.clip((HALF * radius) ** 2 - (across - place[:, None]) ** 2, 0, None))
+
+    bone = sum(chord(*one) for one in DISCS)
+    curves = np.stack([mass_attenuation(m, SPECTRUM.energies) for m in ("water", "bone", "Al")])
+    filters = np.broadcast_to(density("Al") * thickest * BOWTIE, bone.shape)
+    paths = np.stack([chord(0, 0, 0.9) - bone, 1.9 * bone, filters]).reshape(3, -1)
+    logs = np.log(np.maximum(SPECTRUM.weights, 1e-30))
+    values = projection(paths, logs, curves) - projection(paths * [[0], [0], [1]], logs, curves)
+    window = (-HALF, HALF, -HALF, HALF, -width / 2, width / 2)
+    volume = astra.create_vol_geom(45, 45, 1, *window)
+    return Scan(values.reshape(1, VIEWS, COLUMNS).astype(np.float32), geometry, volume, spectrum=SPECTRUM)
 
 
 def bias(result):
@@ -111,3 +149,42 @@ def test_one_energy_is_dimmed_and_not_hardened():
     alone = tps.reconstruct(*parts, **quick)
     same = tps.reconstruct(*parts, filter_map=("Al", BOWTIE), **quick)
     np.testing.assert_array_equal(np.asarray(alone.volume), np.asarray(same.volume))
+
+
+def test_one_that_is_found_is_as_one_that_is_told(monkeypatch, tmp_path):
+    found = Answer({"parabola": 1.0}, "as planted", Status.ASKED)
+    monkeypatch.setattr("tomo_polysplat.plan.solver.find_bowtie", lambda *_: found)
+    scan = disc(BOWTIE)
+    quick = {"settings": small_scans.QUICK, "align": False}
+    path = tmp_path / "checkpoint.npz"
+    by_fit = tps.reconstruct(scan, filter_map="fit", checkpoint=path, **quick)
+    same = bowtie_map(found.value, 1, COLUMNS)
+    told = tps.reconstruct(scan, filter_map=same, **quick)
+    np.testing.assert_array_equal(np.asarray(by_fit.volume), np.asarray(told.volume))
+    assert by_fit.plan[
+        "bowtie"
+    ] is found and "a bowtie of aluminium in cm, parabola 1" in found_about_the_scanner(by_fit.plan)
+    np.testing.assert_array_equal(filter_of(by_fit, scan)[1], same[1])
+    monkeypatch.undo()
+    again = tps.reconstruct(scan, filter_map="fit", checkpoint=path, resume=True, **quick)
+    assert again.plan["bowtie"].value == found.value, "a checkpoint knows it"
+
+
+def test_what_cannot_be_found_is_refused():
+    scan = disc(BOWTIE)
+    with pytest.raises(ValueError, match="time_budget"):
+        tps.reconstruct(scan, filter_map="fit", time_budget=5)
+    with pytest.raises(ValueError, match="filter_map"):
+        tps.reconstruct(scan, filter_map="auto")
+
+
+def test_fits_find_a_bowtie_of_grains_and_none_where_there_is_none():
+    """A slice of discs that lie anywhere: no ring of the object does what the bowtie does."""
+    for thickness, least, most in ((1.0, 0.6, 1.5), (0.0, 0.0, 0.2)):
+        scan = discs(thickness)
+        geometry, grid = from_astra(scan.proj_geom, scan.vol_geom)
+        values = np.ascontiguousarray(np.moveaxis(scan.projections, 1, 0))
+        problem = Problem.of(values, geometry, grid, "cm", SPECTRUM, None)
+        options = RunOptions.of("balanced", None, None, 0, "cpu", [])
+        answer = find_bowtie(problem, options, lambda *_: None)
+        assert least <= answer.evidence["thickest"] <= most, answer

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.fit.filtered import filtered
+from tomo_polysplat.fit.filtered import FIT, can_be_found, filter_to_find, filtered
 from tomo_polysplat.fit.memory import require_machine
 from tomo_polysplat.fit.optimise import FitOutcome, FitState
 from tomo_polysplat.fit.problem import Problem
@@ -81,7 +81,7 @@ def reconstruct(
     devices: str | Sequence[int | str] | None = None,
     valid: Any = None,
     water_correction: Sequence[float] | None = None,
-    filter_map: Sequence[Any] | None = None,
+    filter_map: Sequence[Any] | str | None = None,
     calibrate: bool | str | Sequence[str] | None = None,
     soft_density: float | None = None,
     align: bool | str | Sequence[str] | None = "auto",
@@ -132,10 +132,12 @@ def reconstruct(
         Coefficients c_0 = 0, c_1, ... of the polynomial ``sum_k c_k P^k`` that the scanner has put its
         -log(I/I0) through; it is undone first, so that every ray keeps the noise of its counts. With a
         spectrum only.
-    filter_map : (material, thickness) or (material, thickness, density), optional
+    filter_map : (material, thickness) or (material, thickness, density), or "fit", optional
         A filter that is not everywhere as thick, such as a bowtie: its thickness at each pixel, an array
         (rows, columns) in ``unit``, or one row for all; g/cm3 where the material has no known density. The open beam
         I0 was measured through it. Each pixel then has the spectrum behind its filter; ``spectrum`` is that in front.
+        "fit" finds a bowtie of aluminium by two fits by joined pixels, in place of a map that a `Scan` brings; not
+        beside a ``time_budget``. ``result.plan["bowtie"]`` tells its coefficients in cm (docs/spectrum.md).
     calibrate : bool or names among "scatter", "kvp", "filter", optional
         Fit these by a few short fits first, and use what fits the held-out rays better: a scattered signal, and the
         tube's voltage or its filters, which need ``soft_density``. True calibrates scatter, and the voltage where
@@ -202,8 +204,9 @@ def reconstruct(
     mended: list[str] = []
     if mend and isinstance(projections, Scan) and proj_geom is None:
         projections, mended = mend_scan(projections)
+    projections, told_filter, bowtie = filter_to_find(projections, filter_map, time_budget)
     measured = Measurement(
-        projections, proj_geom, vol_geom, unit, spectrum, valid, water_correction, filter_map
+        projections, proj_geom, vol_geom, unit, spectrum, valid, water_correction, told_filter
     ).filled()
     if measured.unit is None and measured.spectrum is not None:
         warn_of_unit("cm")
@@ -213,16 +216,21 @@ def reconstruct(
     wanted = Calibration.of(calibrate, soft_density, problem.spectrum)
     flipped = is_planar_geometry(measured.geometries()[0])
     moved = moves_of(align if mend or align != "auto" else None, time_budget)
+    bowtie = bowtie and can_be_found(problem, measured.geometries()[0]["type"])
     asked = None if wanted is None else {"names": wanted.names, "soft_density": wanted.soft_density}
-    options = run_options.to_dict() | {
-        "calibration": asked or ("as the rays ask" if calibrate is None else None),
-        "align": moved,
-    }
+    options = (
+        run_options.to_dict()
+        | {
+            "calibration": asked or ("as the rays ask" if calibrate is None else None),
+            "align": moved,
+        }
+        | ({"filter_map": FIT} if bowtie else {})
+    )
     saved = _checkpoint(checkpoint, resume, problem, options)
     before = 0.0 if saved is None else saved.seconds
     started, begun = started - before, begun - before
     with one_torch_thread(run_options.device), kept_threads(), progress_reports(progress) as report:
-        solver = Solver(run_options, saved, started, flipped, report, moved)
+        solver = Solver(run_options, saved, started, flipped, report, moved, bowtie)
         problem, prepared, outcome = solver.solve(problem, wanted, ask_scatter=calibrate is None)
         _note_ranks(prepared.plan)
         _note_scan(prepared.plan, problem, grid, measured.water_correction, mended)
@@ -307,7 +315,7 @@ def _note_scan(
     plan.note("unseen", *_unseen(problem, grid))
     if mended:
         plan.note("mended", "the axis", "; ".join(mended))
-    if problem.filter_map is not None:
+    if problem.filter_map is not None and "bowtie" not in plan.facts:
         plan.note("filter_map", "modelled", problem.filter_map.describe())
 
 

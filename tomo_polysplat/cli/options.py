@@ -72,7 +72,7 @@ def filter_map_from(text: str) -> tuple[str, Any]:
 
     material, _, name = text.partition(":")
     if not name:
-        raise fail("--filter-map", "MATERIAL:FILE, such as Al:bowtie.npy", repr(text))
+        raise fail("--filter-map", "MATERIAL:FILE, such as Al:bowtie.npy, or fit", repr(text))
     return material, thickness_of(name, "--filter-map")
 
 

@@ -124,7 +124,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--filter-map",
         metavar="MATERIAL:FILE",
         help="a filter that is not everywhere as thick, such as a bowtie: its thickness at each pixel (rows, columns) "
-        "in --unit, as .npy, .tif or text; one row stands for all",
+        "in --unit, as .npy, .tif or text; one row stands for all. 'fit' finds a bowtie of aluminium",
     )
     group.add_argument(
         "--soft-density", type=float, metavar="G/CM3", help="known density of what most of the object is"
@@ -172,8 +172,7 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
     make_settings(arguments.quality, settings)
     scan = scan_from(arguments, spectrum_from(arguments))
     spectrum = _spectrum_of(scan, arguments)
-    if arguments.filter_map is not None:
-        scan = replace(scan, filter_map=filter_map_from(arguments.filter_map))
+    scan, to_find = _filtered(scan, arguments.filter_map)
     require_room_of(arguments, scan)
     print(visible(scan))
     # What a run will take is said without -v as well.
@@ -190,6 +189,7 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
             calibrate=_calibrated(arguments),
             align=_aligned(arguments),
             soft_density=arguments.soft_density,
+            filter_map=to_find,
             mend=not arguments.no_mend,
             progress=progress,
             settings=settings or None,
@@ -213,6 +213,15 @@ def _follow(device: str) -> int:
 
     follow_torchrun(device)
     return 0
+
+
+def _filtered(scan: Scan, told: str | None) -> tuple[Scan, str | None]:
+    """The scan with the filter that is told, and "fit" where one is to be found."""
+    from tomo_polysplat.fit.filtered import FIT
+
+    if told is None or told == FIT:
+        return scan, told
+    return replace(scan, filter_map=filter_map_from(told)), None
 
 
 def _aligned(arguments: argparse.Namespace) -> str | bool | list[str]:

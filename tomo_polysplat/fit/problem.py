@@ -187,6 +187,13 @@ class Problem:
         object.__setattr__(other, "_known", shared)
         return other
 
+    def behind(self, filter_map: FilterMap | None) -> Problem:
+        """The same measurements through another filter; copies of them on devices serve both."""
+        other, known = replace(self, filter_map=filter_map), self._known
+        shared = _Known(known.copies, closed=known.closed, agreement=known.agreement, taken=known.taken)
+        object.__setattr__(other, "_known", shared)
+        return other
+
     def told_geometry(self) -> Geometry:
         """The scanner in the caller's unit, its views in the caller's order."""
         geometry = self.geometry.scaled(self.length).shifted(self.centre)

@@ -15,6 +15,7 @@ from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.detector_blur import blurred
+from tomo_polysplat.physics.filter_slope import filter_slope
 from tomo_polysplat.physics.pixel_light import averaged_light
 from tomo_polysplat.physics.quadrature import Quadrature
 from tomo_polysplat.physics.transmission import polychromatic_projection
@@ -123,6 +124,18 @@ class FitScene:
         parts = [fine // whole for fine, whole in zip(areal.shape[2:], self.behind.shape[1:])]
         filters, alone = self.behind.repeat_interleave(parts[0], 1).repeat_interleave(parts[1], 2)
         return polychromatic_projection(areal, self.quadrature, filters) - alone
+
+    def filter_slopes(
+        self, gaussians: Gaussians, views: DetectorViews, quadrature: Quadrature
+    ) -> torch.Tensor:
+        """(views, rows, columns) derivative of -log(I/I0) by the areal density of each pixel's filter, in cm2/g.
+
+        ``quadrature`` has nodes that know the filter; rays are infinitely thin, and not blurred.
+        """
+        weights = gaussians.weights(self.reference_curve)
+        areal, _ = project_gaussians(gaussians, weights, views, self.kernel)
+        behind = areal.new_zeros(areal.shape[2:]) if self.behind is None else self.behind[0]
+        return filter_slope(areal * self.areal_scale, quadrature, behind)
 
     def as_if_bare(self, areal: torch.Tensor, measured: torch.Tensor) -> torch.Tensor:
         """Rays in front of no filter with as much more or less light, of the whole beam, than the model has."""

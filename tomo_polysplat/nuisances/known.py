@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from tomo_polysplat.nuisances.alignment import Alignment
+from tomo_polysplat.nuisances.bowtie import Bowtie
 from tomo_polysplat.nuisances.detector_blur import BlurOfDetector
 from tomo_polysplat.nuisances.drift import Drift
 from tomo_polysplat.nuisances.filters import Filters
@@ -22,6 +23,7 @@ NUISANCES: tuple[type[Nuisance], ...] = (
     OpenBeam,
     TubeVoltage,
     Filters,
+    Bowtie,
     BlurOfDetector,
     PixelLight,
     Gains,

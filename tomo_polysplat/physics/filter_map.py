@@ -117,11 +117,14 @@ class FilterMap:
         In g/cm2.
     grams : float
         Density in g/cm3, for reports.
+    reach : float
+        Areal density in g/cm2 up to which nodes of a spectrum have to hold, where that is more than the map has.
     """
 
     material: str
     areal: np.ndarray
     grams: float
+    reach: float = 0.0
 
     @classmethod
     def of(cls, value: Any, unit: str, rows: int, columns: int) -> FilterMap:
@@ -145,7 +148,8 @@ class FilterMap:
     @property
     def span(self) -> Behind:
         """What nodes of a spectrum have to hold for."""
-        return (self.material, *self.ends)
+        least, most = self.ends
+        return self.material, least, max(most, self.reach)
 
     @property
     def ends(self) -> tuple[float, float]:

@@ -16,6 +16,7 @@ from tomo_polysplat.fit.stopping import StopReason
 from tomo_polysplat.fit.taken_out import Step
 from tomo_polysplat.json_text import parse_json
 from tomo_polysplat.model.gaussians import OF_ALL, Gaussians
+from tomo_polysplat.nuisances.bowtie import Bowtie
 from tomo_polysplat.nuisances.drift import Drift
 from tomo_polysplat.nuisances.gains import Gains
 from tomo_polysplat.plan.decision import When
@@ -60,6 +61,7 @@ def plan_of(parts: dict[str, Any], options: dict[str, Any]) -> Plan:
     _require_calibration(plan, options.get("calibration"))
     _require_moves(plan, options.get("align"))
     _require_light(plan)
+    _require_bowtie(plan, options.get("filter_map"))
     return plan
 
 
@@ -82,6 +84,16 @@ def _require_moves(plan: Plan, asked: Any) -> None:
         numbers = value if isinstance(value, list) else [value]
         if name not in MOVES or not _finite(numbers):
             raise TypeError(f"moves of the scanner, got {name} = {value!r}"[:200])
+
+
+def _require_bowtie(plan: Plan, asked: Any) -> None:
+    """See to it that a plan tells the bowtie where it was asked about."""
+    if asked is None:
+        return
+    found, ends = plan.facts["bowtie"].value, Bowtie.parameters
+    good = isinstance(found, dict) and set(found) <= set(ends) and _finite(list(found.values()))
+    if not (good and all(ends[name].least <= value <= ends[name].most for name, value in found.items())):
+        raise TypeError(f"coefficients of a bowtie, got {found!r}"[:200])
 
 
 def _require_light(plan: Plan) -> None:

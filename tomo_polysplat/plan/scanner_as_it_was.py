@@ -21,7 +21,7 @@ from tomo_polysplat.plan.realignment import is_joined, realigned
 __all__ = ["STAYS", "scanner_as_it_was"]
 
 # Facts that a run which begins anew, or goes on, does not find again.
-STAYS = ("alignment", EARLY_LIGHT, "gains", "drift")
+STAYS = ("alignment", "bowtie", EARLY_LIGHT, "gains", "drift")
 
 
 def scanner_as_it_was(

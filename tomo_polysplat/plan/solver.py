@@ -19,6 +19,7 @@ from tomo_polysplat.fit.surroundings import cut_out
 from tomo_polysplat.kernels.compile_time import compiled_seconds, working_time
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.plan.answer import Answer, Status
+from tomo_polysplat.plan.bowtie import behind_bowtie, find_bowtie
 from tomo_polysplat.plan.calibration import Calibration
 from tomo_polysplat.plan.checkpoint import Checkpoint
 from tomo_polysplat.plan.decision import When
@@ -64,6 +65,8 @@ class Solver:
         Which moves of the scanner the rays are asked about (`plan.alignment`).
     report : callable
         Gets the share done, and words.
+    bowtie : bool
+        Whether the rays are asked about a bowtie filter (`plan.bowtie`).
     compiled : float
         Seconds that this process had compiled for before.
     """
@@ -74,6 +77,7 @@ class Solver:
     flipped: bool
     report: Callable[[float, str], Any]
     moved: str | Sequence[str] | None = None
+    bowtie: bool = False
     compiled: float = field(default_factory=compiled_seconds)
 
     def solve(
@@ -98,8 +102,10 @@ class Solver:
             told, facts, lab = scanner_as_it_was(
                 problem, self.moved, self.run_options, self.saved, self.report
             )
-        problem, plan = physics(told, wanted, self.run_options, self.saved, self.report)
-        plan.facts |= facts
+            filters = self._filters(told)
+        behind = behind_bowtie(told, {} if filters is None else filters.value)
+        problem, plan = physics(behind, wanted, self.run_options, self.saved, self.report)
+        plan.facts |= facts if filters is None else facts | {"bowtie": filters}
         # Other physics have another start.
         lab = lab if problem is told else None
         prepared = prepare(problem, plan, self.run_options, self.saved, self.report, lab)
@@ -131,6 +137,14 @@ class Solver:
         words = "the fit explains the rays no better, or too little to have regained what its seeds had lost"
         prepared.plan.note("returned", "start", f"{words}: the volume is the one that it began from")
         logger.warning("The start volume is returned: %s.", prepared.plan.facts["returned"].why)
+
+    def _filters(self, problem: Problem) -> Answer | None:
+        """What the rays tell of a bowtie, which a checkpoint's plan knows; None where they are not asked."""
+        if not self.bowtie:
+            return None
+        if self.saved is not None and self.saved.plan is not None:
+            return self.saved.plan.facts["bowtie"]
+        return find_bowtie(problem, self.run_options, self.report)
 
     def _anew(
         self, problem: Problem, prepared: PreparedFit, so_far: FitOutcome

@@ -11,6 +11,7 @@ import numpy as np
 from tomo_polysplat.checks import fail
 from tomo_polysplat.plan.answer import Status
 from tomo_polysplat.reconstruction import reconstruct
+from tomo_polysplat.result.filter_found import filter_of
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.scan import Scan
 from tomo_polysplat.scan.volume_grid import VolumeGrid
@@ -98,7 +99,7 @@ def fit_again(
         unit=scan.unit,
         valid=valid,
         water_correction=scan.water_correction if spectrum is not None else None,
-        filter_map=scan.filter_map,
+        filter_map=filter_of(result, scan),
         calibrate="scatter" if scattered and spectrum is not None else False,
         align=False,
         seed=int(result.settings.get("seed", 0)),

@@ -54,6 +54,7 @@ _TOLD = {
     "spectrum_doubt": "Whether the spectrum fits",
     "water_correction": "The scanner's water correction",
     "filter_map": "The filter in front of each pixel",
+    "bowtie": "The bowtie filter",
     "mended": "What was mended",
     "alignment": "The scanner's geometry",
     "scatter": "Scatter",
@@ -117,7 +118,7 @@ def _of_nuisances(plan: Mapping[str, Answer]) -> dict[str, Any]:
     values |= plan["calibration"].value["fitted"] if "calibration" in plan else {}
     if "fitted_blur" in plan and plan["detector_blur"].status is Status.ASKED:
         values["blur"] = plan["fitted_blur"].value
-    values |= {name: plan[name].value for name in ("gains", "drift") if name in plan}
+    values |= {name: plan[name].value for name in ("bowtie", "gains", "drift") if name in plan}
     return values | ({"pixel_rays": plan["pixel_rays"].value} if "pixel_rays" in plan else {})
 
 

@@ -20,6 +20,7 @@ from tomo_polysplat.render.renderer import RAY_CUTOFF, detector_views
 from tomo_polysplat.report.decided import RayPhysics, ray_physics
 from tomo_polysplat.report.held_out import HeldOut
 from tomo_polysplat.report.where import MisfitMap
+from tomo_polysplat.result.filter_found import filter_of
 from tomo_polysplat.result.residuals import Residuals
 from tomo_polysplat.scan.geometry import from_astra, is_planar_geometry
 from tomo_polysplat.scan.noise import photons_per_ray
@@ -79,7 +80,7 @@ def residuals_of(
     seen = geometry if result.geometry is None else from_astra(result.geometry, scan.vol_geom)[0]
     some = seen.select(chosen)
     planar = is_planar_geometry(scan.proj_geom) or geometry.planar
-    filters = None if spectrum is None or scan.filter_map is None else scan.filter_map
+    filters = None if spectrum is None else filter_of(result, scan)
     behind = None if filters is None else FilterMap.of(filters, scan.unit, *values.shape[1:])
     model = _Model(result, detector_views(some, planar), pick_fast_device(device), behind)
     unseen = HeldOut(geometry, grid, values, float(result.settings.get("held_out", 0.0)))

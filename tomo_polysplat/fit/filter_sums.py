@@ -1,0 +1,89 @@
+"""Sums over the rays of what a fit leaves and of how that would change with the filter in front of each pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from tomo_polysplat.fit.loss import misfit
+from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.physics.quadrature import Quadrature
+from tomo_polysplat.settings import Settings
+
+__all__ = ["FilterSums", "filter_sums"]
+
+# Views looked at together, and rays, of which there are as many for each node of the spectrum.
+_AT_ONCE, _RAYS = 8, 1 << 21
+# Residuals beyond so many usual ones of some views, or of what a model is allowed, count as so many.
+_FAR, _LEAST_ERROR = 4.0, 1e-3
+
+
+@dataclass(frozen=True)
+class FilterSums:
+    """Sums by pixel over the fitted rays, weighed by inverse variances up to a factor.
+
+    Attributes
+    ----------
+    sums : (5, rows, columns) array
+        Of 1, of the slope of -log(I/I0) by the filter's thickness (1/cm), of its square, of what is measured less the
+        model, and of slope times that.
+    held_out : (views,) array
+        Mean misfit of the rays held out; NaN in views without any.
+    """
+
+    sums: np.ndarray
+    held_out: np.ndarray
+
+
+# What a fit is, and what is to be known of the filter.
+@torch.no_grad()
+def filter_sums(
+    gaussians: Gaussians,
+    scene: FitScene,
+    rays: Rays,
+    settings: Settings,
+    quadrature: Quadrature,
+    grams: float,
+) -> FilterSums:
+    """Those of all views.
+
+    Parameters
+    ----------
+    gaussians, scene, settings
+        Of the fit.
+    rays : Rays
+        Their weights count, which are to be the same for fits that are compared.
+    quadrature : Quadrature
+        Nodes that know the filter's material.
+    grams : float
+        Its density in g/cm3.
+    """
+    views, rows, columns = len(rays.views), rays.views.rows, rays.views.columns
+    sums = torch.zeros((5, rows, columns), dtype=torch.float64, device=rays.target)
+    held_out = torch.full((views,), torch.nan, dtype=torch.float64, device=rays.target)
+    allowed = max(settings.model_error, _LEAST_ERROR)
+    at_once = max(1, min(_AT_ONCE, _RAYS // (rows * columns)))
+    for first in range(0, views, at_once):
+        some = np.arange(first, min(first + at_once, views))
+        seen, measured, fitted, aside = rays.batch(some)
+        predicted, _ = scene.projections(gaussians, seen)
+        slopes = scene.filter_slopes(gaussians, seen, quadrature) * grams
+        left = _clipped(measured - predicted, fitted, allowed)
+        parts = torch.stack([torch.ones_like(left), slopes, slopes.square(), left, slopes * left])
+        sums += (parts * fitted.square()).double().sum(dim=1)
+        for k in range(len(some)):
+            if bool(aside[k].any()):
+                held_out[first + k] = misfit(predicted[k], measured[k], aside[k], settings)
+    return FilterSums(sums.cpu().numpy(), held_out.cpu().numpy())
+
+
+def _clipped(residual: torch.Tensor, fitted: torch.Tensor, allowed: float) -> torch.Tensor:
+    """What is left of the fitted rays; those far off count as less far ones."""
+    used = (fitted > 0).to(residual.dtype)
+    usual = ((residual * fitted).square().sum() / used.sum().clamp(min=1)).sqrt().clamp(min=allowed)
+    far = _FAR * usual / fitted.clamp(min=1e-12)
+    return residual.maximum(-far).minimum(far) * used
