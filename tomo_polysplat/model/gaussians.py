@@ -76,14 +76,9 @@ class Gaussians:
         if self.position.device.type == "cpu":
             return self.copy()
         if before is None or len(before) != len(self):
-            names = [field.name for field in fields(self)]
+            tensors = {field.name: getattr(self, field.name) for field in fields(self)}
             before = Gaussians(
-                **{
-                    name: torch.empty_like(
-                        getattr(self, name), device="cpu", requires_grad=False, pin_memory=True
-                    )
-                    for name in names
-                }
+                **{name: torch.empty(t.shape, dtype=t.dtype, pin_memory=True) for name, t in tensors.items()}
             )
         for field in fields(self):
             getattr(before, field.name).copy_(getattr(self, field.name).detach())
