@@ -10,7 +10,7 @@ from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.plan import preparation
 from tomo_polysplat.plan.early_light import take_out_early
 from tomo_polysplat.plan.first_look import first_look
-from tomo_polysplat.plan.light_told import EARLY_LIGHT
+from tomo_polysplat.plan.light_told import EARLY_LIGHT, LightTold
 from tomo_polysplat.plan.means import Means
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.scan.geometry import from_astra, projections_from_astra
@@ -67,6 +67,23 @@ def test_what_a_caller_wants_left_in_is_left_in():
     problem, facts = looked_at(spoilt(), gains=False)
     assert not problem.taken.gains.any() and problem.taken.drift.any() and "gains" not in facts
     problem, facts = looked_at(spoilt(), gains=False, drift=False)
+    assert not problem.taken.steps and not facts
+
+
+def test_what_changes_hardly_anything_is_left_to_the_run(monkeypatch):
+    gains, drift = light()
+    evidence = {"rms": 4e-5, "better": 4e-4, "error": 1e-4}
+    told = {
+        "drift": LightTold(True, drift, "", evidence | {"better": 0.05, "error": 0.01}),
+        "gains": LightTold(True, 1e-3 * gains, "", evidence),
+    }
+    monkeypatch.setattr("tomo_polysplat.plan.early_light.light_told", lambda *parts: dict(told))
+    problem, facts = looked_at(scan().projections)
+    assert problem.taken.drift.any() and not problem.taken.gains.any() and "gains" not in facts
+    # Who asks for it has it at once.
+    assert "gains" in looked_at(scan().projections, gains=True)[1]
+    del told["drift"]
+    problem, facts = looked_at(scan().projections)
     assert not problem.taken.steps and not facts
 
 
