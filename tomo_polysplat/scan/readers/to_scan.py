@@ -118,10 +118,13 @@ def _open_beam(
     """The pictures without an object and without light, where counts have to be compared with them."""
     if kind != "counts":
         return told, None, None
-    size = pictures.shape[1:]
+    size, names = pictures.shape[1:], ("flats", "darks")
+    told = _deep_enough(told)
     dark = None if told.darks is None else pictures.mean(told.darks, "darks")
     if told.flats is not None:
-        return told, *flat_and_dark(pictures.mean(told.flats, "flats"), dark, size)
+        flat = pictures.mean(told.flats, "flats")
+        _require_reachable("flats", float(np.nanmean(flat)), told)
+        return told, *flat_and_dark(flat, dark, size, names)
     white = told.white
     if white is None:
         white = pictures.bright(_BRIGHT)
@@ -129,7 +132,28 @@ def _open_beam(
             f"no flat field: the open beam is taken to be {white:.6g} counts, as in the brightest pixels; give flats= "
             "or white= if that is wrong"
         )
-    return told, *flat_and_dark(np.full(size, white), dark, size)
+    _require_reachable("white", white, told)
+    return told, *flat_and_dark(np.full(size, white), dark, size, ("white", "darks"))
+
+
+def _deep_enough(told: Acquisition) -> Acquisition:
+    """Say of pictures of 8 bits what they cannot show."""
+    if told.frames.dtype.itemsize > 1:
+        return told
+    return told.saying(
+        "the pictures have 8 bits, 256 grey values: what is faint or dense is lost; export 16 bits if the scanner can"
+    )
+
+
+def _require_reachable(name: str, light: float, told: Acquisition) -> None:
+    """Refuse an open beam of more counts than the pictures' numbers go to: one of the two was converted."""
+    dtype = told.frames.dtype
+    # A white level may be the first number that is not reached.
+    if dtype.kind not in "iu" or light <= np.iinfo(dtype).max + 1:
+        return
+    expected = f"counts that pictures of {dtype} can have, {np.iinfo(dtype).max} at most"
+    remedy = "were the pictures converted to fewer bits? take those that the scanner wrote, or say white="
+    raise fail(name, expected, f"{light:.6g}", remedy)
 
 
 def _geometries(seen: Geometry, told: Acquisition, options: ReadOptions) -> dict[str, Any]:
