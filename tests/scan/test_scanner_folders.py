@@ -10,7 +10,7 @@ from folders import error_db, marked, require_the_same_volume
 
 import tomo_polysplat as tps
 from tomo_polysplat.simulate.folders.scene import MARKER
-from tomo_polysplat.simulate.folders.write import KINDS, write_folder
+from tomo_polysplat.simulate.folders.write import KINDS, scan_for, write_folder
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -23,6 +23,16 @@ def test_a_folder_gives_the_volume_of_our_own_file(kind, tmp_path):
         # What the folder tells of the tube makes the spectrum that the scan was made with.
         assert scan.spectrum.effective_energy == pytest.approx(own.spectrum.effective_energy)
         assert any("flat panel" in guess for guess in scan.notes["scanner"]["guessed"])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_scan_of_another_size_gives_the_volume_of_our_own_file(kind, tmp_path):
+    """Even rows, so that no pixel is in the middle, odd columns, fewer views, and another noise."""
+    size = {"views": 36, "rows": 38, "columns": 43, "seed": 1}
+    own = write_folder(kind, tmp_path / "folder", scan_for(kind, **size))
+    scan = tps.load_scan(tmp_path / "folder")
+    assert scan.vol_geom["GridSliceCount"] == 38 and scan.vol_geom["GridColCount"] == 43
+    require_the_same_volume(scan, own)
 
 
 @pytest.mark.parametrize("kind", KINDS)
