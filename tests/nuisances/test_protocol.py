@@ -11,7 +11,9 @@ from docs_examples import run_page
 
 from tomo_polysplat import nuisances
 from tomo_polysplat.nuisances.detector_blur import BlurOfDetector
+from tomo_polysplat.nuisances.drift import Drift
 from tomo_polysplat.nuisances.filters import Filters
+from tomo_polysplat.nuisances.gains import Gains
 from tomo_polysplat.nuisances.known import NUISANCES
 from tomo_polysplat.nuisances.nuisance import Nuisance
 from tomo_polysplat.nuisances.open_beam import OpenBeam
@@ -95,3 +97,11 @@ def test_the_example_of_the_docs_runs():
     blocks, names = run_page("nuisances.md")
     assert len(blocks) == 2
     names["test_a_lag_is_kept_where_the_held_out_rays_fit_better"]()
+
+
+@pytest.mark.parametrize("kind", [Drift, Gains])
+def test_light_is_corrected_where_that_is_sure_and_worth_it(kind):
+    """Very many rays are sure of what changes nothing."""
+    assert kind.gate({"rms": 1e-2, "better": 0.02, "error": 0.005}).kept
+    assert not kind.gate({"rms": 1e-2, "better": 0.02, "error": 0.01}).kept
+    assert not kind.gate({"rms": 2e-5, "better": 2e-4, "error": 1e-5}).kept

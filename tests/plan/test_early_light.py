@@ -46,7 +46,7 @@ def looked_at(projections, **settings):
     geometry, grid = from_astra(scan().proj_geom, scan().vol_geom)
     values = projections_from_astra(projections, scan().proj_geom).copy()
     problem = Problem.of(values, geometry, grid, scan().unit, scan().spectrum, None)
-    look = first_look(preparation.lab_of(problem, Plan(), Means(chosen, None, 0, torch.device("cpu"))))
+    look = first_look(preparation.lab_of(problem, Plan(), Means(chosen, None, 0, torch.device("cpu"))), 1.0)
     return problem, take_out_early(look, chosen)
 
 
@@ -77,7 +77,7 @@ def test_of_a_steady_scanner_nothing_is_made_twice(monkeypatch):
     assert len(volumes) == 1 and result.gains is None and EARLY_LIGHT not in result.plan
     monkeypatch.setattr(preparation, "first_volume", kept)
     # Without a look, the volume is the same to the bit.
-    monkeypatch.setattr("tomo_polysplat.plan.scanner_as_it_was.first_look", lambda lab: None)
+    monkeypatch.setattr("tomo_polysplat.plan.scanner_as_it_was.first_look", lambda *_: None)
     alone = small_scans.reconstruct(scan(), settings=SETTINGS, progress=False, align=False)
     assert np.array_equal(alone.volume, result.volume)
 

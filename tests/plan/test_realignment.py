@@ -43,7 +43,7 @@ def problem(moved):
 
 @cache
 def first(moved):
-    return first_look(lab_of(problem(moved), Plan(), MEANS))
+    return first_look(lab_of(problem(moved), Plan(), MEANS), 1.0)
 
 
 def ask(moved, axis=AXIS):
@@ -94,13 +94,13 @@ def test_a_fit_that_fails_moves_nothing_and_ends_no_run(monkeypatch, caplog):
     monkeypatch.setattr(realignment, "first_volume", failing)
     assert ask(True) is AXIS and "broken" in caplog.text
     monkeypatch.setattr(Lab, "trial", failing)
-    assert first_look(lab_of(problem(False), Plan(), MEANS)) is None and caplog.text.count("broken") == 2
+    assert first_look(lab_of(problem(False), Plan(), MEANS), 1.0) is None and caplog.text.count("broken") == 2
 
 
 def test_a_short_run_is_not_asked():
-    """A pass would be more than a tenth of it."""
+    """A pass would be more than the share of it that may be taken."""
     quick = Means(make_settings("balanced", {"passes": 9.0}), None, 0, torch.device("cpu"))
-    assert first_look(lab_of(problem(False), Plan(), quick)) is None
+    assert first_look(lab_of(problem(False), Plan(), quick), 0.1) is None
     assert realignment.realigned(problem(False), AXIS, None, quick, lambda *_: None) is AXIS
 
 

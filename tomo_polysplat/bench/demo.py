@@ -71,6 +71,8 @@ def run_demo(
             unit=scan.unit,
             seed=seed,
             device=device,
+            # The simulated scanner stands where it is told: looking for moves would take a fifth of so short a run.
+            align=False,
             settings=_SETTINGS,
             progress=lambda share, _: progress(first + share * (last - first), words),
         )

@@ -19,8 +19,8 @@ __all__ = ["Look", "first_look"]
 
 logger = logging.getLogger(__name__)
 
-# Where no question needs this fit it takes this share of the run's passes at most, and no more than so many of them.
-_SHARE, _PASSES = 0.1, 1.0
+# Where no question needs this fit, it takes so many passes.
+_PASSES = 1.0
 
 
 @dataclass(frozen=True)
@@ -41,10 +41,17 @@ class Look:
     settings: Settings
 
 
-def first_look(lab: Lab) -> Look | None:
-    """The first fit; None where it would take too large a part of the run, or fails. It is made once."""
+def first_look(lab: Lab, share: float) -> Look | None:
+    """The first fit; None where it would take too large a part of the run, or fails. It is made once.
+
+    Parameters
+    ----------
+    lab : Lab
+    share : float
+        Of the run's passes, that the fit may take where no question needs it.
+    """
     try:
-        settings = _settings(lab)
+        settings = _settings(lab, share)
         if settings is None or not len(lab.seeds(edges="blurred")):
             return None
         return Look(lab, lab.trial(settings, edges="blurred").gaussians, settings)
@@ -56,10 +63,10 @@ def first_look(lab: Lab) -> Look | None:
         return None
 
 
-def _settings(lab: Lab) -> Settings | None:
+def _settings(lab: Lab, share: float) -> Settings | None:
     """Of the fit, None where it would take too long."""
     settings, plan = settings_of_trial(lab), lab.plan
     if Edges().given(lab.settings) is None and not why_no_trial(plan.spacing, plan.passes, lab):
         return settings
     passes = min(settings.passes or _PASSES, _PASSES)
-    return replace(settings, passes=passes) if passes <= _SHARE * plan.passes else None
+    return replace(settings, passes=passes) if passes <= share * plan.passes else None

@@ -20,6 +20,10 @@ from tomo_polysplat.plan.realignment import is_joined, realigned
 
 __all__ = ["STAYS", "scanner_as_it_was"]
 
+# Shares of the run's passes that a first fit may take which no question needs. A scanner that has moved costs many
+# decibels in a quick run, too; gains and drift are found by the run as well. Large detectors are asked otherwise.
+_OF_MOVES, _OF_LIGHT = 0.2, 0.1
+
 # Facts that a run which begins anew, or goes on, does not find again.
 STAYS = ("alignment", "bowtie", EARLY_LIGHT, "gains", "drift")
 
@@ -71,7 +75,7 @@ def scanner_as_it_was(
     if lab is None:
         report(0.0, "start volume")
         lab = lab_of(aligned(problem, found.value if found else {}), Plan(), options)
-    look = first_look(lab)
+    look = first_look(lab, _OF_MOVES if moved == "auto" and not is_joined(problem) else _OF_LIGHT)
     light = {} if look is None else take_out_early(look, options.settings)
     return lab.problem, _facts(found) | light, None if light else lab
 
@@ -90,5 +94,5 @@ def _found(
         return realigned(problem, axis, None, options, report), None
     report(0.0, "start volume")
     lab = lab_of(aligned(problem, axis.value), Plan(), options)
-    found = realigned(problem, axis, first_look(lab), options, report)
+    found = realigned(problem, axis, first_look(lab, _OF_MOVES), options, report)
     return found, lab if found is axis else None
