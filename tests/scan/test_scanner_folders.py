@@ -9,6 +9,7 @@ import SimpleITK
 from folders import error_db, marked, require_the_same_volume
 
 import tomo_polysplat as tps
+from tomo_polysplat.simulate.folders.__main__ import main as write_one
 from tomo_polysplat.simulate.folders.scene import MARKER
 from tomo_polysplat.simulate.folders.write import KINDS, scan_for, write_folder
 
@@ -51,6 +52,13 @@ def test_another_library_opens_the_volume_of_a_folder(kind, tmp_path):
     expected = tps.baselines.fdk(own)
     assert own.unit == "cm" and expected.unit == "cm"
     assert abs(error_db(10 * values, own.truth) - error_db(expected.volume, own.truth)) < 0.3
+
+
+def test_the_size_of_a_folder_s_scan_can_be_told(tmp_path, monkeypatch):
+    sizes = ["--views", "5", "--rows", "8", "--columns", "11", "--seed", "3"]
+    monkeypatch.setattr(sys, "argv", ["folders", "npz", str(tmp_path / "folder"), *sizes])
+    assert write_one() == 0
+    assert tps.load_scan(tmp_path / "folder").projections.shape == (8, 5, 11)
 
 
 def test_the_folder_above_that_of_the_scan(tmp_path):
