@@ -86,14 +86,10 @@ def acquisition_of(path: Path, stated: Mapping[str, Any]) -> Acquisition:
 def _refuse_one_picture(path: Path) -> None:
     """Refuse a picture of a scan whose text, which tells the distances, stands beside it."""
     folder = path.parent
-    text = picture_stack.toml_files(folder) or [r for r in READERS[:-1] if r.recognises(folder)]
-    if text and path.suffix.lower() in PICTURE_SUFFIXES:
-        raise fail(
-            "path",
-            "a scan",
-            f"{path}, one of its pictures",
-            f"name the folder: {visible(folder.resolve().name)}",
-        )
+    told = bool(picture_stack.toml_files(folder)) or any(r.recognises(folder) for r in READERS[:-1])
+    if told and path.suffix.lower() in PICTURE_SUFFIXES:
+        remedy = f"name the folder: {visible(folder.resolve().name)}"
+        raise fail("path", "a scan", f"{path}, one of its pictures", remedy)
 
 
 def _remedy(path: Path) -> str:

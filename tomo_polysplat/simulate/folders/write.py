@@ -34,7 +34,7 @@ _GEOMETRY: dict[str, dict[str, Any]] = {
 }
 
 
-def scan_for(kind: str, **size: int) -> Scan:
+def scan_for(kind: str, **size: Any) -> Scan:
     """A scan that a kind of scanner can write; `size` may have views, rows, columns and seed of `marked_scan`."""
     require_choice("kind", kind, KINDS)
     return marked_scan(**size, **_GEOMETRY.get(kind, {}))
