@@ -89,6 +89,10 @@ COMMANDS = {
     "import rgb.tif -o z.h5 --sod 2 --sdd 5 --pixel 1": "got uint8 of shape (5, 6, 3) in rgb.tif; save them as grey",
     "import tiffs -o z.h5 --angles 6.2832": "arc: expected angles in degrees, got 0 to 4.71, which look like radians",
     "import tiffs -o z.h5 --angles two.txt": "got 2; name the angles of this scan, or say how far it turned: arc",
+    "import tiffs -o z.h5 --flat dark_*.tif": "flats: expected an open beam that the object makes darker, got ",
+    "import tiffs -o z.h5 --input transmission": "input: expected an open beam that the object makes darker, got ",
+    "import tiffs -o z.h5 --input attenuation": "input: expected line integrals, such as 0 to 10, got ",
+    "import nikon -o z.h5 --white 200": "white: expected an open beam that the object makes darker, got 201 times its light",
     "import torn -o z.h5": "expected a readable TIFF file, got torn/proj_0002.tif",
     "import sizes -o z.h5": "got uint16 of (5, 6) in sizes/proj_0002.tif; move it elsewhere",
     "import cropped -o z.h5": "flats: expected shape (9, 9) (rows, columns) of the projections, got (5, 6); take flats",
@@ -103,7 +107,7 @@ COMMANDS = {
     "import archives -o z.h5": "call the arrays of the .npz file projections, flats, darks and degrees",
     "import hdf5 -o z.h5": "which is none of these; name the file of the scan: angles.h5, other.h5",
     "import hdf5/other.h5 -o z.h5": "no such dataset in hdf5/other.h5; NXtomo and CIL's NeXus are read too",
-    "import hdf5/angles.h5 -o z.h5": "no /exchange/theta in the file; `tomo-polysplat import SCAN --angles 180`",
+    "import hdf5/angles.h5 -o z.h5": "endpoint=False), or `tomo-polysplat import SCAN --angles 180`",
     "import hdf5/angles.h5 -o z.h5 --sod 2 --sdd 5": "expected arc, degrees and pixel alone, for a Data Exchange file",
     "view none.h5 --no-browser": "RESULT: expected an existing file, got none.h5",
     "view slice.tif --no-browser": "look at a TIFF in ImageJ",
@@ -128,6 +132,7 @@ def folders_gone_wrong(folder):
     for name, old, new in ((slip, "source_object", "sorce_object"), (comma, "100.0", "100,0")):
         text = (name / "scan.toml").read_text()
         (name / "scan.toml").write_text(text.replace(old, new))
+    write_folder("nikon", folder / "nikon", marked_scan(4, 9, 9))
     write_folder("skyscan", folder / "skyscan", marked_scan(4, 9, 9))
     for picture in [*eight.glob("proj*.tif"), *(folder / "skyscan").glob("*.tif")]:
         tifffile.imwrite(picture, (tifffile.imread(picture) >> 8).astype(np.uint8))

@@ -33,6 +33,9 @@ logger = logging.getLogger(__name__)
 _BRIGHT = 99.0
 # Degrees under which a source sees a detector: few scanners have 60, and none so many.
 _WIDE_VIEW, _NO_VIEW = 90.0, 130.0
+# Rays to look at, and line integrals that the middle one of them cannot have: of more light than was sent, by 1.65, and
+# of less than 1e-13 of it.
+_LOOKED_AT, _BRIGHTER, _OPAQUE = 100_000, 0.5, 30.0
 # A usual flat panel, where nothing tells of the detector.
 _PANEL = "csi:0.6mm"
 
@@ -61,6 +64,7 @@ def scan_from_acquisition(told: Acquisition, options: ReadOptions, part: Part) -
     told, flat, dark = _open_beam(told, kind, pictures)
     counts = Counts(lambda: nullcontext(pictures.views), pictures.shape, kind, flat, dark, limit)
     projections, valid, rays = line_integrals(counts, options.progress)
+    _require_possible(told, kind, projections, valid)
     told, spectrum = _spectrum(told, options)
     seen = part.of(geometry, (pictures.rows, pictures.columns))
     _tell(told, rays, valid)
@@ -154,6 +158,25 @@ def _require_reachable(name: str, light: float, told: Acquisition) -> None:
     expected = f"counts that pictures of {dtype} can have, {np.iinfo(dtype).max} at most"
     remedy = "were the pictures converted to fewer bits? take those that the scanner wrote, or say white="
     raise fail(name, expected, f"{light:.6g}", remedy)
+
+
+def _require_possible(told: Acquisition, kind: str, projections: np.ndarray, valid: np.ndarray) -> None:
+    """Refuse rays most of which are brighter than the open beam, or darker than anything that lets light through."""
+    chosen = np.unravel_index(
+        np.linspace(0, valid.size - 1, min(valid.size, _LOOKED_AT)).astype(np.int64), valid.shape
+    )
+    some = projections[chosen][valid[chosen]]
+    middle = float(np.median(some)) if some.size else 0.0
+    if kind == "attenuation" and middle > _OPAQUE:
+        remedy = "counts are input='counts'; integrals that were multiplied are divided first"
+        raise fail(
+            "input", "line integrals, such as 0 to 10", f"{middle:.6g} in half of the rays and more", remedy
+        )
+    if middle < -_BRIGHTER:
+        name = "input" if kind != "counts" else "white" if told.flats is None else "flats"
+        got = f"{np.exp(-min(middle, 0.0)):.3g} times its light in half of the rays and more"
+        remedy = "take flats and darks of the same scan and exposure; counts are input='counts'"
+        raise fail(name, "an open beam that the object makes darker", got, remedy)
 
 
 def _geometries(seen: Geometry, told: Acquisition, options: ReadOptions) -> dict[str, Any]:
