@@ -92,7 +92,7 @@ COMMANDS = {
     "import tiffs -o z.h5 --flat dark_*.tif": "flats: expected an open beam that the object makes darker, got ",
     "import tiffs -o z.h5 --input transmission": "input: expected an open beam that the object makes darker, got ",
     "import tiffs -o z.h5 --input attenuation": "input: expected line integrals, such as 0 to 10, got ",
-    "import nikon -o z.h5 --white 200": "white: expected an open beam that the object makes darker, got 201 times its light",
+    "import nikon -o z.h5 --white 200": "white: expected an open beam that the object makes darker, got 201 times",
     "import torn -o z.h5": "expected a readable TIFF file, got torn/proj_0002.tif",
     "import sizes -o z.h5": "got uint16 of (5, 6) in sizes/proj_0002.tif; move it elsewhere",
     "import cropped -o z.h5": "flats: expected shape (9, 9) (rows, columns) of the projections, got (5, 6); take flats",
