@@ -18,7 +18,7 @@ from playwright.sync_api import sync_playwright
 from tomo_polysplat.viewer.server import Server
 from tomo_polysplat.viewer.volumes import Shown
 
-MOVES = 25
+MOVES = 100
 MOVE = """async ({slider, value}) => {
   const begun = performance.now(), control = document.querySelector(slider);
   control.value = value;

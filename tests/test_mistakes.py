@@ -1,5 +1,8 @@
 """Typical mistakes: each is refused before the work, by its name, with what was expected and got and how to mend it."""
 
+import shutil
+
+import h5py
 import numpy as np
 import pytest
 import tifffile
@@ -74,7 +77,7 @@ COMMANDS = {
     "simulate teeth --metal vibranium -o y.h5": "got 'vibranium'; did you mean",
     "simulate teeth -o y.tif": "--output: expected a name ending in .npz, .h5, .hdf5, got y.tif; a scan is no volume",
     "import tiffs -o z.tif": "--output: expected a name ending in .npz, .h5, .hdf5, got z.tif",
-    "import tiffs -o z.h5 --rows 5-9": "--rows: expected A:B, got '5-9'",
+    "import tiffs -o z.h5 --rows 5-9": "--rows: expected A:B, got '5-9'; whole numbers with colons between them, such",
     "import tiffs -o z.h5 --rows 9:5": "rows: expected first < end, from 0 to 9, got 9, 5",
     "import tiffs -o z.h5 --binning 0": "binning: expected a positive whole number, got 0",
     "import tiffs -o z.h5 --views 0": "views: expected a positive whole number, got 0",
@@ -84,6 +87,28 @@ COMMANDS = {
     "import slice.tif -o z.h5 --sod 5 --sdd 2 --pixel 1": "source_detector: expected at least source_object, 5, got 2",
     "import slice.tif -o z.h5 --sod 2 --sdd 5 --pixel 1 --angles a.txt": "degrees: expected an existing file",
     "import rgb.tif -o z.h5 --sod 2 --sdd 5 --pixel 1": "got uint8 of shape (5, 6, 3) in rgb.tif; save them as grey",
+    "import tiffs -o z.h5 --angles 6.2832": "arc: expected angles in degrees, got 0 to 4.71, which look like radians",
+    "import tiffs -o z.h5 --angles two.txt": "got 2; name the angles of this scan, or say how far it turned: arc",
+    "import tiffs -o z.h5 --flat dark_*.tif": "flats: expected an open beam that the object makes darker, got ",
+    "import tiffs -o z.h5 --input transmission": "input: expected an open beam that the object makes darker, got ",
+    "import tiffs -o z.h5 --input attenuation": "input: expected line integrals, such as 0 to 10, got ",
+    "import nikon -o z.h5 --white 200": "white: expected an open beam that the object makes darker, got 201 times",
+    "import torn -o z.h5": "expected a readable TIFF file, got torn/proj_0002.tif",
+    "import sizes -o z.h5": "got uint16 of (5, 6) in sizes/proj_0002.tif; move it elsewhere",
+    "import cropped -o z.h5": "flats: expected shape (9, 9) (rows, columns) of the projections, got (5, 6); take flats",
+    "import dimmed -o z.h5": "flats: expected more light than darks has, 100 counts, got 9; are the two swapped",
+    "import slip -o z.h5": "scan.toml: expected keys that are known, or none of their like, got 'sorce_object'; did",
+    "import comma -o z.h5": "numbers have a decimal point (0.1)",
+    "import eight -o z.h5": "flats: expected counts that pictures of uint8 can have, 255 at most, got 4",
+    "import skyscan -o z.h5": "white: expected counts that pictures of uint8 can have, 255 at most, got 57000; were",
+    "import skyscan/marker_0001.tif -o z.h5": "one of its pictures; name the folder: skyscan",
+    "import jpeg -o z.h5": "which is none of these; its pictures are not read: save them as TIFFs of 16 bits",
+    "import names.npz -o z.h5": "a stack of pictures is read too: call its arrays projections, flats, darks",
+    "import archives -o z.h5": "call the arrays of the .npz file projections, flats, darks and degrees",
+    "import hdf5 -o z.h5": "which is none of these; name the file of the scan: angles.h5, other.h5",
+    "import hdf5/other.h5 -o z.h5": "no such dataset in hdf5/other.h5; NXtomo and CIL's NeXus are read too",
+    "import hdf5/angles.h5 -o z.h5": "endpoint=False), or `tomo-polysplat import SCAN --angles 180`",
+    "import hdf5/angles.h5 -o z.h5 --sod 2 --sdd 5": "expected arc, degrees and pixel alone, for a Data Exchange file",
     "view none.h5 --no-browser": "RESULT: expected an existing file, got none.h5",
     "view slice.tif --no-browser": "look at a TIFF in ImageJ",
     "view scan.h5 --port 99999": "--port: expected a number from 0 to 65535, got 99999",
@@ -93,13 +118,44 @@ COMMANDS = {
 MISTAKES = {f"recon scan.h5 -o x.h5 {options}": message for options, message in OPTIONS.items()} | COMMANDS
 
 
+def folders_gone_wrong(folder):
+    """A stack of TIFFs with one thing wrong in each copy, and folders of files that are not read."""
+    names = ("torn", "sizes", "cropped", "dimmed", "slip", "comma", "eight")
+    torn, sizes, cropped, dimmed, slip, comma, eight = (folder / name for name in names)
+    for copy in (torn, sizes, cropped, dimmed, slip, comma, eight):
+        shutil.copytree(folder / "tiffs", copy)
+    (torn / "proj_0002.tif").write_bytes((torn / "proj_0002.tif").read_bytes()[:200])
+    tifffile.imwrite(sizes / "proj_0002.tif", np.zeros((5, 6), np.uint16))
+    for flat in range(3):
+        tifffile.imwrite(cropped / f"flat_{flat:04d}.tif", np.full((5, 6), 40000, np.uint16))
+        tifffile.imwrite(dimmed / f"flat_{flat:04d}.tif", np.full((9, 9), 9, np.uint16))
+    for name, old, new in ((slip, "source_object", "sorce_object"), (comma, "100.0", "100,0")):
+        text = (name / "scan.toml").read_text()
+        (name / "scan.toml").write_text(text.replace(old, new))
+    write_folder("nikon", folder / "nikon", marked_scan(4, 9, 9))
+    write_folder("skyscan", folder / "skyscan", marked_scan(4, 9, 9))
+    for picture in [*eight.glob("proj*.tif"), *(folder / "skyscan").glob("*.tif")]:
+        tifffile.imwrite(picture, (tifffile.imread(picture) >> 8).astype(np.uint8))
+    for name in ("jpeg", "hdf5", "archives"):
+        (folder / name).mkdir()
+    (folder / "jpeg" / "proj_0.jpg").write_bytes(b"\xff\xd8")
+    for name in ("names.npz", "archives/names.npz"):
+        np.savez(folder / name, pictures=np.zeros((4, 5, 6)))
+    with h5py.File(folder / "hdf5" / "angles.h5", "w") as file:
+        file["exchange/data"] = np.full((4, 5, 6), 9, np.uint16)
+    with h5py.File(folder / "hdf5" / "other.h5", "w") as file:
+        file["entry/data"] = np.zeros((4, 5, 6))
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("mistakes")
     assert main(["simulate", "pins", "--size", "8", "--views", "6", "-o", str(folder / "scan.h5")]) == 0
     write_folder("tiffs", folder / "tiffs", marked_scan(4, 9, 9))
+    folders_gone_wrong(folder)
     (folder / "empty").mkdir()
     (folder / "words.txt").write_text("keV weight\n20 one\n")
+    (folder / "two.txt").write_text("0\n90\n")
     (folder / "three.txt").write_text("20 1 1\n30 2 2\n")
     tifffile.imwrite(folder / "slice.tif", np.full((5, 6), 9, np.uint16))
     tifffile.imwrite(folder / "rgb.tif", np.zeros((5, 6, 3), np.uint8), photometric="rgb")

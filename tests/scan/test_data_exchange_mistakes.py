@@ -29,3 +29,18 @@ def test_open_beam_images_without_light_are_named(exchange, what):
             file[f"exchange/{name}"] = image
     with pytest.raises(ValueError, match="data_white: expected more light than data_dark"):
         load_scan(path)
+
+
+def test_angles_that_a_file_lacks_are_stated_as_those_of_pictures_are(exchange):
+    """By an arc, which the command line has too; lengths are in mm there."""
+    path, _ = exchange()
+    expected = load_scan(path, theta=np.arange(91) * 180 / 91, pixel_size=0.5, unit="mm")
+    with h5py.File(path, "a") as file:
+        del file["exchange/theta"]
+    scan = load_scan(path, scanner={"arc": 180, "pixel": 0.5})
+    np.testing.assert_allclose(scan.proj_geom["Vectors"], expected.proj_geom["Vectors"])
+    assert scan.unit == "mm"
+    with pytest.raises(ValueError, match=r"scanner: expected arc.*got source_object; a cone beam"):
+        load_scan(path, scanner={"arc": 180, "source_object": 10.0})
+    with pytest.raises(ValueError, match=r"one angle for each of 91 pictures, got 2; name the angles"):
+        load_scan(path, scanner={"degrees": [0, 90]})

@@ -308,3 +308,37 @@ def test_edf_as_fabio_writes_it(kind, tmp_path):
         found = [frames.read(k, slice(None), slice(None)) for k in range(frames.shape[0])]
         np.testing.assert_array_equal(found, expected)
         assert frames.dtype == pictures.dtype
+
+
+def test_flats_that_are_not_named_are_no_projections(folder):
+    """One flat is enough to name; the others must not become views, which would shift all angles."""
+    scan = tps.load_scan(folder, scanner={"flats": "flat_0001.tif"})
+    np.testing.assert_array_equal(scan.projections, tps.load_scan(folder).projections)
+
+
+def test_pictures_that_all_have_a_word_for_flats_are_the_object_s(folder, tmp_path):
+    for file in folder.glob("proj_*.tif"):
+        (tmp_path / file.name.replace("proj", "open_door")).symlink_to(file)
+    scan = tps.load_scan(tmp_path, scanner=STATED | {"flats": folder / "flat_0001.tif"})
+    assert scan.views == 48
+
+
+def test_eight_bits_are_said(folder, tmp_path):
+    for file in folder.glob("*.tif"):
+        tifffile.imwrite(tmp_path / file.name, (tifffile.imread(file) >> 8).astype(np.uint8))
+    said = " ".join(tps.load_scan(tmp_path, scanner=STATED).notes["scanner"]["guessed"])
+    assert "8 bits, 256 grey values" in said
+
+
+def test_what_tifffile_logs_of_its_own_is_still_there_for_others(bare, caplog):
+    """A torn picture is told once, by our own exception; a caller's reads log as ever."""
+    torn = bare / "proj_0005.tif"
+    start = torn.read_bytes()[:200]
+    torn.unlink()
+    torn.write_bytes(start)
+    with pytest.raises(ValueError, match="readable TIFF"):
+        tps.load_scan(bare, scanner=STATED)
+    assert not caplog.records
+    with pytest.raises(Exception, match=r"."), tifffile.TiffFile(torn) as file:
+        file.pages[0].asarray()
+    assert caplog.records

@@ -9,8 +9,9 @@ import SimpleITK
 from folders import error_db, marked, require_the_same_volume
 
 import tomo_polysplat as tps
+from tomo_polysplat.simulate.folders.__main__ import main as write_one
 from tomo_polysplat.simulate.folders.scene import MARKER
-from tomo_polysplat.simulate.folders.write import KINDS, write_folder
+from tomo_polysplat.simulate.folders.write import KINDS, scan_for, write_folder
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -23,6 +24,16 @@ def test_a_folder_gives_the_volume_of_our_own_file(kind, tmp_path):
         # What the folder tells of the tube makes the spectrum that the scan was made with.
         assert scan.spectrum.effective_energy == pytest.approx(own.spectrum.effective_energy)
         assert any("flat panel" in guess for guess in scan.notes["scanner"]["guessed"])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_scan_of_another_size_gives_the_volume_of_our_own_file(kind, tmp_path):
+    """Even rows, so that no pixel is in the middle, odd columns, fewer views, and another noise."""
+    size = {"views": 36, "rows": 38, "columns": 43, "seed": 1}
+    own = write_folder(kind, tmp_path / "folder", scan_for(kind, **size))
+    scan = tps.load_scan(tmp_path / "folder")
+    assert scan.vol_geom["GridSliceCount"] == 38 and scan.vol_geom["GridColCount"] == 43
+    require_the_same_volume(scan, own)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -41,6 +52,13 @@ def test_another_library_opens_the_volume_of_a_folder(kind, tmp_path):
     expected = tps.baselines.fdk(own)
     assert own.unit == "cm" and expected.unit == "cm"
     assert abs(error_db(10 * values, own.truth) - error_db(expected.volume, own.truth)) < 0.3
+
+
+def test_the_size_of_a_folder_s_scan_can_be_told(tmp_path, monkeypatch):
+    sizes = ["--views", "5", "--rows", "8", "--columns", "11", "--seed", "3"]
+    monkeypatch.setattr(sys, "argv", ["folders", "npz", str(tmp_path / "folder"), *sizes])
+    assert write_one() == 0
+    assert tps.load_scan(tmp_path / "folder").projections.shape == (8, 5, 11)
 
 
 def test_the_folder_above_that_of_the_scan(tmp_path):

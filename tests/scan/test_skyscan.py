@@ -7,7 +7,7 @@ from folders import marked, require_the_same_volume
 
 import tomo_polysplat as tps
 from tomo_polysplat.physics.filter_text import filters_of
-from tomo_polysplat.simulate.folders.scene import pictures_of
+from tomo_polysplat.simulate.folders.scene import marked_scan, pictures_of
 from tomo_polysplat.simulate.folders.skyscan import log_text
 from tomo_polysplat.simulate.folders.tiffs import write_pictures
 from tomo_polysplat.simulate.folders.write import write_folder
@@ -67,6 +67,14 @@ def test_the_optical_axis_is_counted_from_the_lowest_line(folder):
     scan = tps.load_scan(folder)
     option = scan.vol_geom["option"]
     assert (option["WindowMinZ"] + option["WindowMaxZ"]) / 2 == pytest.approx(4 * 0.64)
+
+
+@pytest.mark.parametrize(("line", "above"), [(18, 0.0), (19, 0.0), (17, 1.5), (20, -1.5)])
+def test_a_whole_number_does_not_tell_the_middle_of_an_even_number_of_lines(tmp_path, line, above):
+    write_folder("skyscan", tmp_path / "even", marked_scan(6, 38, 9))
+    change(tmp_path / "even", ("(line)=  18", f"(line)=  {line}"))
+    option = tps.load_scan(tmp_path / "even").vol_geom["option"]
+    assert (option["WindowMinZ"] + option["WindowMaxZ"]) / 2 == pytest.approx(above * 0.64, abs=1e-9)
 
 
 def test_a_rolled_camera_is_said_and_undone_on_request(tmp_path):

@@ -14,6 +14,8 @@ NAME = "import"
 HELP = "read a scanner's folder (or file) and write it as one scan with geometry and spectrum"
 # Option and the name of `scanner` in `load_scan` that it stands for.
 LENGTHS = {"sod": "source_object", "sdd": "source_detector"}
+# What one, two and three whole numbers look like.
+_COUNTED = (("a number", "2"), ("A:B", "100:900"), ("A:B:N", "0:900:2"))
 TEXTS = {"projections": "projections", "flat": "flats", "dark": "darks"}
 
 
@@ -103,5 +105,6 @@ def _numbers(option: str, text: str | None, count: int) -> Any:
         return None
     parts = text.split(":")
     if len(parts) != count or not all(part.isdecimal() for part in parts):
-        raise fail(option, "a number" if count == 1 else "A:B" if count == 2 else "A:B:N", repr(text))
+        expected, such = _COUNTED[count - 1]
+        raise fail(option, expected, repr(text), f"whole numbers with colons between them, such as {such}")
     return tuple(int(part) for part in parts)

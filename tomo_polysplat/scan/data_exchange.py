@@ -86,7 +86,9 @@ def scan_from_hdf5(path: Path, options: ReadOptions, part: Part = _ALL) -> Scan:
         data = None if exchange is None else find_array(exchange, "data")
         if exchange is None or data is None or data.ndim != 3 or 0 in data.shape:
             got = "no such dataset" if data is None else f"shape {data.shape}"
-            raise fail("path", "a dataset /exchange/data of shape (views, rows, columns)", f"{got} in {path}")
+            remedy = "NXtomo and CIL's NeXus are read too; else copy the projections there with h5py, or into TIFFs"
+            expected = "a dataset /exchange/data of shape (views, rows, columns)"
+            raise fail("path", expected, f"{got} in {path}", remedy)
         now, later = _in_two(part, file, options)
         wanted = StoredPart(data, now)
         stay = 4 * prod(wanted.shape) >= _STAYS and find_array(file, "polysplat/valid") is None

@@ -98,7 +98,8 @@ def _missing_theta(views: int) -> Exception:
         "theta",
         "the angle of every view",
         "no /exchange/theta in the file",
-        f"pass theta= in degrees, such as numpy.linspace(0, 180, {views}, endpoint=False)",
+        f"pass theta= in degrees, such as numpy.linspace(0, 180, {views}, endpoint=False), or "
+        "`tomo-polysplat import SCAN --angles 180`",
     )
 
 

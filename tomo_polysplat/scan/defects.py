@@ -15,23 +15,26 @@ logger = logging.getLogger(__name__)
 
 
 def flat_and_dark(
-    white: np.ndarray, dark: np.ndarray | None, shape: tuple[int, int]
+    white: np.ndarray,
+    dark: np.ndarray | None,
+    shape: tuple[int, int],
+    names: tuple[str, str] = ("data_white", "data_dark"),
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean open-beam and dark images of a detector of `shape` (rows, columns); no dark image means zero.
+
+    `names` are what the caller knows the two as.
 
     Raises
     ------
     ValueError
         If a shape is not that of the detector, or the open-beam image has no more light than the dark one.
     """
-    flat = _mean_frame("data_white", white, shape)
-    background = np.zeros(shape) if dark is None else _mean_frame("data_dark", dark, shape)
+    flat = _mean_frame(names[0], white, shape)
+    background = np.zeros(shape) if dark is None else _mean_frame(names[1], dark, shape)
     light, without = (np.where(np.isfinite(image), image, 0).mean() for image in (flat, background))
     if not light > without:
         remedy = "are the two swapped, or was there no light?"
-        raise fail(
-            "data_white", f"more light than data_dark has, {without:.6g} counts", f"{light:.6g}", remedy
-        )
+        raise fail(names[0], f"more light than {names[1]} has, {without:.6g} counts", f"{light:.6g}", remedy)
     return flat, background
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,12 +13,13 @@ from tomo_polysplat.checks import fail
 from tomo_polysplat.files import existing_file
 from tomo_polysplat.scan.data_exchange import scan_from_hdf5
 from tomo_polysplat.scan.data_exchange_writer import write_hdf5
+from tomo_polysplat.scan.hdf5 import find_array, find_group, opened
 from tomo_polysplat.scan.npz import scan_from_npz, write_npz
 from tomo_polysplat.scan.readers import cil_nexus, npz_stack, nxtomo
 from tomo_polysplat.scan.readers.part import Part
 from tomo_polysplat.scan.readers.recognise import acquisition_of
 from tomo_polysplat.scan.readers.scan_part import scan_part
-from tomo_polysplat.scan.readers.stated import with_options
+from tomo_polysplat.scan.readers.stated import require_known, view_degrees, with_options
 from tomo_polysplat.scan.readers.to_scan import scan_from_acquisition
 from tomo_polysplat.scan.reading import ReadOptions
 from tomo_polysplat.scan.scan import Scan
@@ -122,13 +124,36 @@ def load_scan(
     if reader is None:
         told = acquisition_of(Path(path), with_options(scanner or {}, options))
         return scan_from_acquisition(told, options, part)
-    if scanner:
+    if scanner and reader is scan_from_hdf5:
+        options = _of_parallel_beam(existing_file(path), options, scanner)
+    elif scanner:
         got = ", ".join(map(str, scanner))
         raise fail("scanner", "nothing for a scan that has its own geometry", got, "leave it out")
     if reader is scan_from_hdf5:
         return scan_from_hdf5(existing_file(path), options, part)
     scan = reader(existing_file(path), options)
     return scan if part.whole else scan_part(scan, part)
+
+
+def _of_parallel_beam(file: Path, options: ReadOptions, scanner: Mapping[str, Any]) -> ReadOptions:
+    """Angles and pixel of a Data Exchange file that has none, as they are told of pictures."""
+    known = require_known(scanner, "scanner")
+    others = sorted(known.keys() - {"beam", "arc", "degrees", "pixel"})
+    if others or known.get("beam", "parallel") != "parallel":
+        remedy = (
+            "a cone beam's geometry is passed as proj_geom= and vol_geom=, or read from TIFFs of the pictures"
+        )
+        got = ", ".join(others or ["beam"])
+        raise fail("scanner", "arc, degrees and pixel alone, for a Data Exchange file", got, remedy)
+    with opened(file) as content:
+        group = find_group(content, "exchange")
+        data = None if group is None else find_array(group, "data")
+        views = 0 if data is None or data.ndim != 3 else data.shape[0]
+    theta = view_degrees(known, file.parent, views) if views else None
+    options = options if theta is None else replace(options, theta=theta)
+    if "pixel" not in known:
+        return options
+    return replace(options, pixel_size=known["pixel"], unit=options.unit or "mm")
 
 
 def _reader_of_scans(path: Path) -> Callable[[Path, ReadOptions], Scan] | None:

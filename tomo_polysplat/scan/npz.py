@@ -57,9 +57,9 @@ def scan_from_npz(path: Path, options: ReadOptions) -> Scan:
     arrays |= read_archive(path, sizes, sizes)
     missing = [name for name in ("projections", "vectors", "vol_shape", "vol_window") if name not in arrays]
     if missing:
-        raise fail(
-            "path", "projections, vectors, vol_shape and vol_window", f"no {', '.join(missing)} in {path}"
-        )
+        remedy = "a stack of pictures is read too: call its arrays projections, flats, darks and degrees"
+        expected = "projections, vectors, vol_shape and vol_window"
+        raise fail("path", expected, f"no {', '.join(missing)} in {path}", remedy)
     values = require_array("projections", arrays["projections"], 3)
     if options.input not in (None, "attenuation"):
         raise fail("input", "'attenuation', which an .npz scan holds", repr(options.input))

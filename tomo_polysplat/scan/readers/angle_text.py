@@ -31,7 +31,7 @@ def angles_in(text: str) -> np.ndarray:
     return np.array([float(words[-1]) for words in rows[first:]])
 
 
-def require_degrees(angles: np.ndarray) -> np.ndarray:
+def require_degrees(angles: np.ndarray, argument: str = "degrees") -> np.ndarray:
     """Refuse even angles that make a half or a whole turn in radians."""
     if len(angles) > 2 and np.isfinite(angles).all():
         steps = np.diff(angles)
@@ -41,7 +41,7 @@ def require_degrees(angles: np.ndarray) -> np.ndarray:
             missed = min(abs(turn - abs(k * step)) for k in (len(angles), len(angles) - 1))
             if np.ptp(steps) < _TURN * abs(step) and missed < _TURN * abs(step):
                 got = f"{angles[0]:.3g} to {angles[-1]:.3g}, which look like radians"
-                raise fail("degrees", "angles in degrees", got, "multiply them by 180 / pi")
+                raise fail(argument, "angles in degrees", got, "multiply them by 180 / pi")
     return angles
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -14,7 +16,21 @@ from tomo_polysplat.files import existing_file, require_plausible_size
 from tomo_polysplat.scan.hdf5_array import StoredArray
 from tomo_polysplat.scan.hdf5_links import moved
 
-__all__ = ["ArrayFrames", "Frames", "Hdf5Array", "Hdf5Frames", "TiffFrames"]
+__all__ = ["OTHER_PICTURE", "ArrayFrames", "Frames", "Hdf5Array", "Hdf5Frames", "TiffFrames"]
+
+# What to do about a picture of another size among those of a scan.
+OTHER_PICTURE = (
+    "move it elsewhere if it is none of the scan's, else copy it again; or name a pattern (projections)"
+)
+# Set while this module reads: tifffile logs what it raises, and more, and a failure is told once.
+_READING = ContextVar("reading", default=False)
+
+
+def _of_others(_: logging.LogRecord) -> bool:
+    return not _READING.get()
+
+
+logging.getLogger("tifffile").addFilter(_of_others)
 
 
 class Frames(Protocol):
@@ -138,7 +154,8 @@ class TiffFrames:
         with _page(file, number) as page:
             if page.shape != self.shape[1:] or np.dtype(page.dtype) != self.dtype:
                 got = f"{page.dtype} of {page.shape} in {file}"
-                raise fail("path", f"{self.dtype} of {self.shape[1:]} as in {self._files[0].name}", got)
+                expected = f"{self.dtype} of {self.shape[1:]} as in {self._files[0].name}"
+                raise fail("path", expected, got, OTHER_PICTURE)
             try:
                 return page.asarray()[rows, columns]
             except Exception as error:  # its decoders raise whatever they meet
@@ -158,18 +175,22 @@ def _page(file: Path, number: int) -> Iterator[Any]:
     """One picture of a TIFF file, which is open meanwhile."""
     import tifffile
 
+    before = _READING.set(True)
     try:
-        tiff = tifffile.TiffFile(file)
-    except Exception as error:  # its parser raises whatever it meets
-        raise _unreadable(file, error) from error
-    with tiff:
         try:
-            page = tiff.pages[number]
-            size = int(page.nbytes)  # which takes its shape and type apart
-        except Exception as error:
+            tiff = tifffile.TiffFile(file)
+        except Exception as error:  # its parser raises whatever it meets
             raise _unreadable(file, error) from error
-        _require_picture(file, page, size)
-        yield page
+        with tiff:
+            try:
+                page = tiff.pages[number]
+                size = int(page.nbytes)  # which takes its shape and type apart
+            except Exception as error:
+                raise _unreadable(file, error) from error
+            _require_picture(file, page, size)
+            yield page
+    finally:
+        _READING.reset(before)
 
 
 def _unreadable(file: Path, error: Exception) -> Exception:

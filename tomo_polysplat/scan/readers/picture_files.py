@@ -10,7 +10,7 @@ import numpy as np
 from tomo_polysplat.checks import fail
 from tomo_polysplat.files import existing_file
 from tomo_polysplat.scan.readers.edf import EdfFrames
-from tomo_polysplat.scan.readers.frames import ArrayFrames, Frames, TiffFrames
+from tomo_polysplat.scan.readers.frames import OTHER_PICTURE, ArrayFrames, Frames, TiffFrames
 from tomo_polysplat.scan.readers.xradia_frames import xrm_pictures
 
 __all__ = ["NpyFrames", "frames_of"]
@@ -44,7 +44,8 @@ class NpyFrames:
         picture = self._mapped(index)
         if picture.shape != self.shape[1:] or picture.dtype != self.dtype:
             got = f"{picture.dtype} of {picture.shape} in {self._files[index]}"
-            raise fail("path", f"{self.dtype} of {self.shape[1:]} as in {self._files[0].name}", got)
+            expected = f"{self.dtype} of {self.shape[1:]} as in {self._files[0].name}"
+            raise fail("path", expected, got, OTHER_PICTURE)
         return np.asarray(picture[rows, columns])
 
     def _mapped(self, index: int) -> np.ndarray:

@@ -21,7 +21,7 @@ from tomo_polysplat.scan.readers.picture_names import (
     named_files,
     pictures_in,
 )
-from tomo_polysplat.scan.readers.stated import read_toml, require_known, stated_over
+from tomo_polysplat.scan.readers.stated import read_toml, require_known, require_no_slips, stated_over
 
 __all__ = ["full_turn", "guessed", "read", "recognises", "stated_beside", "toml_files", "written_beside"]
 
@@ -96,6 +96,7 @@ def written_beside(path: Path) -> tuple[dict[str, Any], dict[str, str]]:
     table = read_toml(file)
     aliased = {key: value for key, value in table.items() if _is_known(key)}
     other = {key: str(value) for key, value in table.items() if not _is_known(key)}
+    require_no_slips(other, file.name)
     return require_known(aliased, file.name), other
 
 
@@ -132,6 +133,8 @@ def _sorted_out(folder: Path, known: Mapping[str, Any]) -> dict[str, list[Path]]
             taken |= set(matching)
     if "projections" not in files:
         left = [file for file in pictures_in(folder) if file not in taken]
+        # Flats that were not named, where one of them was, are none of the object.
+        left = [file for file in left if not any(has_word(file.stem, name) for name in kinds[1:])] or left
         folders = [inner for inner in inside if has_word(inner.name, "projections")]
         if not left and len(folders) == 1:
             left = pictures_in(folders[0])

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from tomo_polysplat.checks import fail
+from tomo_polysplat.checks import fail, visible
 from tomo_polysplat.scan.readers import (
     cil_nexus,
     esrf,
@@ -24,13 +24,16 @@ from tomo_polysplat.scan.readers.acquisition import Acquisition
 from tomo_polysplat.scan.readers.entries import entries_of
 from tomo_polysplat.scan.readers.files_of_scans import the_one
 from tomo_polysplat.scan.readers.other_makers import what_is_told
-from tomo_polysplat.scan.readers.picture_names import pictures_in
+from tomo_polysplat.scan.readers.picture_names import PICTURE_SUFFIXES, pictures_in
 
 __all__ = ["acquisition_of"]
 
 # Folders that hold reconstructions.
 _RECONSTRUCTED = re.compile(r"rec\w*|slices|volume", re.I)
 _MOST_FOLDERS = 100
+_MOST_NAMED = 3
+# Pictures for the eye.
+_LOSSY = {".jpg", ".jpeg", ".png", ".bmp", ".gif"}
 # The first one that recognises what it is shown reads it: what any folder of pictures is comes last.
 READERS = (skyscan, nikon, xradia, nxtomo, cil_nexus, rtk, esrf, npz_stack, picture_stack)
 _REMEDY = (
@@ -62,6 +65,8 @@ def acquisition_of(path: Path, stated: Mapping[str, Any]) -> Acquisition:
             folder = the_one([folder for folder, _ in scans], "one scan in the folder", "name one")
             return scans[0][1].read(folder, stated).saying(f"what is read is {folder.name} in {path.name}")
     if picture_stack.recognises(path):
+        if path.is_file() and "pixel" not in stated:
+            _refuse_one_picture(path)
         return picture_stack.read(path, stated)
     told = what_is_told(path)
     if told is not None:
@@ -74,8 +79,33 @@ def acquisition_of(path: Path, stated: Mapping[str, Any]) -> Acquisition:
         "path",
         f"a Data Exchange HDF5 file, an .npz scan, or one of: {kinds}",
         f"{path}, which is none of these",
-        _REMEDY,
+        _remedy(path),
     )
+
+
+def _refuse_one_picture(path: Path) -> None:
+    """Refuse a picture of a scan whose text, which tells the distances, stands beside it."""
+    folder = path.parent
+    told = bool(picture_stack.toml_files(folder)) or any(r.recognises(folder) for r in READERS[:-1])
+    if told and path.suffix.lower() in PICTURE_SUFFIXES:
+        remedy = f"name the folder: {visible(folder.resolve().name)}"
+        raise fail("path", "a scan", f"{path}, one of its pictures", remedy)
+
+
+def _remedy(path: Path) -> str:
+    """What to do about the files that are there."""
+    files = [file for file in (entries_of(path) if path.is_dir() else [path]) if file.is_file()]
+    suffixes = {file.suffix.lower() for file in files}
+    scans = [file.name for file in files if file.suffix.lower() in (".h5", ".hdf5")]
+    if suffixes & _LOSSY:
+        return (
+            "its pictures are not read: save them as TIFFs of 16 bits (ImageJ: File, Save As, Image Sequence)"
+        )
+    if scans and path.is_dir():
+        return f"name the file of the scan: {', '.join(scans[:_MOST_NAMED])}"
+    if ".npz" in suffixes:
+        return "call the arrays of the .npz file projections, flats, darks and degrees"
+    return _REMEDY
 
 
 def _folders_of_scans(path: Path) -> list[Path]:

@@ -53,7 +53,7 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     table = _table(text)
     if len(table["GantryAngle"]) != frames.shape[0]:
         got = f"{len(table['GantryAngle'])} views for {frames.shape[0]} pictures"
-        raise fail("path", "a view in the geometry for each picture", got)
+        raise fail("path", "a view in the geometry for each picture", got, "take the two of one scan")
     told = Acquisition(
         KIND,
         frames,

@@ -152,7 +152,11 @@ def _setup(log: IniText, numbers: np.ndarray, rows: int) -> tuple[Setup, list[st
             f"pixels are taken to be {ratio:g} times as wide as high (CameraXYRatio); give pixel= otherwise"
         )
     height = width / (ratio if ratio > 0 else 1.0)
-    line = log.number("Optical Axis (line)", otherwise=(rows - 1) / 2)
+    middle = (rows - 1) / 2
+    line = log.number("Optical Axis (line)", otherwise=middle)
+    if abs(line - middle) == 0.5:
+        # An even number of lines has its middle between two, which a whole number cannot tell.
+        line = middle
     tilt = log.number("Image Rotation", otherwise=0.0)
     if tilt:
         said.append(
@@ -165,7 +169,7 @@ def _setup(log: IniText, numbers: np.ndarray, rows: int) -> tuple[Setup, list[st
         said.append("the camera was offset: is that in the pictures? give offset= if it is not")
     sense, guess = _sense(log)
     degrees = sense * _step(log, numbers) * numbers
-    setup = Setup(degrees, (width, height), offset=(0.0, ((rows - 1) / 2 - line) * height))
+    setup = Setup(degrees, (width, height), offset=(0.0, (middle - line) * height))
     return setup if parallel else replace(setup, source_object=near, source_detector=far), said + guess
 
 

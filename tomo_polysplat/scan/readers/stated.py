@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,10 @@ from tomo_polysplat.scan.readers.text import text_of
 from tomo_polysplat.scan.reading import INPUT_KINDS, ReadOptions
 from tomo_polysplat.units import LENGTH_UNITS
 
-__all__ = ["KEYS", "read_toml", "require_known", "stated_over", "view_degrees", "with_options"]
+__all__ = [
+    *("KEYS", "read_toml", "require_known", "require_no_slips", "stated_over", "view_degrees"),
+    "with_options",
+]
 
 # Lengths are in `unit`; `arc` and `degrees` count counterclockwise seen from above, of the source about the object.
 KEYS = {
@@ -56,6 +60,8 @@ _OTHER_NAMES = {
     "voltage": "kvp",
 }
 _MOST_BYTES = 1 << 20
+# Likeness (difflib's, of 1) from which a key is a slip of one of ours: `filters` has 0.92, `operator` below 0.6.
+_SLIP = 0.8
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -76,7 +82,8 @@ def read_toml(path: Path) -> dict[str, Any]:
     except ImportError as error:
         raise fail("path", "tomli, which reads TOML on Python 3.10", "none", "pip install tomli") from error
     except (ValueError, RecursionError) as error:
-        raise fail("path", "a TOML file", f"{path} ({error})") from error
+        remedy = "numbers have a decimal point (0.1), texts stand in quotes, one key a line"
+        raise fail("path", "a TOML file", f"{path} ({error})", remedy) from error
 
 
 def require_known(stated: Mapping[str, Any], where: str) -> dict[str, Any]:
@@ -87,6 +94,22 @@ def require_known(stated: Mapping[str, Any], where: str) -> dict[str, Any]:
             meant = did_you_mean(key, [*KEYS, *_OTHER_NAMES])
             raise fail(where, f"names among {', '.join(KEYS)}", repr(key), meant)
     return known
+
+
+def require_no_slips(others: Iterable[str], where: str) -> None:
+    """Refuse a name that is nearly one of ours: what it says would be kept as a note, and not done.
+
+    Raises
+    ------
+    ValueError
+        For such a name.
+    """
+    names = [*KEYS, *_OTHER_NAMES]
+    for key in others:
+        if difflib.get_close_matches(key.lower().replace("-", "_").replace(" ", "_"), names, 1, _SLIP):
+            raise fail(
+                where, "keys that are known, or none of their like", repr(key), did_you_mean(key, names)
+            )
 
 
 def with_options(stated: Mapping[str, Any], options: ReadOptions) -> dict[str, Any]:
@@ -152,7 +175,7 @@ def view_degrees(stated: Mapping[str, Any], folder: Path, views: int) -> np.ndar
     if "degrees" in stated and "arc" in stated:
         raise fail("degrees, arc", "one of the two", "both")
     if "arc" in stated:
-        return np.arange(views) * (require_number("arc", stated["arc"]) / views)
+        return require_degrees(np.arange(views) * (require_number("arc", stated["arc"]) / views), "arc")
     if "degrees" not in stated:
         return None
     given = stated["degrees"]
@@ -160,7 +183,8 @@ def view_degrees(stated: Mapping[str, Any], folder: Path, views: int) -> np.ndar
         given = _angle_file(given, folder)
     angles = require_array("degrees", given, 1).astype(np.float64)
     if len(angles) != views:
-        raise fail("degrees", f"one angle for each of {views} pictures", f"{len(angles)}")
+        remedy = "name the angles of this scan, or say how far it turned: arc (--angles 360)"
+        raise fail("degrees", f"one angle for each of {views} pictures", f"{len(angles)}", remedy)
     return require_degrees(angles)
 
 

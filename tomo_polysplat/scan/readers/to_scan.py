@@ -33,6 +33,9 @@ logger = logging.getLogger(__name__)
 _BRIGHT = 99.0
 # Degrees under which a source sees a detector: few scanners have 60, and none so many.
 _WIDE_VIEW, _NO_VIEW = 90.0, 130.0
+# Rays to look at, and line integrals that the middle one of them cannot have: of more light than was sent, by 1.65, and
+# of less than 1e-13 of it.
+_LOOKED_AT, _BRIGHTER, _OPAQUE = 100_000, 0.5, 30.0
 # A usual flat panel, where nothing tells of the detector.
 _PANEL = "csi:0.6mm"
 
@@ -61,6 +64,7 @@ def scan_from_acquisition(told: Acquisition, options: ReadOptions, part: Part) -
     told, flat, dark = _open_beam(told, kind, pictures)
     counts = Counts(lambda: nullcontext(pictures.views), pictures.shape, kind, flat, dark, limit)
     projections, valid, rays = line_integrals(counts, options.progress)
+    _require_possible(told, kind, projections, valid)
     told, spectrum = _spectrum(told, options)
     seen = part.of(geometry, (pictures.rows, pictures.columns))
     _tell(told, rays, valid)
@@ -118,10 +122,13 @@ def _open_beam(
     """The pictures without an object and without light, where counts have to be compared with them."""
     if kind != "counts":
         return told, None, None
-    size = pictures.shape[1:]
+    size, names = pictures.shape[1:], ("flats", "darks")
+    told = _deep_enough(told)
     dark = None if told.darks is None else pictures.mean(told.darks, "darks")
     if told.flats is not None:
-        return told, *flat_and_dark(pictures.mean(told.flats, "flats"), dark, size)
+        flat = pictures.mean(told.flats, "flats")
+        _require_reachable("flats", float(np.nanmean(flat)), told)
+        return told, *flat_and_dark(flat, dark, size, names)
     white = told.white
     if white is None:
         white = pictures.bright(_BRIGHT)
@@ -129,7 +136,47 @@ def _open_beam(
             f"no flat field: the open beam is taken to be {white:.6g} counts, as in the brightest pixels; give flats= "
             "or white= if that is wrong"
         )
-    return told, *flat_and_dark(np.full(size, white), dark, size)
+    _require_reachable("white", white, told)
+    return told, *flat_and_dark(np.full(size, white), dark, size, ("white", "darks"))
+
+
+def _deep_enough(told: Acquisition) -> Acquisition:
+    """Say of pictures of 8 bits what they cannot show."""
+    if told.frames.dtype.itemsize > 1:
+        return told
+    return told.saying(
+        "the pictures have 8 bits, 256 grey values: what is faint or dense is lost; export 16 bits if the scanner can"
+    )
+
+
+def _require_reachable(name: str, light: float, told: Acquisition) -> None:
+    """Refuse an open beam of more counts than the pictures' numbers go to: one of the two was converted."""
+    dtype = told.frames.dtype
+    # A white level may be the first number that is not reached.
+    if dtype.kind not in "iu" or light <= np.iinfo(dtype).max + 1:
+        return
+    expected = f"counts that pictures of {dtype} can have, {np.iinfo(dtype).max} at most"
+    remedy = "were the pictures converted to fewer bits? take those that the scanner wrote, or say white="
+    raise fail(name, expected, f"{light:.6g}", remedy)
+
+
+def _require_possible(told: Acquisition, kind: str, projections: np.ndarray, valid: np.ndarray) -> None:
+    """Refuse rays most of which are brighter than the open beam, or darker than anything that lets light through."""
+    chosen = np.unravel_index(
+        np.linspace(0, valid.size - 1, min(valid.size, _LOOKED_AT)).astype(np.int64), valid.shape
+    )
+    some = projections[chosen][valid[chosen]]
+    middle = float(np.median(some)) if some.size else 0.0
+    if kind == "attenuation" and middle > _OPAQUE:
+        remedy = "counts are input='counts'; integrals that were multiplied are divided first"
+        raise fail(
+            "input", "line integrals, such as 0 to 10", f"{middle:.6g} in half of the rays and more", remedy
+        )
+    if middle < -_BRIGHTER:
+        name = "input" if kind != "counts" else "white" if told.flats is None else "flats"
+        got = f"{np.exp(-min(middle, 0.0)):.3g} times its light in half of the rays and more"
+        remedy = "take flats and darks of the same scan and exposure; counts are input='counts'"
+        raise fail(name, "an open beam that the object makes darker", got, remedy)
 
 
 def _geometries(seen: Geometry, told: Acquisition, options: ReadOptions) -> dict[str, Any]:

@@ -55,7 +55,8 @@ class Upright:
     def mean(self, frames: Frames, name: str) -> np.ndarray:
         """Mean of all pictures of another stack of the same detector, (rows, columns) float64."""
         size = np.broadcast_to(np.uint8(0), frames.shape[1:])
-        require_shape(name, size, self._told.frames.shape[1:], "(rows, columns) of the projections")
+        remedy = f"take {name} of the same scan, neither binned nor cut out"
+        require_shape(name, size, self._told.frames.shape[1:], "(rows, columns) of the projections", remedy)
         total = np.zeros(self.shape[1:])
         for index in range(frames.shape[0]):
             total += self._read(frames, [index])[0]

@@ -4,20 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tomo_polysplat.scan.scan import Scan
-from tomo_polysplat.simulate.folders.scene import SETTINGS, Pictures, corrected, marked_scan
+from tomo_polysplat.simulate.folders.scene import SETTINGS, Pictures, corrected
 from tomo_polysplat.simulate.folders.tiffs import write_pictures
 
-__all__ = ["make", "write"]
+__all__ = ["ASIDE", "write"]
 
 WHITE = 60000
-# By which the turntable is aside, in mm.
+# By which the turntable is off the line from the source to the detector's middle, in mm.
 ASIDE = 0.9
-
-
-def make() -> Scan:
-    """A scan on a turntable that is off the line from the source to the detector's middle."""
-    return marked_scan(columns_off=0.0, aside=ASIDE)
 
 
 def write(folder: Path, pictures: Pictures) -> None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 from tomo_polysplat.checks import fail, require_choice
 from tomo_polysplat.scan.scan import Scan
 from tomo_polysplat.simulate.folders import arrays, cil, nikon, nxtomo, rtk, skyscan, tiffs, xradia
 from tomo_polysplat.simulate.folders.scene import marked_scan, pictures_of
 
-__all__ = ["KINDS", "write_folder"]
+__all__ = ["KINDS", "scan_for", "write_folder"]
 
 KINDS = {
     "tiffs": tiffs.write,
@@ -26,8 +27,17 @@ KINDS = {
     "xradia": xradia.write,
     "xrm": xradia.write_single_views,
 }
-# Scans of a geometry that a kind has of its own.
-_SCANS = {"nikon": nikon.make, "esrf": lambda: marked_scan(columns_off=0.0, beam="parallel")}
+# What is of its own in the geometry of a kind.
+_GEOMETRY: dict[str, dict[str, Any]] = {
+    "nikon": {"columns_off": 0.0, "aside": nikon.ASIDE},
+    "esrf": {"columns_off": 0.0, "beam": "parallel"},
+}
+
+
+def scan_for(kind: str, **size: Any) -> Scan:
+    """A scan that a kind of scanner can write; `size` may have views, rows, columns and seed of `marked_scan`."""
+    require_choice("kind", kind, KINDS)
+    return marked_scan(**size, **_GEOMETRY.get(kind, {}))
 
 
 def write_folder(kind: str, folder: str | os.PathLike, scan: Scan | None = None) -> Scan:
@@ -40,7 +50,7 @@ def write_folder(kind: str, folder: str | os.PathLike, scan: Scan | None = None)
     folder : path
         A new one.
     scan : Scan, optional
-        One that `marked_scan` made; by default one that suits the kind.
+        One of `scan_for`; by default that of the usual size.
 
     Raises
     ------
@@ -52,6 +62,6 @@ def write_folder(kind: str, folder: str | os.PathLike, scan: Scan | None = None)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise fail("folder", "a new or empty folder", str(target), "name another", FileExistsError)
     target.mkdir(parents=True, exist_ok=True)
-    scan = _SCANS.get(kind, marked_scan)() if scan is None else scan
+    scan = scan_for(kind) if scan is None else scan
     KINDS[kind](target, pictures_of(scan))
     return scan

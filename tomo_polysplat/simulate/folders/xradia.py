@@ -44,13 +44,21 @@ def single_views(pictures: Pictures) -> dict[str, dict[str, bytes]]:
     return files
 
 
+def _displaced(pictures: np.ndarray) -> np.ndarray:
+    """What a detector sees that stands `_MOVED` further: what comes in at an edge is as the edge was."""
+    _, rows, columns = pictures.shape
+    row = np.clip(np.arange(rows) + _MOVED[1], 0, rows - 1)
+    column = np.clip(np.arange(columns) + _MOVED[0], 0, columns - 1)
+    return pictures[:, row[:, None], column]
+
+
 def streams_of(pictures: Pictures) -> dict[str, bytes]:
     """What such a file says, by the names of its streams."""
     at, (views, rows, columns) = SETTINGS, pictures.projections.shape
     flat = (pictures.flats.mean(axis=0) - pictures.darks[0])[::-1]
     passed = (pictures.projections - pictures.darks[0].astype(np.float64))[:, ::-1] / flat
     moved = np.arange(views) % 3 == 1
-    passed[moved] = np.roll(passed[moved], (-_MOVED[1], -_MOVED[0]), (1, 2))
+    passed[moved] = _displaced(passed[moved])
     counts = np.maximum(np.rint(passed * flat), 0).astype("<u2")
     whole = {"ImageWidth": columns, "ImageHeight": rows, "NoOfImages": views, "ImagesTaken": views}
     whole |= {"DataType": _UNSIGNED_SHORT, "XrayGeometry": 1, "CameraBinning": 1}
