@@ -32,6 +32,7 @@ from tomo_polysplat.physics.filter_shape import bowtie_map, filter_shapes, filte
 from tomo_polysplat.physics.materials import density
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.coarse import coarse_problem, coarse_settings
+from tomo_polysplat.plan.fall_of_misfits import fall_of_misfits
 from tomo_polysplat.plan.first_gaussians import first_gaussians
 from tomo_polysplat.plan.first_volume import first_volume
 from tomo_polysplat.plan.means import Means
@@ -66,7 +67,7 @@ def find_bowtie(problem: Problem, means: Means, report: Callable[[float, str], A
     search = _Search(_fewer(problem), means)
     plain, _ = search.fit(moving=False)
     behind, found = search.fit(moving=True)
-    better, error = _improvement(plain.held_out, behind.held_out)
+    better, error = fall_of_misfits(plain.held_out, behind.held_out, -math.inf)
     thickest = float(filter_thickness(found, *problem.projections.shape[1:]).max())
     evidence = {"thickest": thickest, "better": better, "better_error": error}
     verdict, words = Bowtie.gate(evidence), Bowtie.told({Bowtie.name: found})
@@ -92,15 +93,6 @@ def _fewer(problem: Problem) -> Problem:
         return coarse
     some = np.arange(0, coarse.geometry.views, every)
     return replace(coarse, projections=coarse.projections[some], geometry=coarse.geometry.select(some))
-
-
-def _improvement(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
-    """By what share the misfits of the views fall, and its standard error."""
-    both = np.isfinite(before) & np.isfinite(after)
-    fall, mean = (before - after)[both], float(before[both].mean()) if both.any() else 0.0
-    if not mean > 0 or len(fall) < 2:
-        return -math.inf, math.inf
-    return float(fall.mean()) / mean, float(fall.std(ddof=1)) / math.sqrt(len(fall)) / mean
 
 
 class _Search:

@@ -26,6 +26,7 @@ from tomo_polysplat.nuisances.move_estimate import shifts_of_views, whole_moves
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.axis import axis_of
 from tomo_polysplat.plan.coarse import coarse_problem, coarse_settings
+from tomo_polysplat.plan.fall_of_misfits import fall_of_misfits
 from tomo_polysplat.plan.first_gaussians import first_gaussians
 from tomo_polysplat.plan.first_look import Look
 from tomo_polysplat.plan.first_volume import first_volume
@@ -138,7 +139,7 @@ def realigned(
         return axis
     moved = _times(moved, pixel)
     moves = {name: value.tolist() for name, value in moved.items() if bool(value.any())}
-    words, (better, error) = Alignment.told(moves), _improvement(misfits[0], misfits[-1])
+    words, (better, error) = Alignment.told(moves), fall_of_misfits(misfits[0], misfits[-1], 0.0)
     share = f"misfit of held-out rays falls by {better:.1%} (standard error {error:.1%})"
     if not better > max(_BETTER, _SURELY_BETTER * error):
         logger.info("Alignment: not moved, %s; the %s", words, share)
@@ -166,15 +167,6 @@ def _times(moves: Mapping[str, torch.Tensor], pixel: np.ndarray) -> dict[str, to
     """Moves in other pixels; angles and what is in per cent stay."""
     by = {"u": pixel[0], "v": pixel[1], "views": torch.from_numpy(pixel)}
     return {name: value * by.get(name, 1.0) for name, value in moves.items()}
-
-
-def _improvement(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
-    """By what share the misfits of the views fall, and its standard error."""
-    both = np.isfinite(before) & np.isfinite(after)
-    fall, mean = (before - after)[both], float(before[both].mean()) if both.any() else 0.0
-    if not mean > 0 or len(fall) < 2:
-        return 0.0, math.inf
-    return float(fall.mean()) / mean, float(fall.std(ddof=1)) / math.sqrt(len(fall)) / mean
 
 
 class _Realignment:
