@@ -4,6 +4,7 @@ import json
 import math
 import os
 import zipfile
+from functools import cache
 
 import numpy as np
 import pytest
@@ -33,6 +34,28 @@ def every_pass(monkeypatch):
     monkeypatch.setattr("tomo_polysplat.plan.checkpoint._LARGEST_SHARE", 1e9)
 
 
+@pytest.fixture(scope="module")
+def after_a_pass(tmp_path_factory):
+    """The bytes of the checkpoint of a run that died after its first pass."""
+    path = tmp_path_factory.mktemp("killed") / "fit.npz"
+    killed_after(1, fan(), path, settings=LONG)
+    return path.read_bytes()
+
+
+@pytest.fixture
+def killed(tmp_path, after_a_pass):
+    """The path of that checkpoint, for a test to do with as it likes."""
+    path = tmp_path / "fit.npz"
+    path.write_bytes(after_a_pass)
+    return path
+
+
+@cache
+def uninterrupted():
+    """The whole run, which several tests compare with."""
+    return reconstruct(fan(), settings=LONG)
+
+
 def without_seconds(history):
     return [{name: value for name, value in record.items() if name != "seconds"} for record in history]
 
@@ -41,7 +64,7 @@ def without_seconds(history):
 def test_a_resumed_run_is_the_uninterrupted_one(tmp_path, spectrum):
     scan, path = fan(), tmp_path / "fit.npz"
     options = {"settings": LONG} | ({} if spectrum else {"spectrum": None})
-    whole = reconstruct(scan, **options)
+    whole = uninterrupted() if spectrum else reconstruct(scan, **options)
     killed_after(3, scan, path, **options)
     resumed = reconstruct(scan, checkpoint=path, resume=True, **options)
     assert np.array_equal(resumed.volume, whole.volume)
@@ -52,7 +75,7 @@ def test_a_resumed_run_is_the_uninterrupted_one(tmp_path, spectrum):
 
 
 def test_a_run_resumed_at_every_pass_is_the_uninterrupted_one(tmp_path):
-    scan, path = cone(), tmp_path / "fit.npz"
+    scan, path = cone(17, 40), tmp_path / "fit.npz"
     whole = reconstruct(scan, settings=LONG)
     for passes in range(1, 5):
         killed_after(passes, scan, path, settings=LONG, resume=passes > 1)
@@ -63,7 +86,7 @@ def test_a_run_resumed_at_every_pass_is_the_uninterrupted_one(tmp_path):
 
 
 def test_a_cloud_that_has_grown_goes_on_growing(tmp_path):
-    scan, path, growing = cone(), tmp_path / "fit.npz", LONG | {"growth": 2.5}
+    scan, path, growing = cone(17, 24), tmp_path / "fit.npz", LONG | {"growth": 2.5}
     whole = reconstruct(scan, settings=growing)
     counts = [record["gaussians"] for record in whole.history]
     assert counts[1] == counts[0] + math.ceil(0.5 * counts[0])
@@ -74,15 +97,12 @@ def test_a_cloud_that_has_grown_goes_on_growing(tmp_path):
     assert without_seconds(resumed.history) == without_seconds(whole.history)
 
 
-def test_the_start_volume_is_made_once(tmp_path, monkeypatch):
-    path = tmp_path / "fit.npz"
-    killed_after(1, fan(), path, settings=LONG)
-
+def test_the_start_volume_is_made_once(killed, monkeypatch):
     def again(*_):
         raise AssertionError("the start volume was made again")
 
     monkeypatch.setattr("tomo_polysplat.plan.preparation.first_volume", again)
-    assert "passes" in reconstruct(fan(), checkpoint=path, resume=True, settings=LONG).plan["stop"].why
+    assert "passes" in reconstruct(fan(), checkpoint=killed, resume=True, settings=LONG).plan["stop"].why
 
 
 def test_resuming_a_finished_run_only_makes_the_volume(tmp_path):
@@ -96,8 +116,7 @@ def test_resuming_a_finished_run_only_makes_the_volume(tmp_path):
 
 
 def test_a_run_that_a_callback_ended_goes_on(tmp_path):
-    path = tmp_path / "fit.npz"
-    whole = reconstruct(fan(), settings=LONG)
+    path, whole = tmp_path / "fit.npz", uninterrupted()
     paused = reconstruct(fan(), settings=LONG, checkpoint=path, callbacks=[lambda state: state.share > 0.3])
     assert "callback" in paused.plan["stop"].why and len(paused.history) == 2
     resumed = reconstruct(fan(), settings=LONG, checkpoint=path, resume=True)
@@ -136,21 +155,16 @@ def test_resume_begins_anew_without_a_file_and_checkpoint_never_replaces_one(tmp
         ({"materials": ("pmma", "aluminium", "iron")}, "another scan"),
     ],
 )
-def test_another_run_is_refused(tmp_path, change, named):
-    path = tmp_path / "fit.npz"
-    options = {"settings": LONG}
-    killed_after(1, fan(), path, **options)
+def test_another_run_is_refused(killed, change, named):
     with pytest.raises(ValueError, match=named):
-        reconstruct(fan(), checkpoint=path, resume=True, **(options | change))
+        reconstruct(fan(), checkpoint=killed, resume=True, **({"settings": LONG} | change))
 
 
-def test_a_single_other_ray_is_another_scan(tmp_path):
-    path = tmp_path / "fit.npz"
-    killed_after(1, fan(), path, settings=LONG)
+def test_a_single_other_ray_is_another_scan(killed):
     projections = fan().projections.copy()
     projections[0, 3, 5] = np.nextafter(projections[0, 3, 5], np.float32(9))
     with pytest.raises(ValueError, match="another scan"):
-        reconstruct(fan(), projections, checkpoint=path, resume=True, settings=LONG)
+        reconstruct(fan(), projections, checkpoint=killed, resume=True, settings=LONG)
 
 
 def rewritten(path, **changes):
@@ -208,10 +222,9 @@ def with_fact(path, name, **parts):
     return np.frombuffer(json.dumps(about).encode(), np.uint8)
 
 
-def test_what_a_plan_does_not_know_is_refused_by_name(tmp_path):
+def test_what_a_plan_does_not_know_is_refused_by_name(killed):
     """Nothing would read it: who set it meant something else."""
-    path = tmp_path / "fit.npz"
-    killed_after(1, fan(), path, settings=LONG)
+    path = killed
     with np.load(path) as file:
         answer = json.loads(file["about"].tobytes())["plan"]["answers"]["seed_spacing"]
     whole = path.read_bytes()
@@ -258,20 +271,16 @@ def test_what_a_plan_does_not_know_is_refused_by_name(tmp_path):
         lambda path: rewritten(path, about=with_answer(path, tv_corner=["a", "tenth"])),
     ],
 )
-def test_a_damaged_file_is_refused(tmp_path, damage):
-    path = tmp_path / "fit.npz"
-    killed_after(1, fan(), path, settings=LONG)
-    damage(path)
+def test_a_damaged_file_is_refused(killed, damage):
+    damage(killed)
     with pytest.raises(ValueError, match="checkpoint|path|order"):
-        reconstruct(fan(), checkpoint=path, resume=True, settings=LONG)
+        reconstruct(fan(), checkpoint=killed, resume=True, settings=LONG)
 
 
-def test_nothing_in_the_file_is_pickled(tmp_path):
-    path = tmp_path / "fit.npz"
-    killed_after(1, fan(), path, settings=LONG)
-    with np.load(path, allow_pickle=False) as file:
+def test_nothing_in_the_file_is_pickled(killed):
+    with np.load(killed, allow_pickle=False) as file:
         assert all(file[name].dtype.kind in "fiu" for name in file.files) and len(file.files) > 20
-    with zipfile.ZipFile(path) as archive:
+    with zipfile.ZipFile(killed) as archive:
         assert archive.testzip() is None
 
 

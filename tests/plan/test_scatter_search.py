@@ -13,14 +13,14 @@ from tomo_polysplat.plan import calibration, solver
 from tomo_polysplat.plan.answer import Status
 from tomo_polysplat.plan.preparation import prepare
 
-QUICK = {"passes": 6.0, "views_per_step": 2, "tv_factor": 1.0, "edges": "blurred", "pixel_rays": 1}
+QUICK = {"passes": 6.0, "views_per_step": 3, "tv_factor": 1.0, "edges": "blurred", "pixel_rays": 1}
 # The volume is nothing to them.
 HASTY = QUICK | {"views_per_step": 60}
 
 
 @cache
-def pins(scatter=0.0, views=60):
-    return tps.simulate_scan("pins", size=40, views=views, geometry="fan", scatter=scatter)
+def pins(scatter=0.0, views=48):
+    return tps.simulate_scan("pins", size=36, views=views, geometry="fan", scatter=scatter)
 
 
 def reconstruct(scan, **options):
@@ -73,7 +73,7 @@ def test_a_beam_that_drifts_does_not_scatter():
 
 @pytest.mark.parametrize(
     ("views", "options", "words"),
-    [(39, {}, "fewer than 40 views"), (60, {"time_budget": 0.5}, "time budget")],
+    [(39, {}, "fewer than 40 views"), (48, {"time_budget": 0.5}, "time budget")],
 )
 def test_nobody_asks_where_it_cannot_be_told(views, options, words):
     told = reconstruct(pins(0.05, views), **options, settings=HASTY).plan["scatter"]
@@ -143,7 +143,7 @@ def test_what_ends_the_short_fits_does_not_end_the_run(monkeypatch, caplog):
 def test_a_beam_that_may_drift_is_left_alone_where_no_air_tells():
     scan = pins(0.05)
     cut = scan.projections.copy()
-    cut[..., :12] = cut[..., -12:] = np.nan
+    cut[..., :8] = cut[..., -8:] = np.nan
     assert "too few rays" in reconstruct(dataclasses.replace(scan, projections=cut)).plan["scatter"].why
 
 
@@ -169,4 +169,4 @@ def test_ctrl_c_while_it_begins_anew_returns_what_it_had_come_to(monkeypatch):
     result = reconstruct(pins(0.05))
     assert result.plan["stop"].value == "interrupted" and len(begun) == 2
     assert result.history and result.plan["scatter"].why.startswith("not modelled: interrupted")
-    assert result.volume.max() > 0.5 * pins(0.05).truth.max() and np.isfinite(result.volume).all()
+    assert result.volume.sum() == pytest.approx(pins(0.05).truth.sum(), rel=0.3)
