@@ -26,7 +26,7 @@ from tomo_polysplat.simulate.scenes import scan_phantom, scene_phantom
 
 QUICK = {
     "passes": 10.0,
-    "views_per_step": 4,
+    "views_per_step": 6,
     "edges": "blurred",
     "tv_factor": 1.0,
     "pixel_rays": 1,
@@ -39,7 +39,7 @@ FEW_STEPS = {"views_per_step": VIEWS}
 
 @pytest.fixture(scope="module")
 def pancreas():
-    return tps.simulate_scan("pancreas", size=19, views=VIEWS)
+    return tps.simulate_scan("pancreas", size=15, views=VIEWS)
 
 
 @pytest.fixture
@@ -156,9 +156,9 @@ def test_fat_of_one_energy_is_of_no_effect(pancreas):
 
 
 def test_neither_slices_nor_few_views_are_asked(small):
-    fan = tps.simulate_scan("pancreas", size=19, views=VIEWS, geometry="fan")
+    fan = tps.simulate_scan("pancreas", size=15, views=VIEWS, geometry="fan")
     assert "slices" in reconstruct(fan, FEW_STEPS).plan["light"].why
-    few = tps.simulate_scan("pancreas", size=19, views=39)
+    few = tps.simulate_scan("pancreas", size=15, views=39)
     assert "fewer than 40 views" in reconstruct(few, FEW_STEPS).plan["light"].why
 
 
