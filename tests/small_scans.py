@@ -21,7 +21,7 @@ def fan(metal=True):
 
 
 @cache
-def cone(size=24, views=40, metal=False):
+def cone(size=18, views=40, metal=False):
     return tps.simulate_scan("pins", size=size, views=views, metal=metal)
 
 

@@ -56,7 +56,7 @@ def alone(*args, **options):
 
 
 def parallel():
-    return tps.simulate_scan("pins", size=24, views=30, geometry="parallel", metal=False)
+    return tps.simulate_scan("pins", size=17, views=30, geometry="parallel", metal=False)
 
 
 def tilted():
@@ -142,11 +142,11 @@ class TestThreeProcesses:
             self.gaussians.position[:, 2] *= -1
             return told
 
-        settings = ROUGH | {"passes": 1.4, "relocated": 0.0}
+        scan, settings = cone(24), ROUGH | {"passes": 1.4, "relocated": 0.0}
         anew, made = LedStep._anew, []
         monkeypatch.setattr(LedStep, "_anew", lambda step: (made.append(1), anew(step)))
         monkeypatch.setattr(Fitter, "_end_pass", torch.no_grad()(turned_over))
-        shared, one = reconstruct(cone(), settings=settings), alone(cone(), settings=settings)
+        shared, one = reconstruct(scan, settings=settings), alone(scan, settings=settings)
         assert same(shared.volume, one.volume) and made
 
     def test_stand_still_after_ctrl_c_within_a_step(self, three, monkeypatch):
