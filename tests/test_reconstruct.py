@@ -22,7 +22,7 @@ FAST = {"quality": "fast", "settings": {"views_per_step": 4}}
 
 @pytest.fixture(scope="module")
 def metal_scan():
-    return cone(32, 60, metal=True)
+    return cone(28, 55, metal=True)
 
 
 @pytest.fixture(scope="module")

@@ -116,7 +116,7 @@ def test_a_bar_is_drawn_only_when_asked_for(capfd):
     reconstruct(fan(), progress=None)  # no terminal here
     assert capfd.readouterr().err == ""
     # A pass takes longer than the tenth of a second that lies between two drawings at least.
-    reconstruct(fan(), progress=True, settings={"passes": 4.0, "views_per_step": 1})
+    reconstruct(fan(), progress=True, settings={"passes": 2.0, "views_per_step": 1})
     assert "held-out error" in capfd.readouterr().err
 
 

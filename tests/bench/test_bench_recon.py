@@ -35,7 +35,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def task(folder):
-    return Task.of(cached_scan("pins", 16, 44, folder=folder), "cpu")
+    return Task.of(cached_scan("pins", 12, 44, folder=folder), "cpu")
 
 
 def test_a_scan_is_simulated_once(folder, monkeypatch):
@@ -192,28 +192,28 @@ def test_unknown_names_are_refused():
 
 def test_record_table_and_figures(folder, tmp_path):
     methods = ("fdk", "polysplat")
-    bench = ReconBench(("pins",), (15, 16), methods, views=44, settings=QUICK)
+    bench = ReconBench(("pins",), (11, 12), methods, views=44, settings=QUICK)
     seen = []
     record = run_recon_bench(bench, cache=folder, update=lambda r: seen.append(len(r["runs"])))
     assert seen == [2, 4]
     record = json.loads(json.dumps(record))
     assert [(e["size"], e["method"]) for e in record["warm_up"]] == [
-        (n, m) for n in (15, 16) for m in methods
+        (n, m) for n in (11, 12) for m in methods
     ]
     assert all(e["cold_seconds"] > 0 and e["warm_seconds"] > 0 for e in record["warm_up"])
-    scan = bench.scan("pins", 16, folder)
-    fdk = next(r for r in record["runs"] if (r["size"], r["method"]) == (16, "fdk"))
+    scan = bench.scan("pins", 12, folder)
+    fdk = next(r for r in record["runs"] if (r["size"], r["method"]) == (12, "fdk"))
     volume = measure(METHODS["fdk"], Task.of(scan, "cpu"), Options()).volume
     assert fdk["psnr"] == pytest.approx(compare(volume, scan.truth, scan.metal_mask)["psnr"])
-    assert [(c["size"], c["method"]) for c in record["curves"]] == [(15, "polysplat"), (16, "polysplat")]
+    assert [(c["size"], c["method"]) for c in record["curves"]] == [(11, "polysplat"), (12, "polysplat")]
     assert all(len(c["history"]) == 1 for c in record["curves"])
     record["runs"][1] |= {"seconds": None, "about": {"error": "out of luck"}}
     table = as_text(record)
     assert f"{fdk['psnr']:.2f}" in table and "failed: out of luck" in table
     written = write_figures(tmp_path, record)
     assert [path.name for path in written] == [
-        "recon-error-pins-15.png",
-        "recon-error-pins-16.png",
+        "recon-error-pins-11.png",
+        "recon-error-pins-12.png",
         "recon-seconds-pins.png",
     ]
     assert all(path.stat().st_size > 5000 for path in written)

@@ -23,7 +23,7 @@ QUICK = {"passes": 5.0, "views_per_step": 6, "pixel_rays": 1}
 
 @cache
 def fan(metal=True):
-    return tps.simulate_scan("pins", size=32, views=61, geometry="fan", metal=metal)
+    return tps.simulate_scan("pins", size=32, views=51, geometry="fan", metal=metal)
 
 
 def off(scan, columns):

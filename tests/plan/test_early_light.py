@@ -22,7 +22,7 @@ SETTINGS = {"passes": 10.0, "views_per_step": 8, "held_out": 0.06}
 
 @cache
 def scan():
-    return small_scans.cone(size=20, views=37)
+    return small_scans.cone(size=18, views=37)
 
 
 @cache

@@ -15,7 +15,7 @@ QUICK = {"passes": 4.0, "views_per_step": 8, "held_out": 0.06}
 
 @cache
 def scan():
-    return small_scans.cone(size=20, views=37)
+    return small_scans.cone(size=18, views=37)
 
 
 @cache

@@ -22,7 +22,7 @@ SCANS = [
     ("pepper", "cone"),
     ("pancreas", "parallel"),
 ]
-SIZE, VIEWS = 40, 90
+SIZE, VIEWS = 36, 90
 
 
 @pytest.fixture(scope="module", params=SCANS, ids="-".join)
@@ -108,7 +108,7 @@ def test_a_missing_logarithm(scan, change, word):
 
 @cache
 def as_many_views_as_columns(scene, geometry):
-    scan = simulate_scan(scene, SIZE, 60, geometry=geometry)
+    scan = simulate_scan(scene, SIZE, 3 * SIZE // 2, geometry=geometry)
     assert scan.views == scan.columns
     return scan
 

@@ -1,5 +1,7 @@
 """Filtered backprojection of cone and parallel beams against closed forms, and where it does not apply."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import torch
@@ -28,6 +30,13 @@ def cone(angles=TURN, columns=96, rows=96, pixel=(1.6, 1.6), offset=(0.0, 0.0)):
 def parallel(angles=TURN / 2, columns=96, offset=0.0):
     geometry = astra.create_proj_geom("parallel3d", 1.0, 1.0, 64, columns, angles)
     return astra.geom_postalignment(geometry, (offset, 0.0))
+
+
+@cache
+def usual():
+    """The spheres in an ordinary cone beam, which several tests compare with."""
+    geometry, grid = from_astra(cone(), VOLUME)
+    return geometry, grid, fdk(chords(geometry, SPHERES), geometry, grid)
 
 
 def check_spheres(proj_geom, vol_geom=VOLUME, tolerance=0.01):
@@ -176,7 +185,7 @@ def narrow(angles):
     return astra.create_proj_geom("cone", 1.0, 1.0, 64, 96, angles, 20000.0, 10.0)
 
 
-@pytest.mark.parametrize("views", [60, 121])
+@pytest.mark.parametrize("views", [60, 91])
 @pytest.mark.parametrize("endpoint", [True, False])
 def test_half_a_turn_of_a_narrow_cone_is_as_good_as_of_a_parallel_beam(views, endpoint):
     """The rays differ from parallel ones by an eighth of a degree, at the rim by 0.05 columns."""
@@ -217,26 +226,25 @@ def test_a_detector_turned_and_an_axis_moved():
     geometry, grid = from_astra(turned, window)
     moved = [((c[0] + 11.0, c[1], c[2]), r, m) for c, r, m in SPHERES]
     volume = fdk(chords(geometry, moved), geometry, grid)
-    straight, _ = from_astra(cone(), VOLUME)
-    expected = fdk(chords(straight, SPHERES), straight, from_astra(cone(), VOLUME)[1])
+    expected = usual()[2]
     inside = distance(grid, moved[0][0]) < 26
     assert relative_error(volume, expected, inside) < 0.015
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
 def test_the_unit_of_length_only_scales_the_values(factor):
-    geometry, grid = from_astra(cone(), VOLUME)
-    expected = fdk(chords(geometry, SPHERES), geometry, grid)
+    geometry, grid, expected = usual()
     scaled = geometry.scaled(factor)
     volume = fdk(chords(scaled, SPHERES, factor), scaled, grid.scaled(factor))
     np.testing.assert_allclose(volume, expected * 1.0, atol=2e-4 * expected.max())
 
 
 def test_magnification_does_not_matter():
-    geometry, grid = from_astra(cone(), VOLUME)
+    _, grid, expected = usual()
     far = astra.create_proj_geom("cone", 3.2, 3.2, 96, 96, TURN, 200.0, 440.0)
-    volumes = [fdk(chords(g, SPHERES), g, grid) for g in (geometry, from_astra(far, VOLUME)[0])]
-    np.testing.assert_allclose(volumes[1], volumes[0], atol=1e-4 * volumes[0].max())
+    geometry, _ = from_astra(far, VOLUME)
+    volume = fdk(chords(geometry, SPHERES), geometry, grid)
+    np.testing.assert_allclose(volume, expected, atol=1e-4 * expected.max())
 
 
 def test_smooth_filters_blur_noise():
