@@ -86,7 +86,8 @@ def bias(result):
 
 def reconstructed(scan, **options):
     # Where the scanner stood is asked in other files.
-    return tps.reconstruct(scan, settings=small_scans.QUICK | {"passes": 6.0}, align=False, **options)
+    settings = {"passes": 6.0, "views_per_step": 12}
+    return tps.reconstruct(scan, settings=settings, align=False, **options)
 
 
 @cache

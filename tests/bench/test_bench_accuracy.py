@@ -192,7 +192,7 @@ def test_command_line(folder, tmp_path, capsys, monkeypatch):
         raise MemoryError("no room")
 
     monkeypatch.setitem(METHODS, "sirt", Method("SIRT", broken))
-    options = "--scenes pins --sizes 15 --views 20 --photons 1e4 --seeds 2 --methods fdk sirt polysplat"
+    options = "--scenes pins --sizes 9 --views 20 --photons 1e4 --seeds 2 --methods fdk sirt polysplat"
     options = [*options.split(), "--device", "cpu", "--passes", "2"]
     target = tmp_path / "records"
     command = ["bench", "accuracy", *options, "--cache", str(folder), "--record", str(target)]

@@ -75,7 +75,7 @@ def test_a_run_takes_what_was_expected(seconds, monkeypatch, metal):
         return step(self, views, share)
 
     monkeypatch.setattr(EagerStep, "__call__", slow)
-    scan, settings = cone(12, 24, metal=metal), {"passes": 9}
+    scan, settings = cone(10, 20, metal=metal), {"passes": 9}
     with only_told() as found:
         tps.reconstruct(scan, settings=settings, device="cpu", progress=False)
     early = seconds[0]

@@ -22,7 +22,7 @@ SCANS = [
     ("pepper", "cone"),
     ("pancreas", "parallel"),
 ]
-SIZE, VIEWS = 36, 90
+SIZE, VIEWS = 40, 90
 
 
 @pytest.fixture(scope="module", params=SCANS, ids="-".join)
