@@ -6,6 +6,8 @@ from pathlib import Path
 import matplotlib
 import pytest
 
+from tomo_polysplat.settings import PRESETS
+
 FOLDER = Path(__file__).resolve().parents[1] / "examples"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 # Text that is replaced so that a test takes seconds; each must be there.
@@ -52,6 +54,7 @@ def test_the_notebook_runs(path, tmp_path, monkeypatch):
     here.mkdir()
     temporary.mkdir()
     monkeypatch.chdir(here)
+    monkeypatch.setitem(PRESETS, "balanced", PRESETS["fast"])
     monkeypatch.setattr("tempfile.tempdir", str(temporary))
     source = "\n\n".join(cells(path, "code"))
     for old, new in SMALL[path.stem].items():

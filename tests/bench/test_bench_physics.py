@@ -9,6 +9,7 @@ from tomo_polysplat import reconstruct
 from tomo_polysplat.bench import material_rods, materials, spectrum
 from tomo_polysplat.cli.main import main
 from tomo_polysplat.physics.materials import mass_attenuation
+from tomo_polysplat.settings import PRESETS
 
 
 def test_materials_without_scans(tmp_path):
@@ -32,6 +33,7 @@ def test_rods_let_light_through_and_hold_what_they_are_made_of():
 
 def test_rods_of_one_material(monkeypatch):
     monkeypatch.setattr(materials, "MATERIALS", materials.MATERIALS[:1])
+    monkeypatch.setitem(PRESETS, "balanced", PRESETS["fast"])
     record = materials.run_materials_bench(materials.MaterialsBench(size=12, views=16, rods=("iron",)))
     rods = record["rods"][0]
     assert rods["own"] is None and rods["named"] == []
