@@ -7,34 +7,34 @@ from xdist.scheduler import LoadFileScheduling
 
 # Their tests share nothing, so each may go to another worker.
 SPLIT = ("tests/test_notebooks.py",)
-# Files that take longest, the longest first; the order of the others does not matter. The first one runs no kernel of
-# numba's: meanwhile the other worker compiles them, once for both.
+# Files that take longest, the longest first; the order of the others does not matter. The first and the third run no
+# kernels of numba's: meanwhile the other worker compiles them, once for both.
 LONGEST = (
     "tests/kernels/test_triton_steps.py",
     "tests/bench/test_bench_hard.py",
+    "tests/kernels/test_triton.py",
+    "tests/test_several_devices.py",
     "tests/plan/test_scatter_search.py",
     "tests/plan/test_tv_factor.py",
-    "tests/test_several_devices.py",
-    "tests/bench/test_bench_physics.py",
-    "tests/test_reconstruct.py",
-    "tests/plan/test_light.py",
-    "tests/plan/test_pixel_rays.py",
-    "tests/test_checkpoint.py",
     "tests/scan/test_check.py",
+    "tests/test_reconstruct.py",
+    "tests/plan/test_pixel_rays.py",
+    "tests/start/test_fdk.py",
+    "tests/plan/test_light.py",
+    "tests/bench/test_bench_physics.py",
+    "tests/test_readme.py",
     "tests/test_threads.py",
     "tests/test_reconstruct_fat.py",
-    "tests/test_readme.py",
-    "tests/fuzz/test_fuzz.py",
-    "tests/plan/test_align.py",
-    "tests/baselines/test_baselines.py",
+    "tests/test_reconstruct_inputs.py",
     "tests/test_reconstruct_control.py",
-    "tests/plan/test_never_worse.py",
-    "tests/bench/test_bench_recon.py",
+    "tests/scan/test_scanner_folders.py",
+    "tests/plan/test_align.py",
     "tests/plan/test_edges.py",
-    "tests/start/test_fdk.py",
-    "tests/simulate/test_artefacts.py",
-    "tests/kernels/test_triton.py",
-    "tests/quality/test_quality.py",
+    "tests/bench/test_bench_recon.py",
+    "tests/test_reconstruct_filter_map.py",
+    "tests/fuzz/test_fuzz.py",
+    "tests/test_checkpoint.py",
+    "tests/plan/test_never_worse.py",
     "tests/fuzz/test_campaign.py",
     "tests/test_notebooks.py",
 )
