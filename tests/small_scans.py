@@ -26,8 +26,8 @@ def cone(size=18, views=40, metal=False):
 
 
 def reconstruct(scan, projections=None, proj_geom=None, vol_geom=None, **options):
-    """A quick polychromatic reconstruction; what is not given is the scan's."""
-    options = {"spectrum": scan.spectrum, "unit": scan.unit, "settings": QUICK} | options
+    """A quick polychromatic reconstruction; what is not given is the scan's, which stood where it says."""
+    options = {"spectrum": scan.spectrum, "unit": scan.unit, "settings": QUICK, "align": False} | options
     return tps.reconstruct(
         scan.projections if projections is None else projections,
         proj_geom or scan.proj_geom,

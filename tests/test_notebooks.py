@@ -14,7 +14,7 @@ NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 SMALL = {
     "01_quickstart": {"SIZE, VIEWS, QUALITY = 48, 120": "SIZE, VIEWS, QUALITY = 24, 48"},
     "02_tomopy_pipeline": {
-        "COLUMNS, ROWS, VIEWS = 72, 12, 150": "COLUMNS, ROWS, VIEWS = 40, 4, 44",
+        "COLUMNS, ROWS, VIEWS = 72, 12, 150": "COLUMNS, ROWS, VIEWS = 32, 4, 42",
         '"unit": "cm"}': '"unit": "cm", "quality": "fast"}',
         'unit="cm").volume': 'unit="cm", quality="fast").volume',
     },

@@ -102,7 +102,7 @@ def test_the_same_bits_for_any_number_of_threads(name, monkeypatch):
         calibrated = (
             {"calibrate": "scatter", "settings": QUICK | {"passes": 6.0}} if name == "calibrated" else {}
         )
-        result = reconstruct(SCANS[name](), **calibrated)
+        result = reconstruct(SCANS[name](), align="auto", **calibrated)
         return hashlib.sha256(result.basis.tobytes() + result.gaussians["position"].tobytes()).hexdigest()
 
     before, found = (torch.get_num_threads(), numba.get_num_threads()), {}

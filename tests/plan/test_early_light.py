@@ -90,7 +90,7 @@ def test_what_changes_hardly_anything_is_left_to_the_run(monkeypatch):
 def test_of_a_steady_scanner_nothing_is_made_twice(monkeypatch):
     volumes, kept = [], preparation.first_volume
     monkeypatch.setattr(preparation, "first_volume", lambda *parts: volumes.append(parts) or kept(*parts))
-    result = small_scans.reconstruct(scan(), settings=SETTINGS, progress=False)
+    result = small_scans.reconstruct(scan(), settings=SETTINGS, progress=False, align="auto")
     assert len(volumes) == 1 and result.gains is None and EARLY_LIGHT not in result.plan
     monkeypatch.setattr(preparation, "first_volume", kept)
     # Without a look, the volume is the same to the bit.

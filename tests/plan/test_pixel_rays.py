@@ -27,12 +27,12 @@ def pins(subrays=1, metal=True, size=64, views=60):
 
 def thin():
     """A scan of infinitely thin rays."""
-    return pins(size=48, views=45)
+    return pins(size=40, views=42)
 
 
 def small():
     """A scan of averaged light, for runs of which only the course matters."""
-    return pins(3, size=48, views=45)
+    return pins(3, size=40, views=42)
 
 
 def large():
