@@ -85,7 +85,7 @@ def test_every_material_is_known():
 def test_bone_is_as_dense_as_bone_however_long_it_is_fitted(passes):
     """A blurred edge looks like matter of a larger number: left to rise, inside it was 8 and 11 % too dense."""
     beam = materials.MaterialsBench().spectrum
-    scan = material_rods.rod_scan("bone", beam, 20, 42)
+    scan = material_rods.rod_scan("bone", beam, 24, 48)
     result = reconstruct(
         scan.projections,
         scan.proj_geom,
