@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 
     from tomo_polysplat.scan.hdf5_array import StoredArray
 
-__all__ = ["scan_from_hdf5"]
+__all__ = ["input_kind", "pictures_of", "scan_from_hdf5"]
 
 logger = logging.getLogger(__name__)
 
@@ -82,13 +82,9 @@ def scan_from_hdf5(path: Path, options: ReadOptions, part: Part = _ALL) -> Scan:
     with opened(path) as file:
         if find_array(file, "polysplat/basis") is not None:
             raise fail("path", "a scan", f"the result of a reconstruction in {path}", "Result.load reads it")
+        data = pictures_of(file, path)
         exchange = find_group(file, "exchange")
-        data = None if exchange is None else find_array(exchange, "data")
-        if exchange is None or data is None or data.ndim != 3 or 0 in data.shape:
-            got = "no such dataset" if data is None else f"shape {data.shape}"
-            remedy = "NXtomo and CIL's NeXus are read too; else copy the projections there with h5py, or into TIFFs"
-            expected = "a dataset /exchange/data of shape (views, rows, columns)"
-            raise fail("path", expected, f"{got} in {path}", remedy)
+        assert exchange is not None  # the pictures are in it
         now, later = _in_two(part, file, options)
         wanted = StoredPart(data, now)
         stay = 4 * prod(wanted.shape) >= _STAYS and find_array(file, "polysplat/valid") is None
@@ -116,6 +112,18 @@ def scan_from_hdf5(path: Path, options: ReadOptions, part: Part = _ALL) -> Scan:
             filter_map=wanted.filters(read_filter_map(file, (rows, views, columns))),
         )
     return scan if later.whole else scan_part(scan, later)
+
+
+def pictures_of(file: h5py.File, path: Path) -> StoredArray:
+    """``/exchange/data``; refuses a file that has none of three axes."""
+    exchange = find_group(file, "exchange")
+    data = None if exchange is None else find_array(exchange, "data")
+    if data is None or data.ndim != 3 or 0 in data.shape:
+        got = "no such dataset" if data is None else f"shape {data.shape}"
+        remedy = "NXtomo and CIL's NeXus are read too; else copy the projections there with h5py, or into TIFFs"
+        expected = "a dataset /exchange/data of shape (views, rows, columns)"
+        raise fail("path", expected, f"{got} in {path}", remedy)
+    return data
 
 
 def _in_two(part: Part, file: h5py.File, options: ReadOptions) -> tuple[Part, Part]:
@@ -171,7 +179,7 @@ def _counts(
     """What is stored, with what is needed to make line integrals of it, and notes of what that is."""
     rows, columns = data.shape[1:]
     white, dark = find_array(exchange, "data_white"), find_array(exchange, "data_dark")
-    kind = _input_kind(data, white is not None, options.input)
+    kind = input_kind(data, white is not None, options.input)
     if kind != "counts" and options.saturation is not None:
         raise fail("saturation", "counts in the file", f"{kind}, which has none", "leave it out")
     flat = background = None
@@ -211,7 +219,7 @@ def _require_few(frames: StoredArray, data: StoredArray) -> None:
         raise fail(frames.name, f"at most {most} frames", f"{len(frames)}")
 
 
-def _input_kind(data: StoredArray, has_white: bool, stated: str | None) -> str:
+def input_kind(data: StoredArray, has_white: bool, stated: str | None) -> str:
     """What the numbers are: as the caller or the file states it, else as they look, with a warning."""
     if stated is not None:
         return stated
