@@ -56,7 +56,9 @@ def test_angles_flats_and_a_spectrum_that_the_file_lacks(path):
             del file[f"exchange/{name}"]
         file["exchange/data_dark"] = dark  # one picture without an axis for their number
     np.save(path.parent / "flat.npy", white)
-    scan = tps.load_scan(path, scanner=SCANNER | {"arc": 360, "flats": "flat.npy", "kvp": 90, "filter": "Al 1mm"})
+    scan = tps.load_scan(
+        path, scanner=SCANNER | {"arc": 360, "flats": "flat.npy", "kvp": 90, "filter": "Al 1mm"}
+    )
     np.testing.assert_array_equal(scan.projections, expected.projections)
     np.testing.assert_allclose(scan.proj_geom["Vectors"], expected.proj_geom["Vectors"], atol=1e-9)
     assert expected.spectrum is None

@@ -120,7 +120,9 @@ def pictures_of(file: h5py.File, path: Path) -> StoredArray:
     data = None if exchange is None else find_array(exchange, "data")
     if data is None or data.ndim != 3 or 0 in data.shape:
         got = "no such dataset" if data is None else f"shape {data.shape}"
-        remedy = "NXtomo and CIL's NeXus are read too; else copy the projections there with h5py, or into TIFFs"
+        remedy = (
+            "NXtomo and CIL's NeXus are read too; else copy the projections there with h5py, or into TIFFs"
+        )
         expected = "a dataset /exchange/data of shape (views, rows, columns)"
         raise fail("path", expected, f"{got} in {path}", remedy)
     return data

@@ -59,8 +59,8 @@ def load_scan(
     log and in ``scan.notes["scanner"]``, with the keys of the scanner's own text that are not used.
 
     A Data Exchange file that states no geometry is taken as a parallel beam with the angles in
-    ``/exchange/theta`` (degrees), unless `scanner` describes another. Rays without light, saturated, of dead pixels or not finite are marked in
-    ``scan.valid`` and counted in ``scan.notes``, never clipped.
+    ``/exchange/theta`` (degrees), unless `scanner` describes another. Rays without light, saturated, of dead pixels
+    or not finite are marked in ``scan.valid`` and counted in ``scan.notes``, never clipped.
 
     Parameters
     ----------

@@ -62,7 +62,9 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
             Hdf5Frames(data, np.arange(len(data))),
             full_turn(len(data)),
             read_text(file, "measurement/sample/name") or path.stem,
-            input=input_kind(data, white is not None or bool({"flats", "white"} & known.keys()), known.get("input")),
+            input=input_kind(
+                data, white is not None or bool({"flats", "white"} & known.keys()), known.get("input")
+            ),
             flats=white,
             darks=dark,
         )

@@ -4,10 +4,14 @@ Rows are taken to begin at the top, pictures to be as seen from the source, and 
 angles do. Flips that the file tells of (``detector/transformations``, in older files ``x_flipped``, ``y_flipped``)
 are undone, as the ESRF's own programs undo them: half a turn about the vertical exchanges left and right, half a turn
 about another axis top and bottom.
+
+What Diamond's program for data acquisition writes is read as well: there the detector has a name of its own, and the
+angles stand in the group of that name beside the pictures. Positions that were measured come before those asked for.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -40,7 +44,9 @@ KIND = "NXtomo (HDF5)"
 _SUFFIXES = (".nx", ".nxs", ".h5", ".hdf5", ".hdf")
 _KEYS = ("image_key", "image_key_control")
 _PROJECTION, _FLAT, _DARK = 0, 1, 2
-_DETECTOR, _SOURCE = "instrument/detector", "instrument/source/distance"
+_USUAL, _SOURCE = "detector", "instrument/source/distance"
+# Names of turns among Diamond's motors, and how those of positions that were asked for end.
+_ANGLE, _ASKED_FOR = re.compile("rot|theta|angle"), "_set"
 _MM = {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3, "micron": 1e-3, "meter": 1e3, "metre": 1e3}
 # A source so many times as far from the object as the detector is sends a parallel beam.
 _FAR = 200.0
@@ -93,29 +99,48 @@ def _group(parent: h5py.Group, name: str) -> h5py.Group | None:
 
 
 def _is_entry(group: h5py.Group) -> bool:
-    if find_group(group, _DETECTOR) is None:
+    return _detector(group) is not None
+
+
+def _detector(entry: h5py.Group) -> str | None:
+    """Path of the detector with keys, which mostly is called so; of several the first whose pictures are there."""
+    inside = _group(entry, "instrument")
+    names = [] if inside is None else [_USUAL, *list(inside)[:_MOST_ENTRIES]]
+    keyed = [f"instrument/{name}" for name in names if name in names[1:] and _has_keys(inside, name)]
+    return next((path for path in keyed if _has_pictures(entry, path)), keyed[0] if keyed else None)
+
+
+def _has_keys(instrument: h5py.Group | None, name: str) -> bool:
+    group = None if instrument is None else _group(instrument, name)
+    if group is None or (name != _USUAL and "data" not in group):
         return False
-    return any(find_array(group, f"{_DETECTOR}/{key}") is not None for key in _KEYS)
+    return any(key in group and find_array(group, key) is not None for key in _KEYS)
+
+
+def _has_pictures(entry: h5py.Group, detector: str) -> bool:
+    with suppress(ValueError):  # a link may lead to a file that is not there
+        data = find_array(entry, f"{detector}/data")
+        return data is not None and data.ndim == 3
+    return False
 
 
 def _told(path: Path, entry: h5py.Group) -> Acquisition:
-    data = find_array(entry, f"{_DETECTOR}/data")
+    detector = _detector(entry)
+    assert detector is not None  # it was recognised by that
+    data = find_array(entry, f"{detector}/data")
     if data is None or data.ndim != 3:
         got = "none" if data is None else f"shape {data.shape}"
-        raise fail("path", f"pictures in {_DETECTOR}/data, (pictures, rows, columns)", got)
-    name = next(key for key in _KEYS if find_array(entry, f"{_DETECTOR}/{key}") is not None)
-    keys = read_numbers(entry, f"{_DETECTOR}/{name}", (len(data),))
-    angles = read_numbers(entry, "sample/rotation_angle", (len(data),)).astype(np.float64)
-    dataset = find_array(entry, "sample/rotation_angle")
-    if dataset is not None and (text_attribute(dataset, "units") or "").lower().startswith("rad"):
-        angles = np.rad2deg(angles)
+        raise fail("path", f"pictures in {detector}/data, (pictures, rows, columns)", got)
+    name = next(key for key in _KEYS if find_array(entry, f"{detector}/{key}") is not None)
+    keys = read_numbers(entry, f"{detector}/{name}", (len(data),))
+    angles = _degrees(entry, detector, len(data))
     frames = {key: np.flatnonzero(keys == key) for key in (_PROJECTION, _FLAT, _DARK)}
     if not len(frames[_PROJECTION]):
         raise fail(
             "path", "pictures of image_key 0, the projections", f"keys {sorted(set(keys.tolist()))}"[:200]
         )
     stacks = {key: Hdf5Frames(data, chosen) for key, chosen in frames.items() if len(chosen)}
-    setup, unit, said = _setup(entry, angles[frames[_PROJECTION]], data.shape[2])
+    setup, unit, said = _setup(entry, detector, angles[frames[_PROJECTION]], data.shape[2])
     told = Acquisition(
         KIND,
         stacks[_PROJECTION],
@@ -124,17 +149,40 @@ def _told(path: Path, entry: h5py.Group) -> Acquisition:
         unit=unit,
         flats=stacks.get(_FLAT),
         darks=stacks.get(_DARK),
-        exposure=_first(entry, f"{_DETECTOR}/count_time"),
-        other=_others(entry),
+        exposure=_first(entry, f"{detector}/count_time"),
+        other=_others(entry, detector),
     )
     if _DARK not in stacks:
         said.append("no dark pictures: without light a pixel is taken to count 0")
-    return _unflipped(told.saying(*said), entry)
+    return _unflipped(told.saying(*said), entry, detector)
 
 
-def _unflipped(told: Acquisition, entry: h5py.Group) -> Acquisition:
+def _degrees(entry: h5py.Group, detector: str, pictures: int) -> np.ndarray:
+    """Of all pictures."""
+    names = ["sample/rotation_angle", "data/rotation_angle"]
+    name = detector.rpartition("/")[2]
+    plotted = _group(entry, name)
+    inside = [] if plotted is None else sorted(plotted, key=lambda name: name.endswith(_ASKED_FOR))
+    names += [f"{name}/{axis}" for axis in inside[:_MOST_ENTRIES] if _ANGLE.search(axis)]
+    name = next((name for name in names if _is_there(entry, name, pictures)), names[0])
+    angles = read_numbers(entry, name, (pictures,)).astype(np.float64)
+    dataset = find_array(entry, name)
+    if dataset is not None and (text_attribute(dataset, "units") or "").lower().startswith("rad"):
+        angles = np.rad2deg(angles)
+    return angles
+
+
+def _is_there(entry: h5py.Group, name: str, pictures: int) -> bool:
+    """Whether there are so many numbers; a file that a link leads to may be missing."""
+    with suppress(ValueError):
+        found = find_array(entry, name)
+        return found is not None and found.shape == (pictures,)
+    return False
+
+
+def _unflipped(told: Acquisition, entry: h5py.Group, detector: str) -> Acquisition:
     """With what the file tells of exchanged sides; the axis is that of the pictures as they are stored."""
-    sideways, upside_down = _flips(entry)
+    sideways, upside_down = _flips(entry, detector)
     setup = told.setup
     if not (sideways or upside_down) or not isinstance(setup, Setup):
         return told
@@ -145,11 +193,11 @@ def _unflipped(told: Acquisition, entry: h5py.Group) -> Acquisition:
     return replace(told, setup=setup, top_first=not upside_down, from_detector=sideways).saying(words)
 
 
-def _flips(entry: h5py.Group) -> tuple[bool, bool]:
+def _flips(entry: h5py.Group, detector: str) -> tuple[bool, bool]:
     """Whether left and right, and top and bottom, are exchanged."""
-    old = (_first(entry, f"{_DETECTOR}/{axis}_flipped") for axis in "xy")
+    old = (_first(entry, f"{detector}/{axis}_flipped") for axis in "xy")
     sideways, upside_down = (bool(value) for value in old)
-    turns = _group(entry, f"{_DETECTOR}/transformations")
+    turns = _group(entry, f"{detector}/transformations")
     if turns is None:
         return sideways, upside_down
     about = {name: _axis(turns, name) for name in list(turns)[:_MOST_TURNS]}
@@ -173,13 +221,13 @@ def _axis(turns: h5py.Group, name: str) -> np.ndarray | None:
     return vector.astype(np.float64) if told else None
 
 
-def _axis_column(entry: h5py.Group, columns: int) -> tuple[float | None, list[str]]:
+def _axis_column(entry: h5py.Group, detector: str, columns: int) -> tuple[float | None, list[str]]:
     """Columns by which the axis is to the right of the middle.
 
     Files of the ESRF count from the middle, others from the first column; a full view has its axis near the middle.
     """
-    told = _first(entry, f"{_DETECTOR}/x_rotation_axis_pixel_position")
-    half = (read_text(entry, f"{_DETECTOR}/field_of_view") or "").lower() == "half"
+    told = _first(entry, f"{detector}/x_rotation_axis_pixel_position")
+    half = (read_text(entry, f"{detector}/field_of_view") or "").lower() == "half"
     if told is None or told <= columns / (2 if half else 4):
         return told, []
     shift = told - (columns - 1) / 2
@@ -188,16 +236,18 @@ def _axis_column(entry: h5py.Group, columns: int) -> tuple[float | None, list[st
     ]
 
 
-def _setup(entry: h5py.Group, degrees: np.ndarray, columns: int) -> tuple[Setup, str, list[str]]:
-    sides = [_length(entry, f"{_DETECTOR}/{axis}_pixel_size") for axis in "xy"]
-    behind, before = _length(entry, f"{_DETECTOR}/distance"), _length(entry, _SOURCE)
+def _setup(
+    entry: h5py.Group, detector: str, degrees: np.ndarray, columns: int
+) -> tuple[Setup, str, list[str]]:
+    sides = [_length(entry, f"{detector}/{axis}_pixel_size") for axis in "xy"]
+    behind, before = _length(entry, f"{detector}/distance"), _length(entry, _SOURCE)
     width, height = (side or sides[1 - k] or 0.0 for k, side in enumerate(sides))
     said, unit = [], "mm"
     if not width:
         width = height = 1.0
         unit, before = "pixel", None
         said.append("the pixel is not known: lengths are in pixels; give pixel=")
-    shift, counted = _axis_column(entry, columns)
+    shift, counted = _axis_column(entry, detector, columns)
     said += counted
     if shift is None:
         said.append("the axis is taken to fall on the detector's middle; give offset= if it does not")
@@ -227,9 +277,9 @@ def _first(entry: h5py.Group, name: str) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def _others(entry: h5py.Group) -> dict[str, str]:
+def _others(entry: h5py.Group, detector: str) -> dict[str, str]:
     """Texts that somebody may want to see again."""
-    names = ("title", "start_time", "end_time", "instrument/name", f"{_DETECTOR}/field_of_view")
+    names = ("title", "start_time", "end_time", "instrument/name", f"{detector}/field_of_view")
     texts = {name: read_text(entry, name) for name in names}
     energy = _first(entry, "instrument/beam/incident_energy") or _first(entry, "beam/incident_energy")
     if energy is not None:
