@@ -78,10 +78,11 @@ def build_parser() -> Parser:
 
 
 class _VisibleFormatter(logging.Formatter):
-    """One line a message, even if texts from files have control characters in them."""
+    """One line a message, or those of its own, even if texts from files have control characters in them."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  # its name in the library
-        record.message = visible(record.message)
+        own = record.message.split("\n") if getattr(record, "has_own_lines", False) else [record.message]
+        record.message = "\n".join(map(visible, own))
         return super().formatMessage(record)
 
 
