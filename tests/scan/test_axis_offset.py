@@ -46,6 +46,18 @@ def test_an_axis_is_found_wherever_it_is(beam, arc, views):
         assert abs(found.columns - columns) < min(4 * found.error, 0.05)
 
 
+@pytest.mark.parametrize("end", [180.0, 179.9998, 180.0002])
+def test_a_half_turn_to_its_end_but_for_what_motors_miss(end):
+    """49 views, of which the last sees what the first did from behind, a little too early or too late."""
+    values, geometry = measured("parallel", end * 49 / 48, 49)
+    for columns in (0.0, -2.4):
+        found = axis_offset(values, beside(geometry, columns))
+        assert not found.doubt and abs(found.columns - columns) < 0.05
+    # A view that lacks a tenth of a step is none.
+    values, geometry = measured("parallel", (180 - 0.375) * 49 / 48, 49)
+    assert axis_offset(values, geometry).doubt == "no ray was measured from both ends"
+
+
 def test_nothing_depends_on_how_views_and_columns_are_counted():
     values, geometry = measured("fan", 360.0, 60)
     told = beside(geometry, 0.8)
