@@ -71,6 +71,7 @@ def build_parser() -> Parser:
             parents=[common],
             help=module.HELP,
             description=f"{module.HELP[0].upper()}{module.HELP[1:]}.",
+            examples=getattr(module, "EXAMPLES", ()),
         )
         module.add_arguments(child)
         child.set_defaults(run=module.run, parser=child, whole=parser)

@@ -79,10 +79,15 @@ def filter_map_from(text: str) -> tuple[str, Any]:
 def add_scan_options(parser: argparse.ArgumentParser) -> None:
     """The scan and what its file leaves open."""
     parser.add_argument(
-        "scan", metavar="SCAN", help="Data Exchange HDF5 file, .npz scan, or a scanner's folder"
+        "scan",
+        metavar="SCAN",
+        help="Data Exchange HDF5 file, .npz scan, or what a scanner left: a folder or a file",
     )
     group = parser.add_argument_group("what the file does not say")
-    group.add_argument("--unit", help="unit of its lengths: cm (default), mm, um, m or pixel")
+    group.add_argument(
+        "--unit",
+        help="of lengths whose unit no file tells: cm, mm, um, m or pixel (default: mm of a scanner, else cm)",
+    )
     group.add_argument(
         "--centre",
         "--center",
@@ -99,7 +104,7 @@ def add_scan_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--input",
         choices=["counts", "transmission", "attenuation"],
-        help="what /exchange/data holds (default: by its attribute or its open-beam images)",
+        help="what the numbers are (default: as the file tells, or by its open-beam images)",
     )
     group.add_argument(
         "--water-correction",

@@ -32,6 +32,10 @@ if TYPE_CHECKING:
 
 NAME = "recon"
 HELP = "reconstruct a scan into a volume of attenuation in 1/length"
+EXAMPLES = (
+    "tomo-polysplat recon scan.h5 -o volume.tif",
+    "tomo-polysplat recon scan.h5 -o result.h5 --report page.html --kvp 90 --filter 'Al 1mm' --detector csi:0.6mm",
+)
 
 
 # Long: a line or two for every option, in the order of the help.

@@ -27,7 +27,7 @@ from tomo_polysplat.scan.scan import Scan
 if TYPE_CHECKING:
     from tomo_polysplat.physics.spectrum import Spectrum
 
-__all__ = ["load_scan", "require_scan_name", "save_scan"]
+__all__ = ["is_of_scanner", "load_scan", "require_scan_name", "save_scan"]
 
 _WRITERS: dict[str, Callable[..., None]] = {".npz": write_npz, ".h5": write_hdf5, ".hdf5": write_hdf5}
 
@@ -136,6 +136,12 @@ def load_scan(
         return scan_from_hdf5(existing_file(path), options, part)
     scan = reader(existing_file(path), options)
     return scan if part.whole else scan_part(scan, part)
+
+
+def is_of_scanner(path: str | os.PathLike, scanner: Mapping[str, Any]) -> bool:
+    """Whether `load_scan` takes what is there for what a scanner wrote, of which `scanner` may tell the tube too."""
+    reader = _reader_of_scans(Path(path))
+    return reader is None or (reader is scan_from_hdf5 and exchange_told.is_described(scanner))
 
 
 def _of_parallel_beam(file: Path, options: ReadOptions, scanner: Mapping[str, Any]) -> ReadOptions:
