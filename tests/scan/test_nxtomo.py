@@ -261,3 +261,12 @@ def test_angles_beside_the_data_of_a_usual_file(path):
         del file["entry0000/data/rotation_angle"]
     with pytest.raises(ValueError, match="sample/rotation_angle"):
         tps.load_scan(path)
+
+
+def test_a_voltage_without_the_size_of_a_pixel_is_said_to_be_of_no_use(path):
+    with h5py.File(path, "a") as file:
+        for axis in "xy":
+            del file[f"entry0000/instrument/detector/{axis}_pixel_size"]
+    scan = tps.load_scan(path, scanner={"kvp": 90, "filter": "Al 1mm"})
+    assert scan.unit == "pixel" and scan.spectrum is None
+    assert any("a spectrum cannot be used; give pixel=" in guess for guess in scan.notes["scanner"]["guessed"])

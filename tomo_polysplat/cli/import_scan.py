@@ -7,7 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from tomo_polysplat.checks import fail, visible
-from tomo_polysplat.cli.options import add_scan_options, add_spectrum_options, scan_from, spectrum_from
+from tomo_polysplat.cli.options import (
+    add_scan_options,
+    add_spectrum_options,
+    scan_from,
+    spectrum_from,
+    tube_of_scanner,
+)
 from tomo_polysplat.files import require_replaceable, require_writable
 
 NAME = "import"
@@ -86,8 +92,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _stated(arguments: argparse.Namespace) -> dict[str, Any]:
     """What stands for `scanner` of `load_scan`, the options of the tube among it, which then are none of a spectrum."""
-    from tomo_polysplat.scan.io import is_of_scanner
-
     names = {**LENGTHS, **TEXTS, "pixel": "pixel", "offset": "offset", "white": "white"}
     stated = {key: getattr(arguments, name) for name, key in names.items()}
     if arguments.parallel:
@@ -98,13 +102,7 @@ def _stated(arguments: argparse.Namespace) -> dict[str, Any]:
         except ValueError:
             stated["degrees"] = arguments.angles
     stated = {key: value for key, value in stated.items() if value is not None}
-    if arguments.spectrum is None and (arguments.kvp is None or is_of_scanner(arguments.scan, stated)):
-        # What is told of the tube comes over the scanner's own text; a detector that nobody names is a flat panel.
-        tube = {"kvp": arguments.kvp, "anode": arguments.anode, "filter": " + ".join(arguments.filter)}
-        tube["detector"] = arguments.detector
-        stated |= {key: value for key, value in tube.items() if value not in (None, "")}
-        arguments.kvp, arguments.anode, arguments.filter, arguments.detector = None, None, [], None
-    return stated
+    return stated | tube_of_scanner(arguments, stated)
 
 
 def _views(text: str | None) -> Any:

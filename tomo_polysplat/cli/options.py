@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     *("INTERRUPTED", "add_scan_options", "add_solver_options", "add_spectrum_options"),
-    *("filter_map_from", "scan_from", "spectrum_from"),
+    *("filter_map_from", "scan_from", "spectrum_from", "tube_of_scanner"),
 ]
 
 
@@ -64,6 +65,21 @@ def spectrum_from(arguments: argparse.Namespace) -> Spectrum | None:
     named = arguments.detector
     detector = None if named is None else Detector.named(named, "--detector")
     return Spectrum.from_tube(arguments.kvp, arguments.anode or "W", filters, detector)
+
+
+def tube_of_scanner(arguments: argparse.Namespace, stated: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of the tube as what `scanner` of ``load_scan`` says of it, and no more of a spectrum; else nothing.
+
+    They come over a scanner's text: a voltage goes with its filter, and a detector that nobody names is a flat panel.
+    """
+    from tomo_polysplat.scan.io import is_of_scanner
+
+    if arguments.spectrum is not None or not is_of_scanner(arguments.scan, stated):
+        return {}
+    tube = {"kvp": arguments.kvp, "anode": arguments.anode, "filter": " + ".join(arguments.filter)}
+    tube["detector"] = arguments.detector
+    arguments.kvp, arguments.anode, arguments.filter, arguments.detector = None, None, [], None
+    return {key: value for key, value in tube.items() if value not in (None, "")}
 
 
 def filter_map_from(text: str) -> tuple[str, Any]:

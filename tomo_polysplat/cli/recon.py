@@ -19,6 +19,7 @@ from tomo_polysplat.cli.options import (
     filter_map_from,
     scan_from,
     spectrum_from,
+    tube_of_scanner,
 )
 from tomo_polysplat.cli.recon_outputs import require_outputs, require_room_of, write_outputs
 from tomo_polysplat.fit.stopping import StopReason
@@ -174,7 +175,8 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
     settings = _settings(arguments)
     # Refused before the scan is read.
     make_settings(arguments.quality, settings)
-    scan = scan_from(arguments, spectrum_from(arguments))
+    tube = tube_of_scanner(arguments, {})
+    scan = scan_from(arguments, spectrum_from(arguments), scanner=tube or None)
     spectrum = _spectrum_of(scan, arguments)
     scan, to_find = _filtered(scan, arguments.filter_map)
     require_room_of(arguments, scan)

@@ -206,8 +206,11 @@ def _geometries(seen: Geometry, told: Acquisition, options: ReadOptions) -> dict
 def _spectrum(told: Acquisition, options: ReadOptions) -> tuple[Acquisition, Spectrum | None]:
     """The caller's spectrum, else that of the tube and its filters behind a usual detector."""
     tube = told.tube
-    if options.spectrum is not None or told.unit == "pixel":
+    if options.spectrum is not None:
         return told, options.spectrum
+    if told.unit == "pixel":
+        lacking = "lengths are in pixels, with which a spectrum cannot be used; give pixel="
+        return told if tube.kvp is None else told.saying(lacking), None
     if tube.kvp is None:
         # A parallel beam is mostly a synchrotron's, of one energy.
         if _geometry(told).beam == "cone":
