@@ -269,4 +269,6 @@ def test_a_voltage_without_the_size_of_a_pixel_is_said_to_be_of_no_use(path):
             del file[f"entry0000/instrument/detector/{axis}_pixel_size"]
     scan = tps.load_scan(path, scanner={"kvp": 90, "filter": "Al 1mm"})
     assert scan.unit == "pixel" and scan.spectrum is None
-    assert any("a spectrum cannot be used; give pixel=" in guess for guess in scan.notes["scanner"]["guessed"])
+    assert any(
+        "a spectrum cannot be used; give pixel=" in guess for guess in scan.notes["scanner"]["guessed"]
+    )

@@ -279,6 +279,15 @@ class OppositeRays:
     def _step(self) -> float:
         return float(np.median(self._gaps))
 
+    @property
+    def _still(self) -> float:
+        return 2 * _STILL / self.values.shape[1]
+
+    @property
+    def one_pair(self) -> bool:
+        """Whether the last view of half a turn in a parallel beam is the first one from behind, and all there is."""
+        return not self.slope and bool(abs(np.ptp(self.azimuth) - np.pi) < self._still)
+
     @cached_property
     def seam(self) -> bool:
         """Whether these are views of half a turn in a parallel beam that begins where `azimuth` does."""
