@@ -112,9 +112,13 @@ def _detector(entry: h5py.Group) -> str | None:
 
 def _has_keys(instrument: h5py.Group | None, name: str) -> bool:
     group = None if instrument is None else _group(instrument, name)
-    if group is None or (name != _USUAL and "data" not in group):
+    if group is None:
         return False
-    return any(key in group and find_array(group, key) is not None for key in _KEYS)
+    if name == _USUAL:
+        return any(find_array(group, key) is not None for key in _KEYS)
+    with suppress(ValueError):  # what is no detector may hold anything
+        return "data" in group and any(find_array(group, key) is not None for key in _KEYS)
+    return False
 
 
 def _has_pictures(entry: h5py.Group, detector: str) -> bool:
