@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.scan.data_exchange import input_kind, pictures_of
+from tomo_polysplat.scan.data_exchange_pictures import input_kind, pictures_of
 from tomo_polysplat.scan.hdf5 import find_array, find_group, opened, read_numbers, read_text, text_attribute
 from tomo_polysplat.scan.readers.acquisition import Acquisition
 from tomo_polysplat.scan.readers.frames import ArrayFrames, Frames, Hdf5Frames

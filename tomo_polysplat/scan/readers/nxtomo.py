@@ -105,9 +105,15 @@ def _is_entry(group: h5py.Group) -> bool:
 def _detector(entry: h5py.Group) -> str | None:
     """Path of the detector with keys, which mostly is called so; of several the first whose pictures are there."""
     inside = _group(entry, "instrument")
-    names = [] if inside is None else [_USUAL, *list(inside)[:_MOST_ENTRIES]]
-    keyed = [f"instrument/{name}" for name in names if name in names[1:] and _has_keys(inside, name)]
+    names = _names(inside)
+    usual_first = [_USUAL] * (_USUAL in names) + [name for name in names if name != _USUAL]
+    keyed = [f"instrument/{name}" for name in usual_first if _has_keys(inside, name)]
     return next((path for path in keyed if _has_pictures(entry, path)), keyed[0] if keyed else None)
+
+
+def _names(group: h5py.Group | None) -> list[str]:
+    """What is in it; h5py has bytes for names that are no texts."""
+    return [name for name in list(group or ())[:_MOST_ENTRIES] if isinstance(name, str)]
 
 
 def _has_keys(instrument: h5py.Group | None, name: str) -> bool:
@@ -165,9 +171,8 @@ def _degrees(entry: h5py.Group, detector: str, pictures: int) -> np.ndarray:
     """Of all pictures."""
     names = ["sample/rotation_angle", "data/rotation_angle"]
     name = detector.rpartition("/")[2]
-    plotted = _group(entry, name)
-    inside = [] if plotted is None else sorted(plotted, key=lambda name: name.endswith(_ASKED_FOR))
-    names += [f"{name}/{axis}" for axis in inside[:_MOST_ENTRIES] if _ANGLE.search(axis)]
+    inside = sorted(_names(_group(entry, name)), key=lambda axis: axis.endswith(_ASKED_FOR))
+    names += [f"{name}/{axis}" for axis in inside if _ANGLE.search(axis)]
     name = next((name for name in names if _is_there(entry, name, pictures)), names[0])
     angles = read_numbers(entry, name, (pictures,)).astype(np.float64)
     dataset = find_array(entry, name)
