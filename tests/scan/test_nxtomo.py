@@ -272,3 +272,29 @@ def test_a_voltage_without_the_size_of_a_pixel_is_said_to_be_of_no_use(path):
     assert any(
         "a spectrum cannot be used; give pixel=" in guess for guess in scan.notes["scanner"]["guessed"]
     )
+
+
+def test_lengths_that_are_texts_are_not_known(path):
+    """Diamond's older files link what nobody measured to the name of the scan."""
+    expected = tps.load_scan(path)
+    with h5py.File(path, "a") as file:
+        entry = file["entry0000"]
+        entry["scan_identifier"] = np.array([b"b2017b74"])
+        for name in ("x_pixel_size", "y_pixel_size", "distance"):
+            del entry[f"instrument/detector/{name}"]
+            entry[f"instrument/detector/{name}"] = h5py.SoftLink("/entry0000/scan_identifier")
+    scan = tps.load_scan(path)
+    assert scan.unit == "pixel" and scan.proj_geom["type"] == "parallel3d_vec"
+    np.testing.assert_array_equal(scan.projections, expected.projections)
+
+
+def test_an_nxtomo_in_an_entry_comes_before_the_entry_s_own_detectors(path):
+    """As in files that Diamond's program made for tomography: both have keys, one has the angles of each picture."""
+    expected = tps.load_scan(path)
+    with h5py.File(path, "a") as file:
+        file.create_group("entry1")
+        file.move("entry0000", "entry1/tomo_entry")
+        other = file.create_group("entry1/instrument/camera")
+        other["data"], other["image_key"] = np.ones((5, 3, 3)), np.zeros(5, int)
+    scan = tps.load_scan(path)
+    np.testing.assert_array_equal(scan.projections, expected.projections)

@@ -23,7 +23,6 @@ import numpy as np
 from tomo_polysplat.checks import fail
 from tomo_polysplat.scan.hdf5 import (
     find_array,
-    find_group,
     opened,
     read_attribute,
     read_numbers,
@@ -33,18 +32,20 @@ from tomo_polysplat.scan.hdf5 import (
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup
 from tomo_polysplat.scan.readers.files_of_scans import hdf5_files, the_one
 from tomo_polysplat.scan.readers.frames import Hdf5Frames
+from tomo_polysplat.scan.readers.nxtomo_entry import KEYS, detector_of, entry_of, group_of, names_in
 from tomo_polysplat.scan.readers.stated import require_known, stated_over
 
 if TYPE_CHECKING:
     import h5py
 
+    from tomo_polysplat.scan.hdf5_array import StoredArray
+
 __all__ = ["KIND", "read", "recognises"]
 
 KIND = "NXtomo (HDF5)"
 _SUFFIXES = (".nx", ".nxs", ".h5", ".hdf5", ".hdf")
-_KEYS = ("image_key", "image_key_control")
 _PROJECTION, _FLAT, _DARK = 0, 1, 2
-_USUAL, _SOURCE = "detector", "instrument/source/distance"
+_SOURCE = "instrument/source/distance"
 # Names of turns among Diamond's motors, and how those of positions that were asked for end.
 _ANGLE, _ASKED_FOR = re.compile("rot|theta|angle"), "_set"
 _MM = {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3, "micron": 1e-3, "meter": 1e3, "metre": 1e3}
@@ -53,7 +54,6 @@ _FAR = 200.0
 # Degrees by which a turn may miss half of one; the ESRF's vertical where no gravity is told.
 _HALF_TURN, _UP = 1.0, (0.0, 0.0, 1.0)
 _MOST_TURNS = 20
-_MOST_ENTRIES = 100
 
 
 def recognises(path: Path) -> bool:
@@ -65,83 +65,24 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     """See `tomo_polysplat.load_scan`; `stated` has its ``scanner``."""
     file_of_scan = the_one(_files(path))
     with opened(file_of_scan) as file:
-        entry = _entry(file)
+        entry = entry_of(file)
         assert entry is not None  # it was recognised by that
         told = _told(file_of_scan, entry)
     return stated_over(told, require_known(stated, "scanner"), file_of_scan.parent)
 
 
 def _files(path: Path) -> list[Path]:
-    return hdf5_files(path, _SUFFIXES, lambda file: _entry(file) is not None)
-
-
-def _entry(file: h5py.File) -> h5py.Group | None:
-    """The first group with pictures and their keys, which may be one of an entry's."""
-    for name in list(file)[:_MOST_ENTRIES]:
-        entry = _group(file, name)
-        if entry is None:
-            continue
-        if _is_entry(entry):
-            return entry
-        for inner in list(entry)[:_MOST_ENTRIES]:
-            group = _group(entry, inner)
-            with suppress(ValueError):  # what is no entry may hold anything
-                if group is not None and _is_entry(group):
-                    return group
-    return None
-
-
-def _group(parent: h5py.Group, name: str) -> h5py.Group | None:
-    try:
-        return find_group(parent, name)
-    except ValueError:
-        return None
-
-
-def _is_entry(group: h5py.Group) -> bool:
-    return _detector(group) is not None
-
-
-def _detector(entry: h5py.Group) -> str | None:
-    """Path of the detector with keys, which mostly is called so; of several the first whose pictures are there."""
-    inside = _group(entry, "instrument")
-    names = _names(inside)
-    usual_first = [_USUAL] * (_USUAL in names) + [name for name in names if name != _USUAL]
-    keyed = [f"instrument/{name}" for name in usual_first if _has_keys(inside, name)]
-    return next((path for path in keyed if _has_pictures(entry, path)), keyed[0] if keyed else None)
-
-
-def _names(group: h5py.Group | None) -> list[str]:
-    """What is in it; h5py has bytes for names that are no texts."""
-    return [name for name in list(group or ())[:_MOST_ENTRIES] if isinstance(name, str)]
-
-
-def _has_keys(instrument: h5py.Group | None, name: str) -> bool:
-    group = None if instrument is None else _group(instrument, name)
-    if group is None:
-        return False
-    if name == _USUAL:
-        return any(find_array(group, key) is not None for key in _KEYS)
-    with suppress(ValueError):  # what is no detector may hold anything
-        return "data" in group and any(find_array(group, key) is not None for key in _KEYS)
-    return False
-
-
-def _has_pictures(entry: h5py.Group, detector: str) -> bool:
-    with suppress(ValueError):  # a link may lead to a file that is not there
-        data = find_array(entry, f"{detector}/data")
-        return data is not None and data.ndim == 3
-    return False
+    return hdf5_files(path, _SUFFIXES, lambda file: entry_of(file) is not None)
 
 
 def _told(path: Path, entry: h5py.Group) -> Acquisition:
-    detector = _detector(entry)
+    detector = detector_of(entry)
     assert detector is not None  # it was recognised by that
     data = find_array(entry, f"{detector}/data")
     if data is None or data.ndim != 3:
         got = "none" if data is None else f"shape {data.shape}"
         raise fail("path", f"pictures in {detector}/data, (pictures, rows, columns)", got)
-    name = next(key for key in _KEYS if find_array(entry, f"{detector}/{key}") is not None)
+    name = next(key for key in KEYS if find_array(entry, f"{detector}/{key}") is not None)
     keys = read_numbers(entry, f"{detector}/{name}", (len(data),))
     angles = _degrees(entry, detector, len(data))
     frames = {key: np.flatnonzero(keys == key) for key in (_PROJECTION, _FLAT, _DARK)}
@@ -171,7 +112,7 @@ def _degrees(entry: h5py.Group, detector: str, pictures: int) -> np.ndarray:
     """Of all pictures."""
     names = ["sample/rotation_angle", "data/rotation_angle"]
     name = detector.rpartition("/")[2]
-    inside = sorted(_names(_group(entry, name)), key=lambda axis: axis.endswith(_ASKED_FOR))
+    inside = sorted(names_in(group_of(entry, name)), key=lambda axis: axis.endswith(_ASKED_FOR))
     names += [f"{name}/{axis}" for axis in inside if _ANGLE.search(axis)]
     name = next((name for name in names if _is_there(entry, name, pictures)), names[0])
     angles = read_numbers(entry, name, (pictures,)).astype(np.float64)
@@ -206,7 +147,7 @@ def _flips(entry: h5py.Group, detector: str) -> tuple[bool, bool]:
     """Whether left and right, and top and bottom, are exchanged."""
     old = (_first(entry, f"{detector}/{axis}_flipped") for axis in "xy")
     sideways, upside_down = (bool(value) for value in old)
-    turns = _group(entry, f"{detector}/transformations")
+    turns = group_of(entry, f"{detector}/transformations")
     if turns is None:
         return sideways, upside_down
     about = {name: _axis(turns, name) for name in list(turns)[:_MOST_TURNS]}
@@ -269,7 +210,7 @@ def _setup(
 
 def _length(entry: h5py.Group, name: str) -> float | None:
     """In mm; positions before the object are negative in some files."""
-    value, dataset = _first(entry, name), find_array(entry, name)
+    value, dataset = _first(entry, name), _scalar(entry, name)
     if value is None or dataset is None:
         return None
     unit = (text_attribute(dataset, "units") or "m").lower()
@@ -278,9 +219,17 @@ def _length(entry: h5py.Group, name: str) -> float | None:
     return abs(value) * _MM[unit]
 
 
+def _scalar(entry: h5py.Group, name: str) -> StoredArray | None:
+    """What may be there; where nothing was known, some programs link to a text."""
+    with suppress(ValueError):
+        dataset = find_array(entry, name)
+        return None if dataset is None or not dataset.size else dataset
+    return None
+
+
 def _first(entry: h5py.Group, name: str) -> float | None:
-    dataset = find_array(entry, name)
-    if dataset is None or not dataset.size:
+    dataset = _scalar(entry, name)
+    if dataset is None:
         return None
     value = float(np.asarray(dataset[()]).reshape(-1)[0])
     return value if np.isfinite(value) else None
