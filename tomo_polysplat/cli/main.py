@@ -34,6 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     level = logging.DEBUG if arguments.debug else logging.INFO if arguments.verbose else logging.WARNING
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(_VisibleFormatter("%(levelname)s: %(message)s"))
+    handler.addFilter(_FirstTime())
     logging.basicConfig(level=level, handlers=[handler])
     if arguments.debug:
         return arguments.run(arguments)
@@ -85,6 +86,22 @@ class _VisibleFormatter(logging.Formatter):
         own = record.message.split("\n") if getattr(record, "has_own_lines", False) else [record.message]
         record.message = "\n".join(map(visible, own))
         return super().formatMessage(record)
+
+
+class _FirstTime:
+    """No warning twice: a scan is looked at several times, as start volumes are made anew."""
+
+    def __init__(self) -> None:
+        self._told: set[str] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether it is to be shown."""
+        if record.levelno != logging.WARNING:
+            return True
+        message = record.getMessage()
+        first = message not in self._told
+        self._told.add(message)
+        return first
 
 
 def _complain(message: str, code: int) -> int:
