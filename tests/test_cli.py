@@ -297,7 +297,9 @@ def test_doctor_knows_the_wrong_dxchange(monkeypatch):
 
 
 def record_of(message, level=logging.WARNING, **extra):
-    return logging.makeLogRecord({"msg": message, "levelno": level, "levelname": "WARNING"} | extra)
+    return logging.makeLogRecord(
+        {"name": "test", "msg": message, "levelno": level, "levelname": "WARNING"} | extra
+    )
 
 
 def test_a_warning_is_shown_once_and_lines_are_its_own_alone():
@@ -306,9 +308,14 @@ def test_a_warning_is_shown_once_and_lines_are_its_own_alone():
     shown = [first.filter(record_of(text)) for text in ("a", "a", "b", "a")]
     assert shown == [True, False, True, False]
     assert all(first.filter(record_of("a", logging.INFO)) for _ in range(2))
-    formatter = _VisibleFormatter("%(levelname)s: %(message)s")
+    formatter = _VisibleFormatter(("--sod", "--angles"))
     assert formatter.format(record_of("of a file\nERROR: forged")) == "WARNING: of a file ERROR: forged"
     assert (
         formatter.format(record_of("ours\n  - \x1b[31m", has_own_lines=True))
         == "WARNING: ours\n  - \\x1b[31m"
     )
+    hint = record_of(
+        "give source_object=, arc= or roll= or white=, not filter='Al 1mm'",
+        name="tomo_polysplat.scan.readers.rtk",
+    )
+    assert formatter.format(hint) == "WARNING: give --sod, --angles or roll= or white=, not filter='Al 1mm'"

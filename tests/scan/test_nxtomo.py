@@ -22,7 +22,7 @@ def test_the_file_alone_and_what_it_tells(path):
     assert told["exposure_s"] == "0.1" and told["keys"] == {"title": "a marker"} and scan.name == "marker"
     assert scan.views == 48 and scan.spectrum is None
     (guess,) = told["guessed"]
-    assert "the voltage of the tube is not known" in guess and "--kvp" in guess
+    assert "the voltage of the tube is not known" in guess and "give kvp=" in guess
     part = tps.load_scan(path, views=(1, 9, 2), rows=(4, 20), columns=(3, 33))
     np.testing.assert_array_equal(part.projections, scan.projections[33 - 20 : 33 - 4, 1:9:2, 3:33])
 

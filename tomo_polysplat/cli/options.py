@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+import re
+from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,12 +15,33 @@ if TYPE_CHECKING:
 
 __all__ = [
     *("INTERRUPTED", "add_scan_options", "add_solver_options", "add_spectrum_options"),
-    *("filter_map_from", "scan_from", "spectrum_from", "tube_of_scanner"),
+    *("filter_map_from", "in_options", "scan_from", "spectrum_from", "tube_of_scanner"),
 ]
 
 
+# Options that stand for names of `scanner` in `load_scan`, where they differ.
+_OPTIONS = {
+    "source_object": "sod",
+    "source_detector": "sdd",
+    "flats": "flat",
+    "darks": "dark",
+    "arc": "angles",
+    "degrees": "angles",
+}
+_SAME = ("pixel", "offset", "white", "kvp", "filter", "detector", "unit", "input")
+_NAMED = re.compile(rf"\b({'|'.join((*_OPTIONS, *_SAME))})=(?![\w'\"{{(])")
 # Exit status after Ctrl-C, as shells use it.
 INTERRUPTED = 130
+
+
+def in_options(text: str, known: Container[str]) -> str:
+    """A hint of Python's, such as ``give source_object=``, as one types it: ``give --sod``, if that is known."""
+
+    def typed(name: re.Match[str]) -> str:
+        option = f"--{_OPTIONS.get(name[1], name[1])}"
+        return option if option in known else name[0]
+
+    return _NAMED.sub(typed, text)
 
 
 def add_spectrum_options(parser: argparse.ArgumentParser) -> None:

@@ -22,6 +22,11 @@ class Parser(argparse.ArgumentParser):
         super().__init__(*args, **({"allow_abbrev": False} | options))
         self._examples = tuple(examples)
 
+    @property
+    def options(self) -> tuple[str, ...]:
+        """All that begins with hyphens, as it is typed."""
+        return tuple(self._option_string_actions)
+
     def format_help(self) -> str:
         """All options, and the examples."""
         lines = "".join(f"  {one}\n" for one in self._examples)

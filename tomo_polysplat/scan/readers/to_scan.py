@@ -216,7 +216,7 @@ def _spectrum(told: Acquisition, options: ReadOptions) -> tuple[Acquisition, Spe
         if _geometry(told).beam == "cone":
             told = told.saying(
                 "the voltage of the tube is not known, and without a spectrum metal is not corrected; give kvp=, "
-                "filter= and detector= (--kvp, --filter, --detector)"
+                "filter= and detector="
             )
         return told, None
     if tube.filters is None:
