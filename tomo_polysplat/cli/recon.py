@@ -19,6 +19,7 @@ from tomo_polysplat.cli.options import (
     filter_map_from,
     scan_from,
     spectrum_from,
+    tube_of_scanner,
 )
 from tomo_polysplat.cli.recon_outputs import require_outputs, require_room_of, write_outputs
 from tomo_polysplat.fit.stopping import StopReason
@@ -32,6 +33,10 @@ if TYPE_CHECKING:
 
 NAME = "recon"
 HELP = "reconstruct a scan into a volume of attenuation in 1/length"
+EXAMPLES = (
+    "tomo-polysplat recon scan.h5 -o volume.tif",
+    "tomo-polysplat recon scan.h5 -o result.h5 --report page.html --kvp 90 --filter 'Al 1mm' --detector csi:0.6mm",
+)
 
 
 # Long: a line or two for every option, in the order of the help.
@@ -170,7 +175,8 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
     settings = _settings(arguments)
     # Refused before the scan is read.
     make_settings(arguments.quality, settings)
-    scan = scan_from(arguments, spectrum_from(arguments))
+    tube = tube_of_scanner(arguments, {})
+    scan = scan_from(arguments, spectrum_from(arguments), scanner=tube or None)
     spectrum = _spectrum_of(scan, arguments)
     scan, to_find = _filtered(scan, arguments.filter_map)
     require_room_of(arguments, scan)
