@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from tomo_polysplat.compiled import njit
 
 __all__ = ["fill_rows_in_place"]
 

@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from tomo_polysplat.compiled import njit
 
 __all__ = ["paint_labels", "trace_rays", "trace_view"]
 

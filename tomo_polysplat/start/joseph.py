@@ -7,8 +7,8 @@ plane of voxel centres along the axis nearest to the ray and interpolate bilinea
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from tomo_polysplat.compiled import njit
 from tomo_polysplat.parallel import cpu_threads, run_tasks, split_range
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 

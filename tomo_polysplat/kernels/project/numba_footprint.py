@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from tomo_polysplat.compiled import njit
 from tomo_polysplat.kernels.project.numba_group import GROUP, SIZE, matrix_of, put, put_group, three
 
 __all__ = ["MOMENTS", "RECORD", "pull_back", "pull_back_view", "ray_frame", "rows_of", "set_up"]

@@ -6,8 +6,7 @@ the compiler that what it reads and what it writes do not overlap.
 
 from __future__ import annotations
 
-from numba import njit
-
+from tomo_polysplat.compiled import njit
 from tomo_polysplat.kernels.gaussian_maths import whitening
 
 __all__ = ["GROUP", "SIZE", "add_where", "matrix_of", "put", "put_group", "three"]

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from tomo_polysplat.compiled import njit
 from tomo_polysplat.kernels.gaussian_maths import FAST, gaussian, whitening_adjoint
 from tomo_polysplat.kernels.numba_lanes import LANES, add_product, add_scaled, lane_sums
 from tomo_polysplat.kernels.project.numba_footprint import (
