@@ -21,7 +21,7 @@ def fill_rows_in_place(rows: np.ndarray, valid: np.ndarray) -> None:
     """
     count, columns = rows.shape
     for row in range(count):
-        before = -1
+        before = np.intp(-1)  # a plain -1 is a type of its own, for which `_bridge` would be compiled as well
         column = 0
         while column < columns:
             if valid[row, column]:

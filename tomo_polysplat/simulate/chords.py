@@ -84,7 +84,7 @@ def _trace(origin, direction, bounds, chosen, count, solids, covered, local, out
     round_axes, centres, to_local, radii, material, density = solids
     squared = direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2
     length = math.sqrt(squared)
-    taken = 0
+    taken = np.intp(0)  # a plain 0 is a type of its own, for which `_cover` would be compiled as well
     for c in range(count - 1, -1, -1):
         j = chosen[c]
         x = origin[0] - centres[j, 0]
@@ -189,7 +189,7 @@ def trace_view(cone, beam, corner, u, v, solids, out):
             count = _choose(planes, solids[1], solids[3], chosen)
             for i in range(top, bottom if count else top):
                 for j in range(left, right):
-                    _pixel(corner, u, v, i, j, pixel)
+                    _pixel(corner, u, v, float(i), float(j), pixel)
                     if cone:
                         for k in range(3):
                             ray[k] = pixel[k] - beam[k]

@@ -54,7 +54,7 @@ def sample_voxels(corners, size, closed, counts, parts, values, marks, mean, mar
     near = np.empty(len(round_axes), np.int64)
     point = np.empty(3)
     for voxel in range(len(corners)):
-        count = 0
+        count = np.intp(0)  # a plain 0 is a type of its own, for which `_label` would be compiled as well
         for part in range(len(round_axes) - 1, -1, -1):
             apart = False
             for a in range(3):

@@ -97,8 +97,8 @@ def _trace(vectors, cone, size, voxels, shape, projections, adjoint, axis, first
                 a, b = (m + 1) % 3, (m + 2) % 3
                 slope_a, slope_b = ray[a] / ray[m], ray[b] / ray[m]
                 start_a, start_b = pixel[a] - pixel[m] * slope_a, pixel[b] - pixel[m] * slope_b
-                low, high = _clip(start_a, slope_a, 0, counts[a], 0.0, counts[m] - 1.0)
-                low, high = _clip(start_b, slope_b, 0, counts[b], low, high)
+                low, high = _clip(start_a, slope_a, 0.0, float(counts[a]), 0.0, counts[m] - 1.0)
+                low, high = _clip(start_b, slope_b, 0.0, float(counts[b]), low, high)
                 if cone and ray[m] > 0:
                     low = max(low, source[m])
                 elif cone:
@@ -150,7 +150,7 @@ def _within(k0, k1, axis, first, last, m, a, start_a, slope_a, start_b, slope_b)
     if m == axis:
         return max(k0, first), min(k1, last)
     start, slope = (start_a, slope_a) if a == axis else (start_b, slope_b)
-    low, high = _clip(start, slope, first, last, k0, k1)
+    low, high = _clip(start, slope, float(first), float(last), float(k0), float(k1))
     # Outwards, as rounding must not decide.
     return max(k0, int(np.floor(low))), min(k1, int(np.ceil(high)) + 1)
 
