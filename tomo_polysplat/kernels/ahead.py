@@ -84,9 +84,9 @@ def compile_voxelise() -> None:
     from tomo_polysplat.kernels.voxelise.box import VoxelBox
 
     box = VoxelBox(np.full(3, -0.5), np.ones(3), (2, 2, 2))
-    scene = [np.full(shape, 0.5, np.float32) for shape in ((1, 3), (1, 3), (1, 4), (1, 1))]
-    volume = numba_kernel.forward(*scene, box, 3.0)
-    numba_kernel.backward(*scene, box, 3.0, volume)
+    position, scale, rotation, weight = (np.ones((1, n), np.float32) for n in (3, 3, 4, 1))
+    volume = numba_kernel.forward(position, scale, rotation, weight, box, 3.0)
+    numba_kernel.backward(position, scale, rotation, weight, box, 3.0, volume)
 
 
 def _started(device: str) -> subprocess.Popen[bytes] | None:
