@@ -171,6 +171,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _reconstruct(arguments: argparse.Namespace) -> int:
+    from tomo_polysplat.kernels.ahead import compiled_ahead
+
     require_outputs(arguments)
     settings = _settings(arguments)
     # Refused before the scan is read.
@@ -183,7 +185,7 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
     print(visible(scan))
     # What a run will take is said without -v as well.
     logging.getLogger("tomo_polysplat.plan.expected").setLevel(logging.INFO)
-    with progress_reports(None) as progress:
+    with progress_reports(None) as progress, compiled_ahead(arguments.device):
         result = tomo_polysplat.reconstruct(
             replace(scan, spectrum=spectrum),
             materials=arguments.materials,

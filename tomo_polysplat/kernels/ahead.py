@@ -63,19 +63,16 @@ def wait_for_kernels() -> None:
     helper, _helper = _helper, None
     if helper is None:
         return
-    if _compiled_project():
+    try:
+        if not _compiled_project():
+            _tell(helper, STOP)
+            compile_voxelise()
         begun = time.perf_counter()
-    else:
-        with suppress(OSError):
-            assert helper.stdin is not None
-            helper.stdin.write(STOP)
-            helper.stdin.flush()
-        compile_voxelise()
-        begun = time.perf_counter()
-    with suppress(subprocess.TimeoutExpired):
-        helper.wait(_LONGEST)
-    _end(helper)
-    add_waited(time.perf_counter() - begun)
+        with suppress(subprocess.TimeoutExpired):
+            helper.wait(_LONGEST)
+        add_waited(time.perf_counter() - begun)
+    finally:
+        _end(helper)
 
 
 def compile_voxelise() -> None:
@@ -103,14 +100,17 @@ def _started(device: str) -> subprocess.Popen[bytes] | None:
     )
 
 
-def _end(helper: subprocess.Popen[bytes] | None) -> None:
-    if helper is None:
-        return
-    helper.kill()
-    helper.wait()
+def _tell(helper: subprocess.Popen[bytes], word: bytes) -> None:
     assert helper.stdin is not None
-    with suppress(OSError):
-        helper.stdin.close()
+    with suppress(OSError):  # it has ended
+        helper.stdin.write(word)
+        helper.stdin.flush()
+
+
+def _end(helper: subprocess.Popen[bytes] | None) -> None:
+    if helper is not None:
+        helper.kill()
+        helper.communicate()
 
 
 def _compiled_project() -> bool:

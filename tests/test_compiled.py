@@ -1,0 +1,44 @@
+"""The garbage collector rests while numba compiles, and only then."""
+
+import gc
+
+import numba
+import numpy as np
+import pytest
+from numba.extending import overload
+
+from tomo_polysplat.compiled import njit
+
+seen = []
+
+
+def watched(value):
+    pass
+
+
+@overload(watched)
+def _typed(value):
+    # Runs in the compiler, amid the function that calls it.
+    seen.append(gc.isenabled())
+    if not isinstance(value, numba.types.Float):
+        raise numba.errors.TypingError("not a number")
+    return lambda value: value
+
+
+# Of another type each, as numba asks once a type.
+@pytest.mark.parametrize("enabled, value", [(True, 2.0), (False, np.float32(2))])
+def test_the_collector_rests_while_a_function_is_compiled(enabled, value):
+    seen.clear()
+    (gc.enable if enabled else gc.disable)()
+    try:
+        assert njit(lambda value: watched(value))(value) == 2.0
+        assert gc.isenabled() is enabled
+    finally:
+        gc.enable()
+    assert seen and not any(seen)
+
+
+def test_it_works_on_after_a_function_that_cannot_be_compiled():
+    with pytest.raises(numba.errors.TypingError):
+        njit(lambda value: watched(value))("text")
+    assert gc.isenabled()
