@@ -29,6 +29,7 @@ from tomo_polysplat.settings import make_settings
 
 if TYPE_CHECKING:
     from tomo_polysplat.physics.spectrum import Spectrum
+    from tomo_polysplat.result.result import Result
     from tomo_polysplat.scan.scan import Scan
 
 NAME = "recon"
@@ -171,8 +172,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _reconstruct(arguments: argparse.Namespace) -> int:
-    from tomo_polysplat.kernels.ahead import compiled_ahead
-
     require_outputs(arguments)
     settings = _settings(arguments)
     # Refused before the scan is read.
@@ -185,9 +184,26 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
     print(visible(scan))
     # What a run will take is said without -v as well.
     logging.getLogger("tomo_polysplat.plan.expected").setLevel(logging.INFO)
+    result = _fitted(replace(scan, spectrum=spectrum), to_find, settings, arguments)
+    with postponed_interrupts("writing") as interruption:
+        if arguments.energy is not None:
+            result = replace(result, energy_kev=arguments.energy)
+        result.provenance = {"scan": scan.name} | result.provenance
+        print(visible(result))
+        write_outputs(result, scan, arguments)
+    stop = result.plan.get("stop")
+    interrupted = stop is not None and stop.value == StopReason.INTERRUPTED
+    return INTERRUPTED if interruption.asked or interrupted else 0
+
+
+def _fitted(
+    scan: Scan, to_find: str | None, settings: dict[str, Any], arguments: argparse.Namespace
+) -> Result:
+    from tomo_polysplat.kernels.ahead import compiled_ahead
+
     with progress_reports(None) as progress, compiled_ahead(arguments.device):
-        result = tomo_polysplat.reconstruct(
-            replace(scan, spectrum=spectrum),
+        return tomo_polysplat.reconstruct(
+            scan,
             materials=arguments.materials,
             quality=arguments.quality,
             time_budget=arguments.time_budget,
@@ -204,15 +220,6 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
             checkpoint=arguments.checkpoint,
             resume=arguments.resume,
         )
-    with postponed_interrupts("writing") as interruption:
-        if arguments.energy is not None:
-            result = replace(result, energy_kev=arguments.energy)
-        result.provenance = {"scan": scan.name} | result.provenance
-        print(visible(result))
-        write_outputs(result, scan, arguments)
-    stop = result.plan.get("stop")
-    interrupted = stop is not None and stop.value == StopReason.INTERRUPTED
-    return INTERRUPTED if interruption.asked or interrupted else 0
 
 
 def _follow(device: str) -> int:
