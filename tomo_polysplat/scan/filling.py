@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tomo_polysplat.compiled import njit
+from tomo_polysplat.compiled import called, njit
 
 __all__ = ["fill_rows_in_place"]
 
@@ -35,7 +35,7 @@ def fill_rows_in_place(rows: np.ndarray, valid: np.ndarray) -> None:
             column = after
 
 
-@njit(nogil=True, cache=True)
+@called()
 def _bridge(values, before, after):
     """Fill the values between two valid columns; -1 or the row's length stand for a missing one."""
     if before < 0 and after == len(values):

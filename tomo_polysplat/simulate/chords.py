@@ -11,14 +11,14 @@ import math
 
 import numpy as np
 
-from tomo_polysplat.compiled import njit
+from tomo_polysplat.compiled import called, njit
 
 __all__ = ["paint_labels", "trace_rays", "trace_view"]
 
 TILE = 16
 
 
-@njit(nogil=True, cache=True)
+@called()
 def _interval(round_axes, origin, direction):
     """Where a ray in the frame of a unit solid is inside it: (first, last); last <= first means nowhere.
 
@@ -52,7 +52,7 @@ def _interval(round_axes, origin, direction):
     return first, last
 
 
-@njit(nogil=True, cache=True)
+@called()
 def _cover(covered, count, first, last):
     """Add an interval to a sorted list of disjoint ones; returns how much was there, and the new count."""
     before = 0
@@ -78,7 +78,7 @@ def _cover(covered, count, first, last):
 
 
 # Compiled: it takes arrays and numbers, and no objects that hold them.
-@njit(nogil=True, cache=True)
+@called()
 def _trace(origin, direction, bounds, chosen, count, solids, covered, local, out):
     """Add one ray's areal densities to ``out``; ``chosen[:count]`` are the solids it may meet, in order."""
     round_axes, centres, to_local, radii, material, density = solids
@@ -121,13 +121,13 @@ def trace_rays(origins, directions, bounds, solids, out):
         _trace(origins[i], directions[i], bounds, chosen, total, solids, covered, local, out[i])
 
 
-@njit(nogil=True, cache=True)
+@called()
 def _pixel(corner, u, v, row, column, out):
     for k in range(3):
         out[k] = corner[k] + row * v[k] + column * u[k]
 
 
-@njit(nogil=True, cache=True)
+@called()
 def _plane(start, stop, inner, beam, cone, out):
     """Plane (normal, offset) through two neighbouring corners of a tile and their rays, facing outwards."""
     ray = out[:3]  # the ray, then the normal, in the same place
@@ -141,7 +141,7 @@ def _plane(start, stop, inner, beam, cone, out):
     out[3] = out[0] * start[0] + out[1] * start[1] + out[2] * start[2]
 
 
-@njit(nogil=True, cache=True)
+@called()
 def _choose(planes, centres, radii, chosen):
     """Solids not wholly outside any of the four planes about a bundle of rays: their indices and number."""
     count = 0

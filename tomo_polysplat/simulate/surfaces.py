@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tomo_polysplat.compiled import njit
+from tomo_polysplat.compiled import called, njit
 
 __all__ = ["crossed_voxels", "sample_voxels"]
 
@@ -77,7 +77,7 @@ def sample_voxels(corners, size, closed, counts, parts, values, marks, mean, mar
         marked[voxel] = found
 
 
-@njit(nogil=True, cache=True)
+@called()
 def _place(index, count, closed):
     """Where a sample point lies along an axis of a voxel, 0 to 1."""
     if closed and count > 1:
@@ -85,7 +85,7 @@ def _place(index, count, closed):
     return (index + 0.5) / count
 
 
-@njit(nogil=True, cache=True)
+@called()
 def _label(point, near, count, parts):
     """Label of the first of the parts ``near`` that holds a point, or 0."""
     round_axes, centre, to_local, _ = parts

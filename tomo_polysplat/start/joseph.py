@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tomo_polysplat.compiled import njit
+from tomo_polysplat.compiled import called, njit
 from tomo_polysplat.parallel import cpu_threads, run_tasks, split_range
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 
@@ -134,7 +134,7 @@ def _trace(vectors, cone, size, voxels, shape, projections, adjoint, axis, first
                     projections[view, i, j] = total * length
 
 
-@njit(nogil=True, cache=True)
+@called()
 def _longest(ray):  # type: ignore[no-untyped-def]
     """The axis along which a ray goes farthest, the first of equals."""
     x, y, z = abs(ray[0]), abs(ray[1]), abs(ray[2])
@@ -144,7 +144,7 @@ def _longest(ray):  # type: ignore[no-untyped-def]
 
 
 # Compiled: it takes arrays and numbers, and no objects that hold them.
-@njit(nogil=True, cache=True)
+@called()
 def _within(k0, k1, axis, first, last, m, a, start_a, slope_a, start_b, slope_b):  # type: ignore[no-untyped-def]
     """The steps k0..k1 that may touch a slab; some beside it may be among them."""
     if m == axis:
@@ -155,7 +155,7 @@ def _within(k0, k1, axis, first, last, m, a, start_a, slope_a, start_b, slope_b)
     return max(k0, int(np.floor(low))), min(k1, int(np.ceil(high)) + 1)
 
 
-@njit(nogil=True, cache=True)
+@called()
 def _clip(start, slope, first, last, low, high):  # type: ignore[no-untyped-def]
     """The part of ``low .. high`` where ``start + k slope`` is within a voxel of those from first to last."""
     if abs(slope) < 1e-12:

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from tomo_polysplat.compiled import njit
+from tomo_polysplat.compiled import called, njit
 from tomo_polysplat.kernels.project.numba_group import GROUP, SIZE, gaussian_of, put_group
 
 __all__ = ["MOMENTS", "RECORD", "pull_back", "pull_back_view", "ray_frame", "rows_of", "set_up"]
@@ -22,7 +22,7 @@ MOMENTS = 11  # sums over a footprint, in the order read by pull_back
 _OUT = RECORD + 5  # what _footprints tells of a Gaussian
 
 # Inlined by LLVM: where Numba does it, compiling takes a third longer.
-_step = njit(error_model="numpy", fastmath={"contract"}, forceinline=True)
+_step = called(error_model="numpy", fastmath={"contract"}, forceinline=True)
 
 
 @_step

@@ -6,7 +6,7 @@ the compiler that what it reads and what it writes do not overlap.
 
 from __future__ import annotations
 
-from tomo_polysplat.compiled import njit
+from tomo_polysplat.compiled import called, njit
 from tomo_polysplat.kernels.gaussian_maths import whitening
 
 __all__ = ["GROUP", "SIZE", "add_where", "gaussian_of", "moments_of", "put_group"]
@@ -16,7 +16,7 @@ SIZE = 15  # numbers of a Gaussian that `put_group` puts down
 
 # Inlined by LLVM: where Numba does it, compiling takes a third longer. Numba compiles such a function anew for every
 # plain number among its arguments, and so each of them takes a Gaussian whole.
-_step = njit(error_model="numpy", fastmath={"contract"}, forceinline=True)
+_step = called(error_model="numpy", fastmath={"contract"}, forceinline=True)
 
 
 @njit(inline="always")
@@ -46,7 +46,7 @@ def add_where(seen, grads, k, point, rows):
             grads[(3 + 3 * i + j) * GROUP + k] += rows[i][j] if seen else 0.0
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@called(error_model="numpy")
 def put_group(first, some, position, scale, rotation, white, group):
     """Position, scale and whitening matrix of the Gaussians from ``first`` on, for `gaussian_of`."""
     for k in range(some):
