@@ -1,12 +1,15 @@
-"""The garbage collector rests while numba compiles, and only then."""
+"""The garbage collector rests while numba compiles, and only then; and all of ours is compiled so."""
 
 import gc
+import re
+from pathlib import Path
 
 import numba
 import numpy as np
 import pytest
 from numba.extending import overload
 
+from tomo_polysplat import compiled
 from tomo_polysplat.compiled import njit
 
 seen = []
@@ -42,3 +45,12 @@ def test_it_works_on_after_a_function_that_cannot_be_compiled():
     with pytest.raises(numba.errors.TypingError):
         njit(lambda value: watched(value))("text")
     assert gc.isenabled()
+
+
+def test_every_function_of_the_package_is_compiled_so():
+    package = Path(compiled.__file__).parent
+    others = [path for path in package.rglob("*.py") if path.name != "compiled.py"]
+    assert len(others) > 100
+    wrong = re.compile(r"^import numba$|from numba import.*jit", re.M)
+    told = [path.name for path in others if wrong.search(path.read_text(encoding="utf-8"))]
+    assert not told, f"import njit or called from tomo_polysplat.compiled in {told}"
