@@ -85,13 +85,13 @@ def test_a_device_that_is_none_is_told_of_by_the_reconstruction_alone(cold):
 
 HELPER = """
 import time
-from tomo_polysplat.kernels import ahead_helper
+from tomo_polysplat.kernels import ahead_helper, select
 
 def compile_the_first(*_):
     print("begun", flush=True)
     time.sleep({seconds})
 
-ahead_helper.availability, ahead_helper.compile_voxelise = compile_the_first, lambda: print("volume")
+select.availability, ahead_helper.compile_voxelise = compile_the_first, lambda: print("volume")
 ahead_helper.main()
 """
 

@@ -7,7 +7,6 @@ import sys
 import threading
 
 from tomo_polysplat.kernels.ahead import STOP, compile_voxelise
-from tomo_polysplat.kernels.select import availability
 
 __all__ = ["main"]
 
@@ -23,6 +22,9 @@ def main() -> None:
         os._exit(1)
 
     threading.Thread(target=listen, daemon=True).start()
+    # Imported last: to load torch takes seconds, in which the other process may end.
+    from tomo_polysplat.kernels.select import availability
+
     availability("numba", "cpu")
     if not stopped.is_set():
         compile_voxelise()
