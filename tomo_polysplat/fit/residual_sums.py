@@ -60,6 +60,7 @@ class ResidualSums:
         return replace(self, total=total, by_depth=by_depth, residual=self.residual - drift[self.view])
 
 
+# One walk over the views fills all sums: cut up, each part would be handed all of them.
 @torch.no_grad()
 def residual_sums(
     gaussians: Gaussians,
