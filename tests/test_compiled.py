@@ -23,9 +23,17 @@ def watched(value):
 def _typed(value):
     # Runs in the compiler, amid the function that calls it.
     seen.append(gc.isenabled())
-    if not isinstance(value, numba.types.Float):
+    if not isinstance(value, numba.types.Number):
         raise numba.errors.TypingError("not a number")
     return lambda value: value
+
+
+def function_of(module):
+    def function(value):
+        return watched(value)
+
+    function.__module__ = module
+    return njit(function)
 
 
 # Of another type each, as numba asks once a type.
@@ -34,16 +42,22 @@ def test_the_collector_rests_while_a_function_is_compiled(enabled, value):
     seen.clear()
     (gc.enable if enabled else gc.disable)()
     try:
-        assert njit(lambda value: watched(value))(value) == 2.0
+        assert function_of("tomo_polysplat.some")(value) == 2.0
         assert gc.isenabled() is enabled
     finally:
         gc.enable()
     assert seen and not any(seen)
 
 
+def test_it_works_on_for_functions_of_others():
+    seen.clear()
+    assert function_of("tomo_polysplatter")(2) == 2
+    assert seen and all(seen) and gc.isenabled()
+
+
 def test_it_works_on_after_a_function_that_cannot_be_compiled():
     with pytest.raises(numba.errors.TypingError):
-        njit(lambda value: watched(value))("text")
+        function_of("tomo_polysplat.some")("text")
     assert gc.isenabled()
 
 

@@ -22,22 +22,29 @@ called = functools.partial(njit, no_cpython_wrapper=True)
 
 
 class _Rest(event.Listener):
-    """The collector rests while the outermost function is compiled; numba compiles in one thread at a time."""
+    """The collector rests while the outermost function is compiled, if it is ours; numba compiles one at a time."""
 
     def __init__(self) -> None:
         self.depth, self.collects = 0, False
 
-    def on_start(self, _: Any) -> None:
+    def on_start(self, begun: Any) -> None:
         self.depth += 1
         if self.depth == 1:
-            self.collects = gc.isenabled()
-            gc.disable()
+            self.collects = gc.isenabled() and _is_ours(begun.data["dispatcher"])
+            if self.collects:
+                gc.disable()
 
     def on_end(self, _: Any) -> None:
         # Registered amid a compilation, it sees an end without a beginning.
         self.depth = max(self.depth - 1, 0)
         if self.depth == 0 and self.collects:
+            self.collects = False
             gc.enable()
+
+
+def _is_ours(dispatcher: Any) -> bool:
+    """Whether the function is the package's own: others' are compiled as they would be without it."""
+    return str(dispatcher.py_func.__module__).startswith(f"{__package__}.")
 
 
 event.register("numba:compile", _Rest())
