@@ -45,7 +45,7 @@ def nuisances_table() -> str:
         numbers = ", ".join(
             f"`{name}` ({one.unit}, from {one.start:g})" for name, one in kind.parameters.items()
         )
-        gate = " ".join((inspect.getdoc(kind.gate) or "").split()).replace("`", "")
+        gate = " ".join((inspect.getdoc(kind.gate) or "").split("\n\n")[0].split()).replace("`", "")
         place, found = kind.place.value, kind.found_by.value
         rows.append(
             f"| `{kind.name}` | {place} | {numbers} | {found} | {kind.gauge} | {gate} | {kind.cost} |"

@@ -1,6 +1,7 @@
 """The command line: what it writes, what it says, and how it refuses."""
 
 import json
+import logging
 import sys
 from dataclasses import replace
 from types import ModuleType
@@ -11,6 +12,7 @@ import pytest
 
 import tomo_polysplat
 from tomo_polysplat.cli import main
+from tomo_polysplat.cli.main import _FirstTime, _VisibleFormatter
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.result.result import Result
@@ -292,3 +294,28 @@ def test_doctor_knows_the_wrong_dxchange(monkeypatch):
     assert "unrelated" in doctor._dxchange() and "conda-forge" in doctor._dxchange()
     monkeypatch.setitem(sys.modules, "dxchange", real)
     assert "unrelated" not in doctor._dxchange()
+
+
+def record_of(message, level=logging.WARNING, **extra):
+    return logging.makeLogRecord(
+        {"name": "test", "msg": message, "levelno": level, "levelname": "WARNING"} | extra
+    )
+
+
+def test_a_warning_is_shown_once_and_lines_are_its_own_alone():
+    """Start volumes are made several times in a run, and each says what is wrong with the scan."""
+    first = _FirstTime()
+    shown = [first.filter(record_of(text)) for text in ("a", "a", "b", "a")]
+    assert shown == [True, False, True, False]
+    assert all(first.filter(record_of("a", logging.INFO)) for _ in range(2))
+    formatter = _VisibleFormatter(("--sod", "--angles"))
+    assert formatter.format(record_of("of a file\nERROR: forged")) == "WARNING: of a file ERROR: forged"
+    assert (
+        formatter.format(record_of("ours\n  - \x1b[31m", has_own_lines=True))
+        == "WARNING: ours\n  - \\x1b[31m"
+    )
+    hint = record_of(
+        "give source_object=, arc= or roll= or white=, not filter='Al 1mm'",
+        name="tomo_polysplat.scan.readers.rtk",
+    )
+    assert formatter.format(hint) == "WARNING: give --sod, --angles or roll= or white=, not filter='Al 1mm'"

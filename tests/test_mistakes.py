@@ -108,7 +108,7 @@ COMMANDS = {
     "import hdf5 -o z.h5": "which is none of these; name the file of the scan: angles.h5, other.h5",
     "import hdf5/other.h5 -o z.h5": "no such dataset in hdf5/other.h5; NXtomo and CIL's NeXus are read too",
     "import hdf5/angles.h5 -o z.h5": "endpoint=False), or `tomo-polysplat import SCAN --angles 180`",
-    "import hdf5/angles.h5 -o z.h5 --sod 2 --sdd 5": "expected arc, degrees and pixel alone, for a Data Exchange file",
+    "import hdf5/angles.h5 -o z.h5 --sod 2 --sdd 5 --white 9": "expected the distances and the pixel of the scanner",
     "view none.h5 --no-browser": "RESULT: expected an existing file, got none.h5",
     "view slice.tif --no-browser": "look at a TIFF in ImageJ",
     "view scan.h5 --port 99999": "--port: expected a number from 0 to 65535, got 99999",

@@ -17,6 +17,7 @@ BASICS = (
     "checks",
     "parallel",
     "versions",
+    "compiled",
     "files",
     "folders",
     "file_lock",

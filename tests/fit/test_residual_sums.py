@@ -105,3 +105,14 @@ def test_weights_follow_what_is_taken_out_at_the_same_address(device):
     assert some.totals is totals and torch.equal(totals, fresh.totals)
     assert some.typical_weight == fresh.typical_weight != before[1]
     assert not torch.equal(totals, before[0])
+
+
+def test_some_views_are_summed_as_if_there_were_no_others():
+    values, some = measured(), np.array([1, 4, 5, 11, 17])
+    whole = residual_sums(None, FlatScene(), rays(values), Settings())
+    part = residual_sums(None, FlatScene(), rays(values), Settings(), some)
+    assert np.array_equal(part.views, some) and np.array_equal(part.count, whole.count[:, some])
+    assert np.array_equal(part.by_depth, whole.by_depth[:, some])
+    theirs = np.isin(whole.view, some)
+    assert np.array_equal(part.residual, whole.residual[theirs])
+    assert np.array_equal(some[part.view], whole.view[theirs])

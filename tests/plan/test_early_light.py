@@ -77,7 +77,7 @@ def test_what_changes_hardly_anything_is_left_to_the_run(monkeypatch):
         "drift": LightTold(True, drift, "", evidence | {"better": 0.05, "error": 0.01}),
         "gains": LightTold(True, 1e-3 * gains, "", evidence),
     }
-    monkeypatch.setattr("tomo_polysplat.plan.early_light.light_told", lambda *parts: dict(told))
+    monkeypatch.setattr("tomo_polysplat.plan.early_light.ask_light", lambda *parts: dict(told))
     problem, facts = looked_at(scan().projections)
     assert problem.taken.drift.any() and not problem.taken.gains.any() and "gains" not in facts
     # Who asks for it has it at once.

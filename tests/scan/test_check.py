@@ -7,13 +7,18 @@ from functools import cache
 import numpy as np
 import pytest
 
+import tomo_polysplat as tps
 from tomo_polysplat.cli import main
+from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.scan.check import check_scan
 from tomo_polysplat.scan.dropouts import dropped_rays
 from tomo_polysplat.scan.io import save_scan
 from tomo_polysplat.scan.probes.measured import Measured
 from tomo_polysplat.scan.probes.rays import bad_rays
-from tomo_polysplat.simulate.scenes import simulate_scan
+from tomo_polysplat.simulate.phantom import Part, Phantom
+from tomo_polysplat.simulate.scanner import Scanner
+from tomo_polysplat.simulate.scenes import scan_phantom, simulate_scan
+from tomo_polysplat.simulate.shapes import cylinder
 
 SCANS = [
     ("teeth", "cone"),
@@ -253,3 +258,15 @@ def test_zeros_within_the_object_are_dropouts_and_air_is_not():
     row[7] = np.nan
     assert np.flatnonzero(dropped_rays(row)).tolist() == [15, 16]
     assert not dropped_rays(np.zeros((3, 2))).any() and not dropped_rays(np.ones((3, 9))).any()
+
+
+@pytest.mark.parametrize("pins, many", [(3, 20), (4, 24), (5, 24)])
+def test_an_object_that_looks_the_same_from_several_sides_is_in_order(pins, many):
+    """A view is like those a third of a turn away, but its neighbours are nearer than the views beyond them."""
+    around = 2 * np.pi * np.arange(pins) / pins
+    parts = [Part(cylinder((0.6 * np.cos(a), 0.6 * np.sin(a), 0), 0.12, 0.6), "pmma", 1.19) for a in around]
+    geometry = tps.parallel_geometry(pixel=0.05, degrees=np.arange(many) * (360 / many), detector=(16, 40))
+    spectrum = Spectrum.from_tube(90, filters={"Al": 0.1})
+    symmetric = scan_phantom(Phantom(parts), *geometry, spectrum, Scanner(1e5, seed=0))
+    assert "order of views" not in defects(symmetric)
+    assert "order of views" in defects(views(symmetric, np.random.default_rng(0).permutation(many)))

@@ -7,6 +7,7 @@ from folders import marked, require_the_same_volume
 
 import tomo_polysplat as tps
 from tomo_polysplat.scan.geometry import from_astra
+from tomo_polysplat.simulate.folders.scene import SETTINGS
 from tomo_polysplat.simulate.folders.write import write_folder
 
 DATA = "entry1/tomo_entry/data/data"
@@ -64,3 +65,44 @@ def test_what_it_cannot_mean_is_refused(path):
         file[DATA].attrs["dim1"] = "channel"
     with pytest.raises(ValueError, match="the axes angle, vertical, horizontal, got vertical, channel"):
         tps.load_scan(path)
+
+
+@pytest.mark.parametrize("beam", ["cone", "parallel"])
+def test_a_file_of_before_version_20_11(tmp_path, beam):
+    """Distances, pixel and angles alone; nothing tells that those are radians but that they make one turn."""
+    own = marked(beam)
+    rows, views, columns = own.projections.shape
+    at = SETTINGS
+    about = {
+        "data_type": "AcquisitionData",
+        "geom_type": beam,
+        "dim0": "vertical",
+        "dim1": "angle",
+        "dim2": "horizontal",
+    }
+    pixel = at.pixel if beam == "cone" else at.pixel * at.source_object / at.source_detector
+    about |= {"pixel_size_h": pixel, "pixel_size_v": pixel}
+    if beam == "cone":
+        about |= {
+            "dist_source_center": at.source_object,
+            "dist_center_detector": at.source_detector - at.source_object,
+        }
+    with h5py.File(tmp_path / "old.nxs", "w") as file:
+        file[DATA] = own.projections
+        for name, value in about.items():
+            file[DATA].attrs[name] = value
+        degrees = np.arange(views) * (360.0 / views)
+        file["entry1/tomo_entry/data/rotation_angle"] = np.deg2rad(degrees).astype(np.float32)
+    stated = {"offset": (at.columns_off * pixel, 0.0), "unit": "mm", "input": "attenuation"}
+    scan = tps.load_scan(tmp_path / "old.nxs", scanner=stated)
+    require_the_same_volume(scan, own)
+    assert any("taken for radians" in guess for guess in scan.notes["scanner"]["guessed"])
+    with h5py.File(tmp_path / "old.nxs", "r+") as file:
+        file["entry1/tomo_entry/data/rotation_angle"][...] = degrees
+    other = tps.load_scan(tmp_path / "old.nxs", scanner=stated)
+    np.testing.assert_allclose(other.proj_geom["Vectors"], scan.proj_geom["Vectors"], atol=1e-4)
+    with h5py.File(tmp_path / "old.nxs", "r+") as file:
+        file[DATA].attrs["geom_type"] = "cone"
+        file[DATA].attrs.pop("dist_source_center", None)
+    with pytest.raises(ValueError, match="dist_source_center and dist_center_detector"):
+        tps.load_scan(tmp_path / "old.nxs")

@@ -40,7 +40,7 @@ def test_angles_that_a_file_lacks_are_stated_as_those_of_pictures_are(exchange):
     scan = load_scan(path, scanner={"arc": 180, "pixel": 0.5})
     np.testing.assert_allclose(scan.proj_geom["Vectors"], expected.proj_geom["Vectors"])
     assert scan.unit == "mm"
-    with pytest.raises(ValueError, match=r"scanner: expected arc.*got source_object; a cone beam"):
-        load_scan(path, scanner={"arc": 180, "source_object": 10.0})
+    with pytest.raises(ValueError, match="source_object, source_detector: expected both distances"):
+        load_scan(path, scanner={"arc": 180, "pixel": 0.5, "source_object": 10.0})
     with pytest.raises(ValueError, match=r"one angle for each of 91 pictures, got 2; name the angles"):
         load_scan(path, scanner={"degrees": [0, 90]})

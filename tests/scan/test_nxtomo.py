@@ -22,7 +22,7 @@ def test_the_file_alone_and_what_it_tells(path):
     assert told["exposure_s"] == "0.1" and told["keys"] == {"title": "a marker"} and scan.name == "marker"
     assert scan.views == 48 and scan.spectrum is None
     (guess,) = told["guessed"]
-    assert "the voltage of the tube is not known" in guess and "--kvp" in guess
+    assert "the voltage of the tube is not known" in guess and "give kvp=" in guess
     part = tps.load_scan(path, views=(1, 9, 2), rows=(4, 20), columns=(3, 33))
     np.testing.assert_array_equal(part.projections, scan.projections[33 - 20 : 33 - 4, 1:9:2, 3:33])
 
@@ -201,3 +201,100 @@ def test_pictures_of_files_that_are_not_there(path):
     (path.parent / "raw_1.h5").unlink()
     with pytest.raises(ValueError, match="raw_1.h5, which is not there"):
         tps.load_scan(path)
+
+
+def as_diamond_writes(path):
+    """The same scan with a detector of another name, and angles beside its pictures, in other files below."""
+    below = path.parent / "raw"
+    below.mkdir()
+    with h5py.File(path, "r") as file:
+        detector = file["entry0000/instrument/detector"]
+        keys, pictures = detector["image_key"][()], detector["data"][()]
+        degrees = file["entry0000/sample/rotation_angle"][()]
+    for name, inside, values in (("camera", "detector/detector", pictures), ("panda", "theta", degrees)):
+        with h5py.File(below / f"{name}.h5", "w") as file:
+            file[f"entry/{inside}"] = values
+    path.unlink()
+    links = {
+        # Of another detector only the keys are there.
+        "instrument/EtherCAT/data": h5py.ExternalLink("raw/gone.h5", "/entry/detector/detector"),
+        "instrument/imaging/data": h5py.ExternalLink("raw/camera.h5", "/entry/detector/detector"),
+        "imaging/data": h5py.ExternalLink("raw/camera.h5", "/entry/detector/detector"),
+        "imaging/gts_theta_value": h5py.ExternalLink("raw/panda.h5", "/entry/theta"),
+        "imaging/gts_theta_value_set": h5py.ExternalLink("raw/gone.h5", "/entry/theta"),
+    }
+    with h5py.File(path.with_suffix(".nxs"), "w") as file:
+        entry = file.create_group("entry")
+        for name, link in links.items():
+            entry.require_group(name.rpartition("/")[0])
+            entry[name] = link
+        for name in ("EtherCAT", "imaging"):
+            entry[f"instrument/{name}/image_key"] = keys
+    return path.with_suffix(".nxs")
+
+
+def test_a_detector_and_angles_of_other_names(path):
+    """As Diamond's program for data acquisition writes them: lengths and the axis are told by the user."""
+    expected = tps.load_scan(path)
+    scan = tps.load_scan(
+        as_diamond_writes(path),
+        scanner={"source_object": 100, "source_detector": 250, "pixel": 1.6, "offset": (2.4, 0)},
+    )
+    np.testing.assert_array_equal(scan.projections, expected.projections)
+    np.testing.assert_allclose(scan.proj_geom["Vectors"], expected.proj_geom["Vectors"], atol=1e-9)
+
+
+def test_pictures_that_are_in_a_file_that_is_not_there(path):
+    moved = as_diamond_writes(path)
+    (path.parent / "raw" / "camera.h5").unlink()
+    with pytest.raises(ValueError, match="put gone.h5|put camera.h5"):
+        tps.load_scan(moved)
+
+
+def test_angles_beside_the_data_of_a_usual_file(path):
+    expected = tps.load_scan(path)
+    with h5py.File(path, "a") as file:
+        file["entry0000"].move("sample/rotation_angle", "data/rotation_angle")
+    scan = tps.load_scan(path)
+    np.testing.assert_array_equal(scan.proj_geom["Vectors"], expected.proj_geom["Vectors"])
+    with h5py.File(path, "a") as file:
+        del file["entry0000/data/rotation_angle"]
+    with pytest.raises(ValueError, match="sample/rotation_angle"):
+        tps.load_scan(path)
+
+
+def test_a_voltage_without_the_size_of_a_pixel_is_said_to_be_of_no_use(path):
+    with h5py.File(path, "a") as file:
+        for axis in "xy":
+            del file[f"entry0000/instrument/detector/{axis}_pixel_size"]
+    scan = tps.load_scan(path, scanner={"kvp": 90, "filter": "Al 1mm"})
+    assert scan.unit == "pixel" and scan.spectrum is None
+    assert any(
+        "a spectrum cannot be used; give pixel=" in guess for guess in scan.notes["scanner"]["guessed"]
+    )
+
+
+def test_lengths_that_are_texts_are_not_known(path):
+    """Diamond's older files link what nobody measured to the name of the scan."""
+    expected = tps.load_scan(path)
+    with h5py.File(path, "a") as file:
+        entry = file["entry0000"]
+        entry["scan_identifier"] = np.array([b"b2017b74"])
+        for name in ("x_pixel_size", "y_pixel_size", "distance"):
+            del entry[f"instrument/detector/{name}"]
+            entry[f"instrument/detector/{name}"] = h5py.SoftLink("/entry0000/scan_identifier")
+    scan = tps.load_scan(path)
+    assert scan.unit == "pixel" and scan.proj_geom["type"] == "parallel3d_vec"
+    np.testing.assert_array_equal(scan.projections, expected.projections)
+
+
+def test_an_nxtomo_in_an_entry_comes_before_the_entry_s_own_detectors(path):
+    """As in files that Diamond's program made for tomography: both have keys, one has the angles of each picture."""
+    expected = tps.load_scan(path)
+    with h5py.File(path, "a") as file:
+        file.create_group("entry1")
+        file.move("entry0000", "entry1/tomo_entry")
+        other = file.create_group("entry1/instrument/camera")
+        other["data"], other["image_key"] = np.ones((5, 3, 3)), np.zeros(5, int)
+    scan = tps.load_scan(path)
+    np.testing.assert_array_equal(scan.projections, expected.projections)

@@ -342,3 +342,44 @@ def test_what_tifffile_logs_of_its_own_is_still_there_for_others(bare, caplog):
     with pytest.raises(Exception, match=r"."), tifffile.TiffFile(torn) as file:
         file.pages[0].asarray()
     assert caplog.records
+
+
+def test_the_only_folder_of_pictures_is_that_of_the_object(folder, tmp_path):
+    """Flats and darks beside it; a folder of slices is another thing, and of two others none is taken."""
+    (tmp_path / "tiffs").mkdir()
+    for file in folder.glob("*.tif"):
+        place = tmp_path / "tiffs" if file.name.startswith("proj") else tmp_path
+        (place / file.name).symlink_to(file)
+    expected = tps.load_scan(folder, scanner=STATED)
+    np.testing.assert_array_equal(tps.load_scan(tmp_path, scanner=STATED).projections, expected.projections)
+    for name in ("slices", "other"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "a.tif").symlink_to(next(folder.glob("proj*.tif")))
+        if name == "slices":
+            assert tps.load_scan(tmp_path, scanner=STATED).views == expected.views
+    with pytest.raises(ValueError, match=r"pictures of an object .*--projections"):
+        tps.load_scan(tmp_path, scanner=STATED)
+
+
+def test_line_integrals_are_not_taken_for_counts(folder, tmp_path):
+    """Decimals around 0 in the air: refused until somebody says what they are; transmission has air near 1."""
+    lines = tps.load_scan(folder).projections.transpose(1, 0, 2)[:, ::-1]
+    np.save(tmp_path / "proj.npy", lines)
+    with pytest.raises(ValueError, match=r"input: expected counts.*% of them 0 or less.*attenuation"):
+        tps.load_scan(tmp_path, scanner=STATED)
+    with pytest.raises(ValueError, match="of them 0 or less"):
+        tps.load_scan(tmp_path, scanner=STATED, input="counts")
+    scan = tps.load_scan(tmp_path, scanner=STATED, input="attenuation")
+    np.testing.assert_array_equal(scan.projections, lines[:, ::-1].transpose(1, 0, 2))
+    np.save(tmp_path / "proj.npy", np.exp(-lines))
+    assert tps.load_scan(tmp_path, scanner=STATED).valid is None
+
+
+def test_several_guesses_are_one_warning_of_a_line_each(bare, caplog):
+    for file in bare.glob("flat*"):
+        file.unlink()
+    stated = {key: value for key, value in STATED.items() if key != "offset"}
+    with caplog.at_level(logging.WARNING):
+        guessed = tps.load_scan(bare, scanner=stated).notes["scanner"]["guessed"]
+    (record,) = (one for one in caplog.records if "guessed" in one.message)
+    assert len(guessed) > 2 and record.message.split("\n  - ")[1:] == guessed

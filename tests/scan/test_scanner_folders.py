@@ -9,6 +9,7 @@ import SimpleITK
 from folders import error_db, marked, require_the_same_volume
 
 import tomo_polysplat as tps
+from tomo_polysplat.cli import main
 from tomo_polysplat.simulate.folders.__main__ import main as write_one
 from tomo_polysplat.simulate.folders.scene import MARKER
 from tomo_polysplat.simulate.folders.write import KINDS, scan_for, write_folder
@@ -97,6 +98,19 @@ def test_two_commands_from_a_folder_to_a_file(tmp_path):
     assert "wrote scan.h5" in done.stdout and "flat panel" in done.stderr
     scan = tps.load_scan(tmp_path / "scan.h5")
     assert scan.views == 24 and scan.unit == "mm" and scan.notes["scanner"]["keys"] == {"operator": "nobody"}
+
+
+def test_the_tube_s_options_mean_the_same_as_in_the_scanner_s_text(tmp_path, capsys):
+    """A flat panel, unless another detector is named; the log's own filter where only a voltage is told."""
+    own = write_folder("skyscan", tmp_path / "folder", marked())
+    energies = []
+    for options in (["--kvp", "90"], ["--kvp", "90", "--filter", "Al 1mm"], ["--detector", "counting"]):
+        output = str(tmp_path / "scan.npz")
+        assert main(["import", str(tmp_path / "folder"), "-o", output, "--overwrite", *options]) == 0
+        energies.append(tps.load_scan(output).spectrum.effective_energy)
+    assert energies[:2] == pytest.approx([own.spectrum.effective_energy] * 2)
+    assert energies[2] < own.spectrum.effective_energy - 2
+    assert "No filter was given" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -48,7 +48,7 @@ def run_demo(
     dict
         ``methods``: a list of ``name``, ``seconds``, ``psnr``, ``psnr_all``, ``ssim``, ``rmse``; and ``scan``,
         ``environment``. Seconds hold everything from the projections to the volume; for the first splat that
-        includes compiling the kernels, when no earlier run has left them on disk.
+        includes compiling the kernels, or waiting for them, when no earlier run has left them on disk.
     """
     progress(0.0, "simulating a scan")
     scan = simulate_scan("pins", _SIZE, _VIEWS, seed=seed)

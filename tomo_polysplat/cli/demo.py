@@ -30,6 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run it and print its table."""
     from tomo_polysplat.bench.demo import FILES, run_demo
+    from tomo_polysplat.kernels.ahead import compiled_ahead
     from tomo_polysplat.report.table import as_text
 
     folder = Path(arguments.output)
@@ -39,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
             folder / name, arguments.overwrite, "pass --overwrite or another folder", "--output"
         )
     require_writable(folder, "--output")
-    with progress_reports(None) as progress:
+    with progress_reports(None) as progress, compiled_ahead(arguments.device):
         outcome = run_demo(folder, device=arguments.device, seed=arguments.seed, progress=progress)
     print(as_text(outcome["methods"], "cm"))
     for name in FILES:

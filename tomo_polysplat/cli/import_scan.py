@@ -7,11 +7,22 @@ from pathlib import Path
 from typing import Any
 
 from tomo_polysplat.checks import fail, visible
-from tomo_polysplat.cli.options import add_scan_options, add_spectrum_options, scan_from, spectrum_from
+from tomo_polysplat.cli.options import (
+    add_scan_options,
+    add_spectrum_options,
+    scan_from,
+    spectrum_from,
+    tube_of_scanner,
+)
 from tomo_polysplat.files import require_replaceable, require_writable
 
 NAME = "import"
 HELP = "read a scanner's folder (or file) and write it as one scan with geometry and spectrum"
+EXAMPLES = (
+    "tomo-polysplat import my_scan/ -o scan.h5",
+    "tomo-polysplat import tiffs/ --sod 200 --sdd 500 --pixel 0.1 --angles 360 --kvp 90 --filter 'Al 1mm' -o scan.h5",
+    "tomo-polysplat import aps.h5 --sod 200 --sdd 500 --pixel 0.1 -o scan.h5",
+)
 # Option and the name of `scanner` in `load_scan` that it stands for.
 LENGTHS = {"sod": "source_object", "sdd": "source_detector"}
 # What one, two and three whole numbers look like.
@@ -44,9 +55,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--angles", metavar="FILE|ARC", help="text file with a view's degrees a line, or the whole arc (360)"
     )
     group.add_argument("--parallel", action="store_true", help="a parallel beam: no distances")
-    group.add_argument("--projections", metavar="PATTERN", help="their TIFFs, such as 'proj_*.tif'")
-    group.add_argument("--flat", metavar="PATTERN", help="TIFFs without the object, such as 'flat_*.tif'")
-    group.add_argument("--dark", metavar="PATTERN", help="TIFFs without light")
+    group.add_argument(
+        "--projections",
+        metavar="PATTERN",
+        help="of the object's pictures, such as 'proj_*.tif'",
+    )
+    group.add_argument("--flat", metavar="PATTERN", help="pictures without the object")
+    group.add_argument("--dark", metavar="PATTERN", help="pictures without light")
     group.add_argument("--white", type=float, metavar="COUNTS", help="the open beam where there are no flats")
     add_spectrum_options(parser)
 
@@ -76,21 +91,18 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _stated(arguments: argparse.Namespace) -> dict[str, Any]:
+    """What stands for `scanner` of `load_scan`, the options of the tube among it, which then are none of a spectrum."""
     names = {**LENGTHS, **TEXTS, "pixel": "pixel", "offset": "offset", "white": "white"}
     stated = {key: getattr(arguments, name) for name, key in names.items()}
     if arguments.parallel:
         stated["beam"] = "parallel"
-    if arguments.kvp is None and arguments.spectrum is None:
-        # The voltage stands in the scanner's own text, what else there is of the tube comes over it.
-        stated |= {"anode": arguments.anode, "filter": " + ".join(arguments.filter) or None}
-        stated["detector"] = arguments.detector
-        arguments.anode, arguments.filter, arguments.detector = None, [], None
     if arguments.angles is not None:
         try:
             stated["arc"] = float(arguments.angles)
         except ValueError:
             stated["degrees"] = arguments.angles
-    return {key: value for key, value in stated.items() if value is not None}
+    stated = {key: value for key, value in stated.items() if value is not None}
+    return stated | tube_of_scanner(arguments, stated)
 
 
 def _views(text: str | None) -> Any:

@@ -5,18 +5,20 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 
 import tomo_polysplat
 from tomo_polysplat.checks import visible
 from tomo_polysplat.cli import bench, check, completion, demo, doctor, import_scan, recon, simulate, view
-from tomo_polysplat.cli.options import INTERRUPTED
+from tomo_polysplat.cli.options import INTERRUPTED, in_options
 from tomo_polysplat.cli.parser import Parser
 
 __all__ = ["main"]
 
 COMMANDS = (demo, import_scan, recon, view, simulate, check, bench, doctor, completion)
 BAD_INPUT, FAILED = 2, 1
+# Who says what a scanner's folder does not tell, and by which name of `scanner` a user can.
+_OF_FOLDERS = "tomo_polysplat.scan.readers"
 # What a shell tells of a command whose reader went away.
 UNREAD = 128 + 13
 
@@ -33,7 +35,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = build_parser().parse_all(argv)
     level = logging.DEBUG if arguments.debug else logging.INFO if arguments.verbose else logging.WARNING
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(_VisibleFormatter("%(levelname)s: %(message)s"))
+    handler.setFormatter(_VisibleFormatter(arguments.parser.options))
+    handler.addFilter(_FirstTime())
     logging.basicConfig(level=level, handlers=[handler])
     if arguments.debug:
         return arguments.run(arguments)
@@ -71,6 +74,7 @@ def build_parser() -> Parser:
             parents=[common],
             help=module.HELP,
             description=f"{module.HELP[0].upper()}{module.HELP[1:]}.",
+            examples=getattr(module, "EXAMPLES", ()),
         )
         module.add_arguments(child)
         child.set_defaults(run=module.run, parser=child, whole=parser)
@@ -78,11 +82,37 @@ def build_parser() -> Parser:
 
 
 class _VisibleFormatter(logging.Formatter):
-    """One line a message, even if texts from files have control characters in them."""
+    """One line a message, or those of its own, even if texts from files have control characters in them.
+
+    What `options` has of the names in hints is told as one types it.
+    """
+
+    def __init__(self, options: Container[str]) -> None:
+        super().__init__("%(levelname)s: %(message)s")
+        self._options = options
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  # its name in the library
-        record.message = visible(record.message)
+        own = record.message.split("\n") if getattr(record, "has_own_lines", False) else [record.message]
+        record.message = "\n".join(map(visible, own))
+        if record.name.startswith(_OF_FOLDERS):
+            record.message = in_options(record.message, self._options)
         return super().formatMessage(record)
+
+
+class _FirstTime:
+    """No warning twice: a scan is looked at several times, as start volumes are made anew."""
+
+    def __init__(self) -> None:
+        self._told: set[str] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether it is to be shown."""
+        if record.levelno != logging.WARNING:
+            return True
+        message = record.getMessage()
+        first = message not in self._told
+        self._told.add(message)
+        return first
 
 
 def _complain(message: str, code: int) -> int:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import re
+from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,12 +15,33 @@ if TYPE_CHECKING:
 
 __all__ = [
     *("INTERRUPTED", "add_scan_options", "add_solver_options", "add_spectrum_options"),
-    *("filter_map_from", "scan_from", "spectrum_from"),
+    *("filter_map_from", "in_options", "scan_from", "spectrum_from", "tube_of_scanner"),
 ]
 
 
+# Options that stand for names of `scanner` in `load_scan`, where they differ.
+_OPTIONS = {
+    "source_object": "sod",
+    "source_detector": "sdd",
+    "flats": "flat",
+    "darks": "dark",
+    "arc": "angles",
+    "degrees": "angles",
+}
+_SAME = ("pixel", "offset", "white", "kvp", "filter", "detector", "unit", "input")
+_NAMED = re.compile(rf"\b({'|'.join((*_OPTIONS, *_SAME))})=(?![\w'\"{{(])")
 # Exit status after Ctrl-C, as shells use it.
 INTERRUPTED = 130
+
+
+def in_options(text: str, known: Container[str]) -> str:
+    """A hint of Python's, such as ``give source_object=``, as one types it: ``give --sod``, if that is known."""
+
+    def typed(name: re.Match[str]) -> str:
+        option = f"--{_OPTIONS.get(name[1], name[1])}"
+        return option if option in known else name[0]
+
+    return _NAMED.sub(typed, text)
 
 
 def add_spectrum_options(parser: argparse.ArgumentParser) -> None:
@@ -66,6 +89,21 @@ def spectrum_from(arguments: argparse.Namespace) -> Spectrum | None:
     return Spectrum.from_tube(arguments.kvp, arguments.anode or "W", filters, detector)
 
 
+def tube_of_scanner(arguments: argparse.Namespace, stated: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of the tube as what `scanner` of ``load_scan`` says of it, and no more of a spectrum; else nothing.
+
+    They come over a scanner's text: a voltage goes with its filter, and a detector that nobody names is a flat panel.
+    """
+    from tomo_polysplat.scan.io import is_of_scanner
+
+    if arguments.spectrum is not None or not is_of_scanner(arguments.scan, stated):
+        return {}
+    tube = {"kvp": arguments.kvp, "anode": arguments.anode, "filter": " + ".join(arguments.filter)}
+    tube["detector"] = arguments.detector
+    arguments.kvp, arguments.anode, arguments.filter, arguments.detector = None, None, [], None
+    return {key: value for key, value in tube.items() if value not in (None, "")}
+
+
 def filter_map_from(text: str) -> tuple[str, Any]:
     """Material and thickness at each pixel, of MATERIAL:FILE."""
     from tomo_polysplat.scan.filter_map_file import thickness_of
@@ -79,10 +117,15 @@ def filter_map_from(text: str) -> tuple[str, Any]:
 def add_scan_options(parser: argparse.ArgumentParser) -> None:
     """The scan and what its file leaves open."""
     parser.add_argument(
-        "scan", metavar="SCAN", help="Data Exchange HDF5 file, .npz scan, or a scanner's folder"
+        "scan",
+        metavar="SCAN",
+        help="Data Exchange HDF5 file, .npz scan, or what a scanner left: a folder or a file",
     )
     group = parser.add_argument_group("what the file does not say")
-    group.add_argument("--unit", help="unit of its lengths: cm (default), mm, um, m or pixel")
+    group.add_argument(
+        "--unit",
+        help="of lengths whose unit no file tells: cm, mm, um, m or pixel (default: mm of a scanner, else cm)",
+    )
     group.add_argument(
         "--centre",
         "--center",
@@ -99,7 +142,7 @@ def add_scan_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--input",
         choices=["counts", "transmission", "attenuation"],
-        help="what /exchange/data holds (default: by its attribute or its open-beam images)",
+        help="what the numbers are (default: as the file tells, or by its open-beam images)",
     )
     group.add_argument(
         "--water-correction",

@@ -13,10 +13,24 @@ __all__ = ["Parser"]
 
 
 class Parser(argparse.ArgumentParser):
-    """As in the library, but without abbreviations: those of today would mean something else tomorrow."""
+    """As in the library, but without abbreviations: those of today would mean something else tomorrow.
 
-    def __init__(self, *args: Any, **options: Any) -> None:
+    Its help ends with `examples`, commands as they are typed.
+    """
+
+    def __init__(self, *args: Any, examples: Sequence[str] = (), **options: Any) -> None:
         super().__init__(*args, **({"allow_abbrev": False} | options))
+        self._examples = tuple(examples)
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """All that begins with hyphens, as it is typed."""
+        return tuple(self._option_string_actions)
+
+    def format_help(self) -> str:
+        """All options, and the examples."""
+        lines = "".join(f"  {one}\n" for one in self._examples)
+        return super().format_help() + (f"\nexamples:\n{lines}" if lines else "")
 
     def parse_all(self, argv: Sequence[str] | None) -> argparse.Namespace:
         """The arguments of a command; what its own parser does not know ends it with a suggestion."""

@@ -19,6 +19,7 @@ from tomo_polysplat.cli.options import (
     filter_map_from,
     scan_from,
     spectrum_from,
+    tube_of_scanner,
 )
 from tomo_polysplat.cli.recon_outputs import require_outputs, require_room_of, write_outputs
 from tomo_polysplat.fit.stopping import StopReason
@@ -28,10 +29,15 @@ from tomo_polysplat.settings import make_settings
 
 if TYPE_CHECKING:
     from tomo_polysplat.physics.spectrum import Spectrum
+    from tomo_polysplat.result.result import Result
     from tomo_polysplat.scan.scan import Scan
 
 NAME = "recon"
 HELP = "reconstruct a scan into a volume of attenuation in 1/length"
+EXAMPLES = (
+    "tomo-polysplat recon scan.h5 -o volume.tif",
+    "tomo-polysplat recon scan.h5 -o result.h5 --report page.html --kvp 90 --filter 'Al 1mm' --detector csi:0.6mm",
+)
 
 
 # Long: a line or two for every option, in the order of the help.
@@ -170,16 +176,34 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
     settings = _settings(arguments)
     # Refused before the scan is read.
     make_settings(arguments.quality, settings)
-    scan = scan_from(arguments, spectrum_from(arguments))
+    tube = tube_of_scanner(arguments, {})
+    scan = scan_from(arguments, spectrum_from(arguments), scanner=tube or None)
     spectrum = _spectrum_of(scan, arguments)
     scan, to_find = _filtered(scan, arguments.filter_map)
     require_room_of(arguments, scan)
     print(visible(scan))
     # What a run will take is said without -v as well.
     logging.getLogger("tomo_polysplat.plan.expected").setLevel(logging.INFO)
-    with progress_reports(None) as progress:
-        result = tomo_polysplat.reconstruct(
-            replace(scan, spectrum=spectrum),
+    result = _fitted(replace(scan, spectrum=spectrum), to_find, settings, arguments)
+    with postponed_interrupts("writing") as interruption:
+        if arguments.energy is not None:
+            result = replace(result, energy_kev=arguments.energy)
+        result.provenance = {"scan": scan.name} | result.provenance
+        print(visible(result))
+        write_outputs(result, scan, arguments)
+    stop = result.plan.get("stop")
+    interrupted = stop is not None and stop.value == StopReason.INTERRUPTED
+    return INTERRUPTED if interruption.asked or interrupted else 0
+
+
+def _fitted(
+    scan: Scan, to_find: str | None, settings: dict[str, Any], arguments: argparse.Namespace
+) -> Result:
+    from tomo_polysplat.kernels.ahead import compiled_ahead
+
+    with progress_reports(None) as progress, compiled_ahead(arguments.device):
+        return tomo_polysplat.reconstruct(
+            scan,
             materials=arguments.materials,
             quality=arguments.quality,
             time_budget=arguments.time_budget,
@@ -196,15 +220,6 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
             checkpoint=arguments.checkpoint,
             resume=arguments.resume,
         )
-    with postponed_interrupts("writing") as interruption:
-        if arguments.energy is not None:
-            result = replace(result, energy_kev=arguments.energy)
-        result.provenance = {"scan": scan.name} | result.provenance
-        print(visible(result))
-        write_outputs(result, scan, arguments)
-    stop = result.plan.get("stop")
-    interrupted = stop is not None and stop.value == StopReason.INTERRUPTED
-    return INTERRUPTED if interruption.asked or interrupted else 0
 
 
 def _follow(device: str) -> int:

@@ -34,9 +34,11 @@ class ResidualSums:
     count, by_depth : (2, views, depths) array
         By view, of the left half of the detector and of the right one; see `nuisances.gain_estimate.drift_of_views`.
     view, pixel : (n,) int array
-        Of the rays held out.
+        Of the rays held out; the view counted among those looked at.
     residual, deviation : (n,) array
         Of these, measurement less model and what of it is allowed.
+    views : (views,) int array
+        Numbers in the scan of the views looked at.
     """
 
     weight: np.ndarray
@@ -47,6 +49,7 @@ class ResidualSums:
     pixel: np.ndarray
     residual: np.ndarray
     deviation: np.ndarray
+    views: np.ndarray
 
     def without_drift(self, drift: np.ndarray) -> ResidualSums:
         """As if the views had this log-factor, (views,), less; the rays of a pixel weigh alike in a block of views."""
@@ -57,11 +60,19 @@ class ResidualSums:
         return replace(self, total=total, by_depth=by_depth, residual=self.residual - drift[self.view])
 
 
+# One walk over the views fills all sums: cut up, each part would be handed all of them.
 @torch.no_grad()
-def residual_sums(gaussians: Gaussians, scene: FitScene, rays: Rays, settings: Settings) -> ResidualSums:
-    """Those of all views."""
+def residual_sums(
+    gaussians: Gaussians,
+    scene: FitScene,
+    rays: Rays,
+    settings: Settings,
+    some: np.ndarray | None = None,
+) -> ResidualSums:
+    """Those of all views, or of ``some`` by their numbers."""
+    numbers = np.arange(len(rays.views)) if some is None else some
     allowed = max(settings.model_error, _LEAST_ERROR)
-    views, rows, columns = len(rays.views), rays.views.rows, rays.views.columns
+    views, rows, columns = len(numbers), rays.views.rows, rays.views.columns
     blocks = min(_BLOCKS, views)
     double = torch.zeros((), dtype=torch.float64, device=rays.target)
     block = _blocks(views, blocks).tolist()
@@ -73,21 +84,21 @@ def residual_sums(gaussians: Gaussians, scene: FitScene, rays: Rays, settings: S
     held: list[list[torch.Tensor]] = []
     at_once = max(1, min(_AT_ONCE, _RAYS // (rows * columns)))
     for first in range(0, views, at_once):
-        some = np.arange(first, min(first + at_once, views))
-        seen, measured, fitted, aside = rays.batch(some)
+        now = slice(first, min(first + at_once, views))
+        seen, measured, fitted, aside = rays.batch(numbers[now])
         predicted, _ = scene.projections(gaussians, seen)
         far = _FAR * allowed / fitted.clamp(min=1e-12)
         left = (measured - predicted).maximum(-far).minimum(far)
         trust = fitted.square()
         # View by view: a GPU would add in any order, and a copy in double precision be made of all.
-        for k, view in enumerate(some.tolist()):
-            weight[block[view]] += trust[k]
-            total[block[view]] += trust[k] * left[k]
+        for k, into_block in enumerate(block[now]):
+            weight[into_block] += trust[k]
+            total[into_block] += trust[k] * left[k]
         depth = torch.where(trust > 0, torch.bucketize(predicted, ends) + right, 2 * many)
-        depth = depth.flatten(1) + (2 * many + 1) * torch.arange(len(some), device=depth.device)[:, None]
+        depth = depth.flatten(1) + (2 * many + 1) * torch.arange(len(depth), device=depth.device)[:, None]
         for into, values in ((count, None), (by_depth, left.double().flatten())):
-            found = torch.bincount(depth.flatten(), values, minlength=len(some) * (2 * many + 1))
-            into[some[0] : some[-1] + 1] = found.reshape(len(some), -1)[:, :-1].reshape(-1, 2, many)
+            found = torch.bincount(depth.flatten(), values, minlength=len(measured) * (2 * many + 1))
+            into[now] = found.reshape(len(measured), -1)[:, :-1].reshape(-1, 2, many)
         where = (aside > 0).nonzero(as_tuple=True)
         parts = (
             where[0] + first,
@@ -96,7 +107,7 @@ def residual_sums(gaussians: Gaussians, scene: FitScene, rays: Rays, settings: S
             allowed / aside[where],
         )
         held.append([part.cpu() for part in parts])
-    aside_parts = [torch.cat(parts).numpy() for parts in zip(*held)]
+    aside_parts = [torch.cat(parts).numpy() for parts in zip(*held)] + [numbers]
     sums = (weight, total, count.transpose(0, 1), by_depth.transpose(0, 1))
     maps = [part.cpu().numpy() for part in sums]
     return ResidualSums(*maps, *aside_parts)

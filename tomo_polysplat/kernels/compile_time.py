@@ -32,6 +32,12 @@ def add_compiled(seconds: float) -> None:
         _seconds += max(seconds, 0.0)
 
 
+def add_waited(seconds: float) -> None:
+    """Count seconds of waiting for another process that compiles, if compiling is tracked."""
+    if _tracked:
+        add_compiled(seconds)
+
+
 def track_compiling() -> None:
     """Listen to numba's and triton's compilers from now on; a compiler that does not tell is not counted."""
     global _tracked

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from tomo_polysplat.compiled import called, njit
 
 __all__ = ["FAST", "gaussian", "whitening", "whitening_adjoint"]
 
@@ -52,7 +53,8 @@ def whitening(scale, rotation, n, out):
     out[2, 2] = c * (1 - 2 * (x * x + y * y))
 
 
-@njit(inline="always")
+# Inlined by LLVM, which compiles sooner than where Numba does it.
+@called(fastmath=FAST, error_model="numpy", forceinline=True)
 def whitening_adjoint(scale, rotation, n, white, grad, grad_scale, grad_rotation):
     """Write the gradients of scale and quaternion of Gaussian ``n`` from ``grad`` = dL/dW (3, 3)."""
     w, x, y, z = rotation[n, 0], rotation[n, 1], rotation[n, 2], rotation[n, 3]

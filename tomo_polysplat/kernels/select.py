@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.checks import fail
+from tomo_polysplat.kernels.ahead import wait_for_kernels
 from tomo_polysplat.kernels.device import pick_device
 from tomo_polysplat.kernels.views import DetectorViews
 
@@ -101,6 +102,8 @@ def _self_check(name: str, device: str) -> float:
     """Largest relative difference of images and gradients to the reference on five Gaussians."""
     from tomo_polysplat.kernels.project.autograd import project
 
+    if name == "numba":
+        wait_for_kernels()
     direction = np.array([0.0, 3.0, 0.0]) - 0.1 * np.array([6.0, 0.0, 4.0])
     matrix = np.stack([[0.1, 0, 0], [0, 0, 0.1], direction], axis=1)[None]
     views = DetectorViews(True, np.array([[0.0, -2.0, 0.0]]), matrix, 9, 13)

@@ -35,3 +35,12 @@ class LightFactor(Nuisance):
         way = "rises" if better < 0 else "falls"
         words = f"the misfit of held-out rays {way} by {abs(better):.1%} (standard error {error:.1%})"
         return Verdict(better > max(_SURE * error, _WORTH), f"{evidence['rms']:.2%} rms; {words}")
+
+    @classmethod
+    def ruled_out(cls, evidence: Mapping[str, float], part: float) -> bool:
+        """Whether the gate would stay shut with all views, of which this ``part`` gave the evidence.
+
+        A mean over m of n views has n / m times the variance of noise, and so much less of it is believed: what all
+        of them confirm takes away at least m / n of that here. NaN, of too few rays, rules nothing out.
+        """
+        return evidence["better"] + _SURE * evidence["error"] <= part * _WORTH

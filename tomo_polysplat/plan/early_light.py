@@ -8,10 +8,9 @@ from __future__ import annotations
 import logging
 from typing import Any
 
-from tomo_polysplat.fit.residual_sums import residual_sums
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.first_look import Look
-from tomo_polysplat.plan.light_told import EARLY_LIGHT, LightTold, light_told, wanted_light
+from tomo_polysplat.plan.light_told import EARLY_LIGHT, LightTold, ask_light, wanted_light
 from tomo_polysplat.settings import Settings
 
 __all__ = ["take_out_early"]
@@ -41,8 +40,7 @@ def take_out_early(look: Look, settings: Settings) -> dict[str, Answer]:
     if all(one is False for one in wanted.values()):
         return {}
     lab = look.lab
-    sums = residual_sums(look.gaussians, lab.scene, lab.rays, look.settings)
-    told = light_told(lab.problem, sums, settings)
+    told = ask_light(lab.problem, look.gaussians, lab.scene, lab.rays, look.settings, settings)
     for name, one in told.items():
         logger.debug("%s before the questions: %s", name, one.why)
     kept = {name: one for name, one in told.items() if one.kept and _is_worth(one, wanted[name])}

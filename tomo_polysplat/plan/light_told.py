@@ -9,22 +9,27 @@ from typing import Any
 import numpy as np
 
 from tomo_polysplat.fit.problem import Problem
-from tomo_polysplat.fit.residual_sums import ResidualSums
+from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.residual_sums import ResidualSums, residual_sums
+from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.nuisances.drift import Drift
 from tomo_polysplat.nuisances.gain_estimate import drift_of_views, gains_of_pixels, less_rings
 from tomo_polysplat.nuisances.gains import Gains
-from tomo_polysplat.nuisances.nuisance import Nuisance
+from tomo_polysplat.nuisances.light_factor import LightFactor
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.settings import Settings
 
-__all__ = ["EARLY_LIGHT", "LightTold", "light_told", "wanted_light"]
+__all__ = ["EARLY_LIGHT", "LightTold", "ask_light", "light_told", "wanted_light"]
 
 # The fact of a plan that some was taken out before its questions.
 EARLY_LIGHT = "early_light"
 
 # Held-out rays that tell anything.
 _FEWEST_RAYS = 30
-_KINDS: tuple[type[Nuisance], ...] = (Drift, Gains)
+# So many views are looked at first, where there are twice as many.
+_FIRST = 128
+_KINDS: tuple[type[LightFactor], ...] = (Drift, Gains)
 
 
 @dataclass(frozen=True)
@@ -36,7 +41,7 @@ class LightTold:
     kept : bool
         Whether it is taken out.
     change : array
-        What is taken out from now on, less what was before: (views,) of drift, (rows, columns) of gains.
+        What is taken out from now on, less what was before: (views looked at,) of drift, (rows, columns) of gains.
     why : str
     evidence : dict of str to float
         See `nuisances.light_factor.LightFactor.gate`.
@@ -59,6 +64,36 @@ def wanted_light(settings: Settings) -> dict[str, Any]:
     return {kind.name: getattr(settings, kind.name) for kind in _KINDS}
 
 
+def ask_light(
+    problem: Problem,
+    gaussians: Gaussians,
+    scene: FitScene,
+    rays: Rays,
+    settings: Settings,
+    options: Settings,
+) -> dict[str, LightTold]:
+    """By name, what the rays tell: some views first, and all where these show anything.
+
+    A look at all views takes as long as half a pass on a GPU.
+
+    Parameters
+    ----------
+    problem, options
+        As `light_told` takes them.
+    gaussians, scene, rays, settings
+        As `fit.residual_sums` takes them.
+    """
+    views = len(rays.views)
+    if views >= 2 * _FIRST and not problem.taken.steps and True not in wanted_light(options).values():
+        some = np.arange(_FIRST) * views // _FIRST
+        told = light_told(problem, residual_sums(gaussians, scene, rays, settings, some), options)
+        if all(
+            kind.ruled_out(told[kind.name].evidence, _FIRST / views) for kind in _KINDS if kind.name in told
+        ):
+            return told
+    return light_told(problem, residual_sums(gaussians, scene, rays, settings), options)
+
+
 def light_told(problem: Problem, sums: ResidualSums, settings: Settings) -> dict[str, LightTold]:
     """By name, drift first, and the gains as they are without it; what a caller wants left in is missing.
 
@@ -71,7 +106,7 @@ def light_told(problem: Problem, sums: ResidualSums, settings: Settings) -> dict
     """
     told, wanted = {}, wanted_light(settings)
     if wanted[Drift.name] is not False:
-        taken = problem.taken.drift
+        taken = problem.taken.drift[sums.views]
         found = drift_of_views(sums.count, sums.by_depth + sums.count * taken[:, None])
         told[Drift.name] = drift = _judged(Drift, found, taken, sums, sums.view, settings)
         sums = sums.without_drift(drift.change)
@@ -86,7 +121,7 @@ def light_told(problem: Problem, sums: ResidualSums, settings: Settings) -> dict
 
 
 def _judged(
-    kind: type[Nuisance],
+    kind: type[LightFactor],
     found: np.ndarray,
     taken: np.ndarray,
     sums: ResidualSums,

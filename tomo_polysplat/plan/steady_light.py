@@ -10,9 +10,8 @@ import logging
 
 from tomo_polysplat.fit.optimise import Run
 from tomo_polysplat.fit.problem import Problem
-from tomo_polysplat.fit.residual_sums import residual_sums
 from tomo_polysplat.plan.answer import Answer, Status
-from tomo_polysplat.plan.light_told import light_told, wanted_light
+from tomo_polysplat.plan.light_told import ask_light, wanted_light
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.settings import Settings
 
@@ -57,8 +56,8 @@ class SteadyLight:
             return
         fitter, taken = run.fitter, self.problem.taken
         before_it = len(taken.steps)
-        sums = residual_sums(fitter.gaussians, fitter.scene, fitter.rays, fitter.settings)
-        for name, told in light_told(self.problem, sums, self.settings).items():
+        parts = fitter.gaussians, fitter.scene, fitter.rays, fitter.settings
+        for name, told in ask_light(self.problem, *parts, self.settings).items():
             if told.change.any():
                 taken.add(**{name: told.change})
             answer = told.answer(asked=self.asked)

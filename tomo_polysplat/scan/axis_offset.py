@@ -83,7 +83,7 @@ def axis_offset(projections: np.ndarray, geometry: Geometry, valid: np.ndarray |
     error is the jackknife's (Efron 1982): the larger one of that over groups of views, whose noise differs, and of that
     over groups of columns, whose gains do. What is added to its square is of views too far apart: by how much the place
     changes if rays between two views bend as their neighbours do, or, of half a turn, the place that comes out between
-    neighbouring views, where it is known.
+    neighbouring views, where it is known: single views that have moved show in that.
     """
     try:
         return offset_of(opposite_rays_of(projections, geometry, valid))
@@ -104,6 +104,9 @@ def offset_of(rays: OppositeRays) -> AxisOffset:
             step = (step + 1) // 2
         if not rays.seam:
             found, error = _refined(rays, found, limit, varying=True)
+        if rays.one_pair:
+            # The mean of what moved either of the two; what the rule of the seam tells is moved by about twice as many.
+            error = float(np.hypot(error, _elsewhere(rays, spread(rays, _VIEWS)[1]) / np.sqrt(2)))
     except ValueError as why:
         return AxisOffset(0.0, np.inf, str(why))
     if not np.isfinite(error):

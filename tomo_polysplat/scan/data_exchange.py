@@ -26,10 +26,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tomo_polysplat.checks import fail, require_choice, visible
+from tomo_polysplat.checks import fail, visible
 from tomo_polysplat.free_memory import in_gigabytes
 from tomo_polysplat.scan.counts import Counts, Marks, Read
 from tomo_polysplat.scan.data_exchange_parallel import parallel_told
+from tomo_polysplat.scan.data_exchange_pictures import input_kind, pictures_of
 from tomo_polysplat.scan.defects import flat_and_dark
 from tomo_polysplat.scan.dxchange_host import read_block
 from tomo_polysplat.scan.filter_map_file import read_filter_map
@@ -52,7 +53,7 @@ from tomo_polysplat.scan.layout import (
 )
 from tomo_polysplat.scan.readers.part import Part
 from tomo_polysplat.scan.readers.scan_part import scan_part
-from tomo_polysplat.scan.reading import INPUT_KINDS, ReadOptions
+from tomo_polysplat.scan.reading import ReadOptions
 from tomo_polysplat.scan.scan import Scan
 from tomo_polysplat.scan.stored_part import StoredPart
 from tomo_polysplat.scan.stored_views import StoredViews
@@ -82,13 +83,9 @@ def scan_from_hdf5(path: Path, options: ReadOptions, part: Part = _ALL) -> Scan:
     with opened(path) as file:
         if find_array(file, "polysplat/basis") is not None:
             raise fail("path", "a scan", f"the result of a reconstruction in {path}", "Result.load reads it")
+        data = pictures_of(file, path)
         exchange = find_group(file, "exchange")
-        data = None if exchange is None else find_array(exchange, "data")
-        if exchange is None or data is None or data.ndim != 3 or 0 in data.shape:
-            got = "no such dataset" if data is None else f"shape {data.shape}"
-            remedy = "NXtomo and CIL's NeXus are read too; else copy the projections there with h5py, or into TIFFs"
-            expected = "a dataset /exchange/data of shape (views, rows, columns)"
-            raise fail("path", expected, f"{got} in {path}", remedy)
+        assert exchange is not None  # the pictures are in it
         now, later = _in_two(part, file, options)
         wanted = StoredPart(data, now)
         stay = 4 * prod(wanted.shape) >= _STAYS and find_array(file, "polysplat/valid") is None
@@ -171,7 +168,7 @@ def _counts(
     """What is stored, with what is needed to make line integrals of it, and notes of what that is."""
     rows, columns = data.shape[1:]
     white, dark = find_array(exchange, "data_white"), find_array(exchange, "data_dark")
-    kind = _input_kind(data, white is not None, options.input)
+    kind = input_kind(data, white is not None, options.input)
     if kind != "counts" and options.saturation is not None:
         raise fail("saturation", "counts in the file", f"{kind}, which has none", "leave it out")
     flat = background = None
@@ -209,30 +206,6 @@ def _require_few(frames: StoredArray, data: StoredArray) -> None:
     most = max(_MOST_FRAMES, data.shape[0])
     if frames.ndim == 3 and len(frames) > most:
         raise fail(frames.name, f"at most {most} frames", f"{len(frames)}")
-
-
-def _input_kind(data: StoredArray, has_white: bool, stated: str | None) -> str:
-    """What the numbers are: as the caller or the file states it, else as they look, with a warning."""
-    if stated is not None:
-        return stated
-    attribute = text_attribute(data, "input")
-    if attribute is not None:
-        return require_choice("attribute 'input' of /exchange/data", attribute, INPUT_KINDS)
-    if has_white:
-        return "counts"
-    sample = np.asarray(data[:: max(1, data.shape[0] // 8)], np.float64)
-    sample = sample[np.isfinite(sample)]
-    if sample.size and np.percentile(sample, 99) > 30:
-        raise fail(
-            "input",
-            "open-beam images (/exchange/data_white) for what looks like counts",
-            "none",
-            "or state input=",
-        )
-    # Air is the commonest value at one end: near 1 in transmission, near 0 in attenuation.
-    kind = "transmission" if sample.size and 0.7 < np.percentile(sample, 95) < 1.3 else "attenuation"
-    logger.warning("no open-beam images: the data look like %s; pass input= to be sure", kind)
-    return kind
 
 
 def _report_defects(rays: dict[str, int], lost: int, size: int) -> None:

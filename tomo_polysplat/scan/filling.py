@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from tomo_polysplat.compiled import called, njit
 
 __all__ = ["fill_rows_in_place"]
 
@@ -20,7 +21,7 @@ def fill_rows_in_place(rows: np.ndarray, valid: np.ndarray) -> None:
     """
     count, columns = rows.shape
     for row in range(count):
-        before = -1
+        before = np.intp(-1)  # a plain -1 is a type of its own, for which `_bridge` would be compiled as well
         column = 0
         while column < columns:
             if valid[row, column]:
@@ -34,7 +35,7 @@ def fill_rows_in_place(rows: np.ndarray, valid: np.ndarray) -> None:
             column = after
 
 
-@njit(nogil=True, cache=True)
+@called()
 def _bridge(values, before, after):
     """Fill the values between two valid columns; -1 or the row's length stand for a missing one."""
     if before < 0 and after == len(values):

@@ -15,7 +15,7 @@ from tomo_polysplat.scan.data_exchange import scan_from_hdf5
 from tomo_polysplat.scan.data_exchange_writer import write_hdf5
 from tomo_polysplat.scan.hdf5 import find_array, find_group, opened
 from tomo_polysplat.scan.npz import scan_from_npz, write_npz
-from tomo_polysplat.scan.readers import cil_nexus, npz_stack, nxtomo
+from tomo_polysplat.scan.readers import cil_nexus, exchange_told, npz_stack, nxtomo
 from tomo_polysplat.scan.readers.part import Part
 from tomo_polysplat.scan.readers.recognise import acquisition_of
 from tomo_polysplat.scan.readers.scan_part import scan_part
@@ -27,7 +27,7 @@ from tomo_polysplat.scan.scan import Scan
 if TYPE_CHECKING:
     from tomo_polysplat.physics.spectrum import Spectrum
 
-__all__ = ["load_scan", "require_scan_name", "save_scan"]
+__all__ = ["is_of_scanner", "load_scan", "require_scan_name", "save_scan"]
 
 _WRITERS: dict[str, Callable[..., None]] = {".npz": write_npz, ".h5": write_hdf5, ".hdf5": write_hdf5}
 
@@ -59,8 +59,8 @@ def load_scan(
     log and in ``scan.notes["scanner"]``, with the keys of the scanner's own text that are not used.
 
     A Data Exchange file that states no geometry is taken as a parallel beam with the angles in
-    ``/exchange/theta`` (degrees). Rays without light, saturated, of dead pixels or not finite are marked in
-    ``scan.valid`` and counted in ``scan.notes``, never clipped.
+    ``/exchange/theta`` (degrees), unless `scanner` describes another. Rays without light, saturated, of dead pixels
+    or not finite are marked in ``scan.valid`` and counted in ``scan.notes``, never clipped.
 
     Parameters
     ----------
@@ -125,6 +125,9 @@ def load_scan(
         told = acquisition_of(Path(path), with_options(scanner or {}, options))
         return scan_from_acquisition(told, options, part)
     if scanner and reader is scan_from_hdf5:
+        if exchange_told.is_described(scanner):
+            told = exchange_told.read(existing_file(path), with_options(scanner, options))
+            return scan_from_acquisition(told, options, part)
         options = _of_parallel_beam(existing_file(path), options, scanner)
     elif scanner:
         got = ", ".join(map(str, scanner))
@@ -135,16 +138,15 @@ def load_scan(
     return scan if part.whole else scan_part(scan, part)
 
 
+def is_of_scanner(path: str | os.PathLike, scanner: Mapping[str, Any]) -> bool:
+    """Whether `load_scan` takes what is there for what a scanner wrote, of which `scanner` may tell the tube too."""
+    reader = _reader_of_scans(Path(path))
+    return reader is None or (reader is scan_from_hdf5 and exchange_told.is_described(scanner))
+
+
 def _of_parallel_beam(file: Path, options: ReadOptions, scanner: Mapping[str, Any]) -> ReadOptions:
     """Angles and pixel of a Data Exchange file that has none, as they are told of pictures."""
     known = require_known(scanner, "scanner")
-    others = sorted(known.keys() - {"beam", "arc", "degrees", "pixel"})
-    if others or known.get("beam", "parallel") != "parallel":
-        remedy = (
-            "a cone beam's geometry is passed as proj_geom= and vol_geom=, or read from TIFFs of the pictures"
-        )
-        got = ", ".join(others or ["beam"])
-        raise fail("scanner", "arc, degrees and pixel alone, for a Data Exchange file", got, remedy)
     with opened(file) as content:
         group = find_group(content, "exchange")
         data = None if group is None else find_array(group, "data")

@@ -16,6 +16,8 @@ __all__ = ["OppositeRays", "RaysAndOpposites"]
 
 # Gaps between views of more than this many usual ones are not bridged.
 _GAP = 2.5
+# Columns by which no matter on the detector moves between views that are taken for the same.
+_STILL = 0.02
 # Views next to the seam of half a turn are evenly spaced to this share of a step.
 _EVEN = 0.05
 # Columns that the values are smoothed over, so that what lies between columns is as sharp as they are.
@@ -137,7 +139,13 @@ class OppositeRays:
         there = begin + np.mod(self.azimuth[lines, None] + np.pi + 2 * fan - begin, 2 * np.pi)
         first = (np.searchsorted(self.azimuth, there - 1e-9) - 1) % len(self.azimuth)
         past = np.mod(there - self.azimuth[first] + 1e-9, 2 * np.pi)
-        return first, past, np.mod(self._gaps[first], 2 * np.pi)
+        gap = np.mod(self._gaps[first], 2 * np.pi)
+        # A half turn that ends where it began, but for what motors miss: the view at the gap's rim is opposite.
+        at_rim = (gap > _GAP * self._step) & (
+            np.minimum(past, gap - past) < 2 * _STILL / self.values.shape[1]
+        )
+        past = np.where(at_rim, np.where(past < 0.5 * gap, 0, self._step), past)
+        return first, past, np.where(at_rim, self._step, gap)
 
     def bent(self, offset: float, lines: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """What opposite rays (lines, columns, rows) lack that are taken from the straight line between two views.
@@ -270,6 +278,15 @@ class OppositeRays:
     @cached_property
     def _step(self) -> float:
         return float(np.median(self._gaps))
+
+    @property
+    def _still(self) -> float:
+        return 2 * _STILL / self.values.shape[1]
+
+    @property
+    def one_pair(self) -> bool:
+        """Whether the last view of half a turn in a parallel beam is the first one from behind, and all there is."""
+        return not self.slope and bool(abs(np.ptp(self.azimuth) - np.pi) < self._still)
 
     @cached_property
     def seam(self) -> bool:

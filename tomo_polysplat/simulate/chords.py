@@ -10,14 +10,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from tomo_polysplat.compiled import called, njit
 
 __all__ = ["paint_labels", "trace_rays", "trace_view"]
 
 TILE = 16
 
 
-@njit(nogil=True, cache=True)
+@called()
 def _interval(round_axes, origin, direction):
     """Where a ray in the frame of a unit solid is inside it: (first, last); last <= first means nowhere.
 
@@ -51,7 +52,7 @@ def _interval(round_axes, origin, direction):
     return first, last
 
 
-@njit(nogil=True, cache=True)
+@called()
 def _cover(covered, count, first, last):
     """Add an interval to a sorted list of disjoint ones; returns how much was there, and the new count."""
     before = 0
@@ -77,13 +78,13 @@ def _cover(covered, count, first, last):
 
 
 # Compiled: it takes arrays and numbers, and no objects that hold them.
-@njit(nogil=True, cache=True)
+@called()
 def _trace(origin, direction, bounds, chosen, count, solids, covered, local, out):
     """Add one ray's areal densities to ``out``; ``chosen[:count]`` are the solids it may meet, in order."""
     round_axes, centres, to_local, radii, material, density = solids
     squared = direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2
     length = math.sqrt(squared)
-    taken = 0
+    taken = np.intp(0)  # a plain 0 is a type of its own, for which `_cover` would be compiled as well
     for c in range(count - 1, -1, -1):
         j = chosen[c]
         x = origin[0] - centres[j, 0]
@@ -120,13 +121,13 @@ def trace_rays(origins, directions, bounds, solids, out):
         _trace(origins[i], directions[i], bounds, chosen, total, solids, covered, local, out[i])
 
 
-@njit(nogil=True, cache=True)
+@called()
 def _pixel(corner, u, v, row, column, out):
     for k in range(3):
         out[k] = corner[k] + row * v[k] + column * u[k]
 
 
-@njit(nogil=True, cache=True)
+@called()
 def _plane(start, stop, inner, beam, cone, out):
     """Plane (normal, offset) through two neighbouring corners of a tile and their rays, facing outwards."""
     ray = out[:3]  # the ray, then the normal, in the same place
@@ -140,7 +141,7 @@ def _plane(start, stop, inner, beam, cone, out):
     out[3] = out[0] * start[0] + out[1] * start[1] + out[2] * start[2]
 
 
-@njit(nogil=True, cache=True)
+@called()
 def _choose(planes, centres, radii, chosen):
     """Solids not wholly outside any of the four planes about a bundle of rays: their indices and number."""
     count = 0
@@ -188,7 +189,7 @@ def trace_view(cone, beam, corner, u, v, solids, out):
             count = _choose(planes, solids[1], solids[3], chosen)
             for i in range(top, bottom if count else top):
                 for j in range(left, right):
-                    _pixel(corner, u, v, i, j, pixel)
+                    _pixel(corner, u, v, float(i), float(j), pixel)
                     if cone:
                         for k in range(3):
                             ray[k] = pixel[k] - beam[k]

@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from tomo_polysplat.checks import require_number
+from tomo_polysplat.compiled import njit
 
 __all__ = ["Scanner", "transmission"]
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from tomo_polysplat.compiled import called, njit
 
 __all__ = ["crossed_voxels", "sample_voxels"]
 
@@ -53,7 +54,7 @@ def sample_voxels(corners, size, closed, counts, parts, values, marks, mean, mar
     near = np.empty(len(round_axes), np.int64)
     point = np.empty(3)
     for voxel in range(len(corners)):
-        count = 0
+        count = np.intp(0)  # a plain 0 is a type of its own, for which `_label` would be compiled as well
         for part in range(len(round_axes) - 1, -1, -1):
             apart = False
             for a in range(3):
@@ -76,7 +77,7 @@ def sample_voxels(corners, size, closed, counts, parts, values, marks, mean, mar
         marked[voxel] = found
 
 
-@njit(nogil=True, cache=True)
+@called()
 def _place(index, count, closed):
     """Where a sample point lies along an axis of a voxel, 0 to 1."""
     if closed and count > 1:
@@ -84,7 +85,7 @@ def _place(index, count, closed):
     return (index + 0.5) / count
 
 
-@njit(nogil=True, cache=True)
+@called()
 def _label(point, near, count, parts):
     """Label of the first of the parts ``near`` that holds a point, or 0."""
     round_axes, centre, to_local, _ = parts

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from tomo_polysplat.compiled import njit
 from tomo_polysplat.parallel import cpu_threads, run_tasks, split_range
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 

@@ -7,8 +7,8 @@ plane of voxel centres along the axis nearest to the ray and interpolate bilinea
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from tomo_polysplat.compiled import called, njit
 from tomo_polysplat.parallel import cpu_threads, run_tasks, split_range
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 
@@ -97,8 +97,8 @@ def _trace(vectors, cone, size, voxels, shape, projections, adjoint, axis, first
                 a, b = (m + 1) % 3, (m + 2) % 3
                 slope_a, slope_b = ray[a] / ray[m], ray[b] / ray[m]
                 start_a, start_b = pixel[a] - pixel[m] * slope_a, pixel[b] - pixel[m] * slope_b
-                low, high = _clip(start_a, slope_a, 0, counts[a], 0.0, counts[m] - 1.0)
-                low, high = _clip(start_b, slope_b, 0, counts[b], low, high)
+                low, high = _clip(start_a, slope_a, 0.0, float(counts[a]), 0.0, counts[m] - 1.0)
+                low, high = _clip(start_b, slope_b, 0.0, float(counts[b]), low, high)
                 if cone and ray[m] > 0:
                     low = max(low, source[m])
                 elif cone:
@@ -134,7 +134,7 @@ def _trace(vectors, cone, size, voxels, shape, projections, adjoint, axis, first
                     projections[view, i, j] = total * length
 
 
-@njit(nogil=True, cache=True)
+@called()
 def _longest(ray):  # type: ignore[no-untyped-def]
     """The axis along which a ray goes farthest, the first of equals."""
     x, y, z = abs(ray[0]), abs(ray[1]), abs(ray[2])
@@ -144,18 +144,18 @@ def _longest(ray):  # type: ignore[no-untyped-def]
 
 
 # Compiled: it takes arrays and numbers, and no objects that hold them.
-@njit(nogil=True, cache=True)
+@called()
 def _within(k0, k1, axis, first, last, m, a, start_a, slope_a, start_b, slope_b):  # type: ignore[no-untyped-def]
     """The steps k0..k1 that may touch a slab; some beside it may be among them."""
     if m == axis:
         return max(k0, first), min(k1, last)
     start, slope = (start_a, slope_a) if a == axis else (start_b, slope_b)
-    low, high = _clip(start, slope, first, last, k0, k1)
+    low, high = _clip(start, slope, float(first), float(last), float(k0), float(k1))
     # Outwards, as rounding must not decide.
     return max(k0, int(np.floor(low))), min(k1, int(np.ceil(high)) + 1)
 
 
-@njit(nogil=True, cache=True)
+@called()
 def _clip(start, slope, first, last, low, high):  # type: ignore[no-untyped-def]
     """The part of ``low .. high`` where ``start + k slope`` is within a voxel of those from first to last."""
     if abs(slope) < 1e-12:

@@ -10,19 +10,19 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from tomo_polysplat.kernels.project.numba_group import GROUP, SIZE, matrix_of, put, put_group, three
+from tomo_polysplat.compiled import called, njit
+from tomo_polysplat.kernels.project.numba_group import GROUP, SIZE, gaussian_of, put_group
 
 __all__ = ["MOMENTS", "RECORD", "pull_back", "pull_back_view", "ray_frame", "rows_of", "set_up"]
 
 RECORD = 12  # numbers of a footprint, in the order of _described
 MOMENTS = 11  # sums over a footprint, in the order read by pull_back
 
-_OUT = RECORD + 6  # what _footprints tells of a Gaussian, by threes
+_OUT = RECORD + 5  # what _footprints tells of a Gaussian
 
 # Inlined by LLVM: where Numba does it, compiling takes a third longer.
-_step = njit(error_model="numpy", fastmath={"contract"}, forceinline=True)
+_step = called(error_model="numpy", fastmath={"contract"}, forceinline=True)
 
 
 @_step
@@ -46,8 +46,9 @@ def _apply(matrix, x):
 
 
 @_step
-def _column(matrix, k):
-    return matrix[0][k], matrix[1][k], matrix[2][k]
+def _columns(matrix):
+    (a, b, c), (d, e, f), (g, h, i) = matrix
+    return (a, d, g), (b, e, h), (c, f, i)
 
 
 @_step
@@ -66,11 +67,11 @@ def ray_frame(point, cone, origin, inverse, matrix, white):
     r = point[0] - origin[0], point[1] - origin[1], point[2] - origin[2]
     a, b, c = _apply(inverse, r)
     kappa = 1.0
+    u, v, along = _columns(matrix)
     if cone:
         kappa = 1.0 / c if c > 0.0 else 0.0
     else:
-        r = _column(matrix, 2)
-    u, v = _column(matrix, 0), _column(matrix, 1)
+        r = along
     return (a * kappa, b * kappa, kappa), r, _apply(white, r), _apply(white, u), _apply(white, v)
 
 
@@ -141,19 +142,18 @@ def _reach(white, scale, toward):
 def _footprints(cone, planar, cutoff, rows, columns, origin, inverse, matrix, group, out):
     """Fill ``out`` with numbers (12) and ranges (4) of a group in a view, and 1 for what lies ahead of the source."""
     for k in range(GROUP):
-        white = matrix_of(group, 6, k)
-        centre, _, w, wu, wv = ray_frame(three(group, 0, k), cone, origin, inverse, matrix, white)
+        point, scale, white = gaussian_of(group, k)
+        centre, _, w, wu, wv = ray_frame(point, cone, origin, inverse, matrix, white)
         ahead = 1.0
         if cone:
             depth = 1.0 / centre[2] if centre[2] > 0.0 else 0.0
-            ahead = 1.0 if depth > 1.001 * cutoff * _reach(white, three(group, 3, k), inverse[2]) else 0.0
+            ahead = 1.0 if depth > 1.001 * cutoff * _reach(white, scale, inverse[2]) else 0.0
         numbers, span = _described(cone, planar, cutoff, rows, columns, centre, w, wu, wv)
-        put(out, 0, k, numbers[0])
-        put(out, 3, k, numbers[1])
-        put(out, 6, k, numbers[2])
-        put(out, 9, k, numbers[3])
-        put(out, 12, k, (span[0], span[1], span[2]))
-        put(out, 15, k, (span[3], ahead, 0.0))
+        for i in range(4):
+            for j in range(3):
+                out[(3 * i + j) * GROUP + k] = numbers[i][j]
+            out[(RECORD + i) * GROUP + k] = span[i]
+        out[(RECORD + 4) * GROUP + k] = ahead
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -230,7 +230,8 @@ def pull_back(cone, planar, frame, inverse, matrix, white, m):
         point = _mix(1.0, point, g_depth, inverse[2])
     else:
         point = _mix(g_column, inverse[0], g_row, inverse[1])
-    r, u, v = frame[1], _column(matrix, 0), _column(matrix, 1)
+    u, v, _ = _columns(matrix)
+    r = frame[1]
     rows = (
         _mix(1.0, _mix(g_w[0], r, g_wu[0], u), g_wv[0], v),
         _mix(1.0, _mix(g_w[1], r, g_wu[1], u), g_wv[1], v),

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from tomo_polysplat.compiled import njit
 from tomo_polysplat.kernels.gaussian_maths import FAST, gaussian, whitening_adjoint
 from tomo_polysplat.kernels.numba_lanes import LANES, add_product, add_scaled, lane_sums
 from tomo_polysplat.kernels.project.numba_footprint import (
@@ -22,7 +22,14 @@ from tomo_polysplat.kernels.project.numba_footprint import (
     rows_of,
     set_up,
 )
-from tomo_polysplat.kernels.project.numba_group import GROUP, SIZE, add_where, matrix_of, put_group, three
+from tomo_polysplat.kernels.project.numba_group import (
+    GROUP,
+    SIZE,
+    add_where,
+    gaussian_of,
+    moments_of,
+    put_group,
+)
 from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.parallel import cpu_threads, run_tasks, shares, split_range
 
@@ -161,16 +168,12 @@ def _gather(
 def _take_back(cone, planar, origin, inverse, matrix, group, moments, grads):
     """Add dL/dposition (3) and dL/dW (9) of a view to those of a group."""
     for k in range(GROUP):
-        white = matrix_of(group, 6, k)
-        m = three(moments, 0, k), three(moments, 3, k), three(moments, 6, k), three(moments, 9, k)
-        frame = ray_frame(three(group, 0, k), cone, origin, inverse, matrix, white)
+        position, _, white = gaussian_of(group, k)
+        m = moments_of(moments, k)
+        frame = ray_frame(position, cone, origin, inverse, matrix, white)
         point, rows = pull_back(cone, planar, frame, inverse, matrix, white, m)
         # A Gaussian that is not seen may have no frame.
-        seen = m[3][2] > 0.0
-        add_where(seen, grads, 0, k, point)
-        add_where(seen, grads, 3, k, rows[0])
-        add_where(seen, grads, 6, k, rows[1])
-        add_where(seen, grads, 9, k, rows[2])
+        add_where(m[3][2] > 0.0, grads, k, point, rows)
 
 
 @njit(inline="always")
@@ -178,9 +181,9 @@ def _take_back_view(cone, planar, origin, inverse, matrix, group, moments, sums)
     """Fill ``sums`` (12) with dL/d(origin, U, V, D) of a view, summed over a group."""
     sums[:] = 0.0
     for k in range(GROUP):
-        m = three(moments, 0, k), three(moments, 3, k), three(moments, 6, k), three(moments, 9, k)
+        m = moments_of(moments, k)
         if m[3][2] > 0.0:
-            white, point = matrix_of(group, 6, k), three(group, 0, k)
+            point, _, white = gaussian_of(group, k)
             frame = ray_frame(point, cone, origin, inverse, matrix, white)
             parts = pull_back_view(cone, planar, point, frame, origin, inverse, white, m)
             for a in range(3):

@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from tomo_polysplat.compiled import called, njit
 from tomo_polysplat.kernels.gaussian_maths import FAST, gaussian, whitening, whitening_adjoint
 from tomo_polysplat.kernels.numba_lanes import LANES, add_product, add_scaled, lane_sums
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
@@ -167,7 +167,8 @@ def _gather(n, rec, weight, cutoff, nx, grad_volume, value, total, acc):
                     acc[8 * LANES + k] += h * deep * deep
 
 
-@njit(inline="always")
+# Inlined by LLVM, which compiles sooner than where Numba does it; the loop along a row would lose its vectors so.
+@called(fastmath=FAST, error_model="numpy", forceinline=True)
 def _pull_back(n, white, q, rec, spacing, m, grad_position, grad_white):
     """Write dL/dposition, and dL/dW to ``grad_white``, from the moments ``m`` of h with t = r (x, y, z)."""
     by_r33 = 1.0 / rec[8] if rec[8] > 0.0 else 0.0

@@ -20,6 +20,9 @@ _BLUR = 2.0
 # alike than those: 1 and 1/2 for views in disorder, the second with a standard deviation of 0.29 over root n.
 _UNLIKE, _RANDOM, _DEVIATION = 0.5, 0.35, 0.29
 _SURE = 4.0
+# Views of an object that looks the same from several sides are like many others, but neighbours differ by less than
+# this share of what views two steps apart do; in disorder by as much.
+_NEARER = 0.5
 # A view in a wrong place differs from its neighbours by so many times as much as these do, squared, and by such a share
 # of what any two views differ by; where it belongs it differs by less than half.
 _FURTHER, _FAR, _ELSEWHERE = 2.5, 0.3, 0.5
@@ -59,7 +62,8 @@ def probe_order(measured: Measured) -> Finding:
     numbers = {"ratio": ratio, "rank": rank, "misplaced": 1.0}
     # In disorder the ratio is 1, as far as noise lets it be told.
     blurred = float(views.error(usual)) / usual / np.sqrt(count / 2)
-    if ratio > max(_UNLIKE, _SURE * blurred) and rank > max(0.5 - 3 * doubt, _RANDOM):
+    ordered = by_place.mean() < _NEARER * squared[np.arange(count), _two_steps_away(near)].mean()
+    if not ordered and ratio > max(_UNLIKE, _SURE * blurred) and rank > max(0.5 - 3 * doubt, _RANDOM):
         text = f"of any two views {100 * rank:.0f} % are more alike than those from neighbouring places"
         remedy = "the angles do not belong to the views in this order: check the order of the files"
         return Finding(ORDER, DEFECT, text, remedy, numbers, doubt)
@@ -126,6 +130,12 @@ def _neighbours(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     others = np.array([line[line != view][:2] for line, view in zip(index, own)])
     apart = np.linalg.norm(places[others] - places[:, None], axis=2)
     return others, apart
+
+
+def _two_steps_away(near: np.ndarray) -> np.ndarray:
+    """The other neighbour of each view's nearest one, (views,)."""
+    first, second = near[near[:, 0]].T
+    return np.where(first == np.arange(len(near)), second, first)
 
 
 def _misplaced(views: Alike, squared: np.ndarray, near: np.ndarray, usual: float) -> np.ndarray:

@@ -2,11 +2,15 @@
 
 In its frame z is up and y runs from the source to the detector. View by view, source and detector are turned about the
 axis by minus (initial angle + angle). This follows its documentation of ``AcquisitionGeometry`` and its writer.
+
+Before version 20.11 it wrote two distances, the pixel and the angles alone, without their unit, and handed all of
+that to ASTRA as it was: angles count as ASTRA's, and the first row is the lowest.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +26,7 @@ from tomo_polysplat.scan.hdf5 import (
     read_numbers,
     text_attribute,
 )
-from tomo_polysplat.scan.readers.acquisition import Acquisition
+from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup
 from tomo_polysplat.scan.readers.files_of_scans import hdf5_files, the_one
 from tomo_polysplat.scan.readers.frames import Hdf5Array
 from tomo_polysplat.scan.readers.stated import require_known, stated_over
@@ -38,6 +42,8 @@ KIND = "NeXus of the Core Imaging Library"
 _SUFFIXES = (".nxs", ".nex", ".h5", ".hdf5")
 _ENTRY = "entry1/tomo_entry"
 _AXES = ("angle", "vertical", "horizontal")
+# So few views may lie within a few degrees.
+_FEW = 12
 
 
 class _Frames:
@@ -79,6 +85,8 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
         told = _told(file_of_scan, entry)
     if "input" not in known:
         told = told.saying("the numbers are taken to be line integrals; give input= if they are not")
+    if isinstance(told.setup, Setup):
+        told = _as_before(told)
     if "unit" not in known:
         told = told.saying("the file states no unit of length: mm is taken; give unit=")
     return stated_over(told, known, file_of_scan.parent)
@@ -91,9 +99,14 @@ def _files(path: Path) -> list[Path]:
 def _is_cil(file: h5py.File) -> bool:
     try:
         entry = find_group(file, _ENTRY)
-        return entry is not None and find_group(entry, "config") is not None
+        return entry is not None and (find_group(entry, "config") is not None or _is_older(entry))
     except ValueError:
         return False
+
+
+def _is_older(entry: h5py.Group) -> bool:
+    data = find_array(entry, "data/data")
+    return data is not None and text_attribute(data, "data_type") == "AcquisitionData"
 
 
 def _told(path: Path, entry: h5py.Group) -> Acquisition:
@@ -114,11 +127,38 @@ def _told(path: Path, entry: h5py.Group) -> Acquisition:
     return Acquisition(
         KIND,
         frames,
-        _geometry(entry, frames.shape, (width, height)),
+        _setup(entry, data, frames.shape[0], (width, height))
+        if find_group(entry, "config") is None
+        else _geometry(entry, frames.shape, (width, height)),
         name=path.stem,
         input="attenuation",
         top_first="top" in panel,
         from_detector="right" in panel,
+    )
+
+
+def _setup(entry: h5py.Group, data: StoredArray, views: int, pixel: tuple[float, float]) -> Setup:
+    """Of an older file."""
+    angles = read_numbers(entry, "data/rotation_angle", (views,)).astype(np.float64)
+    if text_attribute(data, "geom_type") != "cone":
+        return Setup(angles, pixel)
+    before, behind = (number_attribute(data, f"dist_{part}") for part in ("source_center", "center_detector"))
+    if not before or behind is None:
+        raise fail("path", "dist_source_center and dist_center_detector of a cone beam", "not both")
+    return Setup(angles, pixel, before, before + behind)
+
+
+def _as_before(told: Acquisition) -> Acquisition:
+    """An older file's angles, which are in radians where all of them make one turn at most."""
+    setup = told.setup
+    assert isinstance(setup, Setup)
+    said = "the axis is taken to fall on the detector's middle; give offset= if it does not"
+    if len(setup.degrees) < _FEW or np.ptp(setup.degrees) > 2 * np.pi:
+        return told.saying(said)
+    turned = replace(setup, degrees=np.rad2deg(setup.degrees))
+    return replace(told, setup=turned).saying(
+        f"the angles, which span {np.ptp(setup.degrees):.3g}, are taken for radians; give degrees= if they are not",
+        said,
     )
 
 

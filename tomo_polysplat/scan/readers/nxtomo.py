@@ -4,10 +4,14 @@ Rows are taken to begin at the top, pictures to be as seen from the source, and 
 angles do. Flips that the file tells of (``detector/transformations``, in older files ``x_flipped``, ``y_flipped``)
 are undone, as the ESRF's own programs undo them: half a turn about the vertical exchanges left and right, half a turn
 about another axis top and bottom.
+
+What Diamond's program for data acquisition writes is read as well: there the detector has a name of its own, and the
+angles stand in the group of that name beside the pictures. Positions that were measured come before those asked for.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -19,7 +23,6 @@ import numpy as np
 from tomo_polysplat.checks import fail
 from tomo_polysplat.scan.hdf5 import (
     find_array,
-    find_group,
     opened,
     read_attribute,
     read_numbers,
@@ -29,25 +32,28 @@ from tomo_polysplat.scan.hdf5 import (
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup
 from tomo_polysplat.scan.readers.files_of_scans import hdf5_files, the_one
 from tomo_polysplat.scan.readers.frames import Hdf5Frames
+from tomo_polysplat.scan.readers.nxtomo_entry import KEYS, detector_of, entry_of, group_of, names_in
 from tomo_polysplat.scan.readers.stated import require_known, stated_over
 
 if TYPE_CHECKING:
     import h5py
 
+    from tomo_polysplat.scan.hdf5_array import StoredArray
+
 __all__ = ["KIND", "read", "recognises"]
 
 KIND = "NXtomo (HDF5)"
 _SUFFIXES = (".nx", ".nxs", ".h5", ".hdf5", ".hdf")
-_KEYS = ("image_key", "image_key_control")
 _PROJECTION, _FLAT, _DARK = 0, 1, 2
-_DETECTOR, _SOURCE = "instrument/detector", "instrument/source/distance"
+_SOURCE = "instrument/source/distance"
+# Names of turns among Diamond's motors, and how those of positions that were asked for end.
+_ANGLE, _ASKED_FOR = re.compile("rot|theta|angle"), "_set"
 _MM = {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3, "micron": 1e-3, "meter": 1e3, "metre": 1e3}
 # A source so many times as far from the object as the detector is sends a parallel beam.
 _FAR = 200.0
 # Degrees by which a turn may miss half of one; the ESRF's vertical where no gravity is told.
 _HALF_TURN, _UP = 1.0, (0.0, 0.0, 1.0)
 _MOST_TURNS = 20
-_MOST_ENTRIES = 100
 
 
 def recognises(path: Path) -> bool:
@@ -59,63 +65,33 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     """See `tomo_polysplat.load_scan`; `stated` has its ``scanner``."""
     file_of_scan = the_one(_files(path))
     with opened(file_of_scan) as file:
-        entry = _entry(file)
+        entry = entry_of(file)
         assert entry is not None  # it was recognised by that
         told = _told(file_of_scan, entry)
     return stated_over(told, require_known(stated, "scanner"), file_of_scan.parent)
 
 
 def _files(path: Path) -> list[Path]:
-    return hdf5_files(path, _SUFFIXES, lambda file: _entry(file) is not None)
-
-
-def _entry(file: h5py.File) -> h5py.Group | None:
-    """The first group with pictures and their keys, which may be one of an entry's."""
-    for name in list(file)[:_MOST_ENTRIES]:
-        entry = _group(file, name)
-        if entry is None:
-            continue
-        if _is_entry(entry):
-            return entry
-        for inner in list(entry)[:_MOST_ENTRIES]:
-            group = _group(entry, inner)
-            with suppress(ValueError):  # what is no entry may hold anything
-                if group is not None and _is_entry(group):
-                    return group
-    return None
-
-
-def _group(parent: h5py.Group, name: str) -> h5py.Group | None:
-    try:
-        return find_group(parent, name)
-    except ValueError:
-        return None
-
-
-def _is_entry(group: h5py.Group) -> bool:
-    if find_group(group, _DETECTOR) is None:
-        return False
-    return any(find_array(group, f"{_DETECTOR}/{key}") is not None for key in _KEYS)
+    return hdf5_files(path, _SUFFIXES, lambda file: entry_of(file) is not None)
 
 
 def _told(path: Path, entry: h5py.Group) -> Acquisition:
-    data = find_array(entry, f"{_DETECTOR}/data")
+    detector = detector_of(entry)
+    assert detector is not None  # it was recognised by that
+    data = find_array(entry, f"{detector}/data")
     if data is None or data.ndim != 3:
         got = "none" if data is None else f"shape {data.shape}"
-        raise fail("path", f"pictures in {_DETECTOR}/data, (pictures, rows, columns)", got)
-    name = next(key for key in _KEYS if find_array(entry, f"{_DETECTOR}/{key}") is not None)
-    keys = read_numbers(entry, f"{_DETECTOR}/{name}", (len(data),))
-    angles = read_numbers(entry, "sample/rotation_angle", (len(data),)).astype(np.float64)
-    dataset = find_array(entry, "sample/rotation_angle")
-    if dataset is not None and (text_attribute(dataset, "units") or "").lower().startswith("rad"):
-        angles = np.rad2deg(angles)
+        raise fail("path", f"pictures in {detector}/data, (pictures, rows, columns)", got)
+    name = next(key for key in KEYS if find_array(entry, f"{detector}/{key}") is not None)
+    keys = read_numbers(entry, f"{detector}/{name}", (len(data),))
+    angles = _degrees(entry, detector, len(data))
     frames = {key: np.flatnonzero(keys == key) for key in (_PROJECTION, _FLAT, _DARK)}
     if not len(frames[_PROJECTION]):
         raise fail(
             "path", "pictures of image_key 0, the projections", f"keys {sorted(set(keys.tolist()))}"[:200]
         )
     stacks = {key: Hdf5Frames(data, chosen) for key, chosen in frames.items() if len(chosen)}
-    setup, unit, said = _setup(entry, angles[frames[_PROJECTION]], data.shape[2])
+    setup, unit, said = _setup(entry, detector, angles[frames[_PROJECTION]], data.shape[2])
     told = Acquisition(
         KIND,
         stacks[_PROJECTION],
@@ -124,17 +100,39 @@ def _told(path: Path, entry: h5py.Group) -> Acquisition:
         unit=unit,
         flats=stacks.get(_FLAT),
         darks=stacks.get(_DARK),
-        exposure=_first(entry, f"{_DETECTOR}/count_time"),
-        other=_others(entry),
+        exposure=_first(entry, f"{detector}/count_time"),
+        other=_others(entry, detector),
     )
     if _DARK not in stacks:
         said.append("no dark pictures: without light a pixel is taken to count 0")
-    return _unflipped(told.saying(*said), entry)
+    return _unflipped(told.saying(*said), entry, detector)
 
 
-def _unflipped(told: Acquisition, entry: h5py.Group) -> Acquisition:
+def _degrees(entry: h5py.Group, detector: str, pictures: int) -> np.ndarray:
+    """Of all pictures."""
+    names = ["sample/rotation_angle", "data/rotation_angle"]
+    name = detector.rpartition("/")[2]
+    inside = sorted(names_in(group_of(entry, name)), key=lambda axis: axis.endswith(_ASKED_FOR))
+    names += [f"{name}/{axis}" for axis in inside if _ANGLE.search(axis)]
+    name = next((name for name in names if _is_there(entry, name, pictures)), names[0])
+    angles = read_numbers(entry, name, (pictures,)).astype(np.float64)
+    dataset = find_array(entry, name)
+    if dataset is not None and (text_attribute(dataset, "units") or "").lower().startswith("rad"):
+        angles = np.rad2deg(angles)
+    return angles
+
+
+def _is_there(entry: h5py.Group, name: str, pictures: int) -> bool:
+    """Whether there are so many numbers; a file that a link leads to may be missing."""
+    with suppress(ValueError):
+        found = find_array(entry, name)
+        return found is not None and found.shape == (pictures,)
+    return False
+
+
+def _unflipped(told: Acquisition, entry: h5py.Group, detector: str) -> Acquisition:
     """With what the file tells of exchanged sides; the axis is that of the pictures as they are stored."""
-    sideways, upside_down = _flips(entry)
+    sideways, upside_down = _flips(entry, detector)
     setup = told.setup
     if not (sideways or upside_down) or not isinstance(setup, Setup):
         return told
@@ -145,11 +143,11 @@ def _unflipped(told: Acquisition, entry: h5py.Group) -> Acquisition:
     return replace(told, setup=setup, top_first=not upside_down, from_detector=sideways).saying(words)
 
 
-def _flips(entry: h5py.Group) -> tuple[bool, bool]:
+def _flips(entry: h5py.Group, detector: str) -> tuple[bool, bool]:
     """Whether left and right, and top and bottom, are exchanged."""
-    old = (_first(entry, f"{_DETECTOR}/{axis}_flipped") for axis in "xy")
+    old = (_first(entry, f"{detector}/{axis}_flipped") for axis in "xy")
     sideways, upside_down = (bool(value) for value in old)
-    turns = _group(entry, f"{_DETECTOR}/transformations")
+    turns = group_of(entry, f"{detector}/transformations")
     if turns is None:
         return sideways, upside_down
     about = {name: _axis(turns, name) for name in list(turns)[:_MOST_TURNS]}
@@ -173,13 +171,13 @@ def _axis(turns: h5py.Group, name: str) -> np.ndarray | None:
     return vector.astype(np.float64) if told else None
 
 
-def _axis_column(entry: h5py.Group, columns: int) -> tuple[float | None, list[str]]:
+def _axis_column(entry: h5py.Group, detector: str, columns: int) -> tuple[float | None, list[str]]:
     """Columns by which the axis is to the right of the middle.
 
     Files of the ESRF count from the middle, others from the first column; a full view has its axis near the middle.
     """
-    told = _first(entry, f"{_DETECTOR}/x_rotation_axis_pixel_position")
-    half = (read_text(entry, f"{_DETECTOR}/field_of_view") or "").lower() == "half"
+    told = _first(entry, f"{detector}/x_rotation_axis_pixel_position")
+    half = (read_text(entry, f"{detector}/field_of_view") or "").lower() == "half"
     if told is None or told <= columns / (2 if half else 4):
         return told, []
     shift = told - (columns - 1) / 2
@@ -188,16 +186,18 @@ def _axis_column(entry: h5py.Group, columns: int) -> tuple[float | None, list[st
     ]
 
 
-def _setup(entry: h5py.Group, degrees: np.ndarray, columns: int) -> tuple[Setup, str, list[str]]:
-    sides = [_length(entry, f"{_DETECTOR}/{axis}_pixel_size") for axis in "xy"]
-    behind, before = _length(entry, f"{_DETECTOR}/distance"), _length(entry, _SOURCE)
+def _setup(
+    entry: h5py.Group, detector: str, degrees: np.ndarray, columns: int
+) -> tuple[Setup, str, list[str]]:
+    sides = [_length(entry, f"{detector}/{axis}_pixel_size") for axis in "xy"]
+    behind, before = _length(entry, f"{detector}/distance"), _length(entry, _SOURCE)
     width, height = (side or sides[1 - k] or 0.0 for k, side in enumerate(sides))
     said, unit = [], "mm"
     if not width:
         width = height = 1.0
         unit, before = "pixel", None
         said.append("the pixel is not known: lengths are in pixels; give pixel=")
-    shift, counted = _axis_column(entry, columns)
+    shift, counted = _axis_column(entry, detector, columns)
     said += counted
     if shift is None:
         said.append("the axis is taken to fall on the detector's middle; give offset= if it does not")
@@ -210,7 +210,7 @@ def _setup(entry: h5py.Group, degrees: np.ndarray, columns: int) -> tuple[Setup,
 
 def _length(entry: h5py.Group, name: str) -> float | None:
     """In mm; positions before the object are negative in some files."""
-    value, dataset = _first(entry, name), find_array(entry, name)
+    value, dataset = _first(entry, name), _scalar(entry, name)
     if value is None or dataset is None:
         return None
     unit = (text_attribute(dataset, "units") or "m").lower()
@@ -219,17 +219,25 @@ def _length(entry: h5py.Group, name: str) -> float | None:
     return abs(value) * _MM[unit]
 
 
+def _scalar(entry: h5py.Group, name: str) -> StoredArray | None:
+    """What may be there; where nothing was known, some programs link to a text."""
+    with suppress(ValueError):
+        dataset = find_array(entry, name)
+        return None if dataset is None or not dataset.size else dataset
+    return None
+
+
 def _first(entry: h5py.Group, name: str) -> float | None:
-    dataset = find_array(entry, name)
-    if dataset is None or not dataset.size:
+    dataset = _scalar(entry, name)
+    if dataset is None:
         return None
     value = float(np.asarray(dataset[()]).reshape(-1)[0])
     return value if np.isfinite(value) else None
 
 
-def _others(entry: h5py.Group) -> dict[str, str]:
+def _others(entry: h5py.Group, detector: str) -> dict[str, str]:
     """Texts that somebody may want to see again."""
-    names = ("title", "start_time", "end_time", "instrument/name", f"{_DETECTOR}/field_of_view")
+    names = ("title", "start_time", "end_time", "instrument/name", f"{detector}/field_of_view")
     texts = {name: read_text(entry, name) for name in names}
     energy = _first(entry, "instrument/beam/incident_energy") or _first(entry, "beam/incident_energy")
     if energy is not None:

@@ -17,6 +17,7 @@ __all__ = [
     "gaps_in",
     "has_word",
     "in_order",
+    "is_reconstructed",
     "named_files",
     "numbers_of",
     "pictures_in",
@@ -47,6 +48,15 @@ _WORDS = {
     "darks": ("dark", "darks", "darkfield", "darkcurrent", "dk", "df", "di", "background"),
     "projections": ("projections", "projection", "proj", "projs", "data", "tomo", "images", "raw"),
 }
+
+
+# Folders that hold reconstructions.
+_RECONSTRUCTED = re.compile(r"rec\w*|slices|volume", re.I)
+
+
+def is_reconstructed(folder: Path) -> bool:
+    """Whether a folder's name tells of slices, not of projections."""
+    return _RECONSTRUCTED.fullmatch(folder.name) is not None
 
 
 def in_order(files: Iterable[Path]) -> list[Path]:

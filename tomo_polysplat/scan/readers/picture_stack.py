@@ -18,6 +18,7 @@ from tomo_polysplat.scan.readers.picture_names import (
     PICTURE_SUFFIXES,
     gaps_in,
     has_word,
+    is_reconstructed,
     named_files,
     pictures_in,
 )
@@ -135,14 +136,24 @@ def _sorted_out(folder: Path, known: Mapping[str, Any]) -> dict[str, list[Path]]
         left = [file for file in pictures_in(folder) if file not in taken]
         # Flats that were not named, where one of them was, are none of the object.
         left = [file for file in left if not any(has_word(file.stem, name) for name in kinds[1:])] or left
-        folders = [inner for inner in inside if has_word(inner.name, "projections")]
-        if not left and len(folders) == 1:
-            left = pictures_in(folders[0])
+        left = left or _pictures_of_one(inside, taken)
         if not left:
-            remedy = "pass scanner={'projections': 'FOLDER or PATTERN'}"
+            remedy = "pass scanner={'projections': 'FOLDER or PATTERN'} (--projections)"
             raise fail("path", "pictures of an object (TIFF, EDF or .npy)", f"none in {folder}", remedy)
         files["projections"] = left
     return files
+
+
+def _pictures_of_one(folders: list[Path], taken: set[Path]) -> list[Path]:
+    """Pictures of the only folder named as those of projections are, else of the only one with pictures at all."""
+    named = [folder for folder in folders if has_word(folder.name, "projections")]
+    full = [
+        folder
+        for folder in folders
+        if not is_reconstructed(folder) and (pictures := pictures_in(folder)) and pictures[0] not in taken
+    ]
+    only = next((some[0] for some in (named, full) if len(some) == 1), None)
+    return [] if only is None else pictures_in(only)
 
 
 def guessed(told: Acquisition, known: Mapping[str, Any]) -> Acquisition:

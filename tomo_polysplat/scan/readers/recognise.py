@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -24,12 +23,10 @@ from tomo_polysplat.scan.readers.acquisition import Acquisition
 from tomo_polysplat.scan.readers.entries import entries_of
 from tomo_polysplat.scan.readers.files_of_scans import the_one
 from tomo_polysplat.scan.readers.other_makers import what_is_told
-from tomo_polysplat.scan.readers.picture_names import PICTURE_SUFFIXES, pictures_in
+from tomo_polysplat.scan.readers.picture_names import PICTURE_SUFFIXES, is_reconstructed, pictures_in
 
 __all__ = ["acquisition_of"]
 
-# Folders that hold reconstructions.
-_RECONSTRUCTED = re.compile(r"rec\w*|slices|volume", re.I)
 _MOST_FOLDERS = 100
 _MOST_NAMED = 3
 # Pictures for the eye.
@@ -112,4 +109,4 @@ def _folders_of_scans(path: Path) -> list[Path]:
     inside = sorted(
         folder for folder in entries_of(path) if folder.is_dir() and os.access(folder, os.R_OK | os.X_OK)
     )
-    return [folder for folder in inside if not _RECONSTRUCTED.fullmatch(folder.name)][:_MOST_FOLDERS]
+    return [folder for folder in inside if not is_reconstructed(folder)][:_MOST_FOLDERS]

@@ -115,7 +115,13 @@ def require_no_slips(others: Iterable[str], where: str) -> None:
 def with_options(stated: Mapping[str, Any], options: ReadOptions) -> dict[str, Any]:
     """What a user states, with the arguments of `tomo_polysplat.load_scan` that say the same."""
     known = require_known(stated, "scanner")
-    for key, value in (("unit", options.unit), ("degrees", options.theta), ("pixel", options.pixel_size)):
+    said = {
+        "unit": options.unit,
+        "degrees": options.theta,
+        "pixel": options.pixel_size,
+        "input": options.input,
+    }
+    for key, value in said.items():
         if value is not None:
             known.setdefault(key, value)
     if options.centre is not None:

@@ -36,6 +36,8 @@ _WIDE_VIEW, _NO_VIEW = 90.0, 130.0
 # Rays to look at, and line integrals that the middle one of them cannot have: of more light than was sent, by 1.65, and
 # of less than 1e-13 of it.
 _LOOKED_AT, _BRIGHTER, _OPAQUE = 100_000, 0.5, 30.0
+# Share of rays without any light from which decimals of no open beam are taken for no counts.
+_WITHOUT = 0.05
 # A usual flat panel, where nothing tells of the detector.
 _PANEL = "csi:0.6mm"
 
@@ -64,6 +66,8 @@ def scan_from_acquisition(told: Acquisition, options: ReadOptions, part: Part) -
     told, flat, dark = _open_beam(told, kind, pictures)
     counts = Counts(lambda: nullcontext(pictures.views), pictures.shape, kind, flat, dark, limit)
     projections, valid, rays = line_integrals(counts, options.progress)
+    if told.flats is None and told.white is None and flat is not None:
+        _require_light(told, float(flat.max()), rays["no_light"] / valid.size)
     _require_possible(told, kind, projections, valid)
     told, spectrum = _spectrum(told, options)
     seen = part.of(geometry, (pictures.rows, pictures.columns))
@@ -160,6 +164,14 @@ def _require_reachable(name: str, light: float, told: Acquisition) -> None:
     raise fail(name, expected, f"{light:.6g}", remedy)
 
 
+def _require_light(told: Acquisition, open_beam: float, without: float) -> None:
+    """Refuse what cannot be counts without flats: where there is air, line integrals are as often below 0 as above."""
+    if told.frames.dtype.kind != "f" or open_beam > _OPAQUE or without < _WITHOUT or 0.7 < open_beam < 1.3:
+        return
+    got = f"decimals up to {open_beam:.3g}, {100 * without:.0f} % of them 0 or less, as line integrals have them"
+    raise fail("input", "counts, or their open beam beside them", got, "say attenuation (--input), or white=")
+
+
 def _require_possible(told: Acquisition, kind: str, projections: np.ndarray, valid: np.ndarray) -> None:
     """Refuse rays most of which are brighter than the open beam, or darker than anything that lets light through."""
     chosen = np.unravel_index(
@@ -194,14 +206,17 @@ def _geometries(seen: Geometry, told: Acquisition, options: ReadOptions) -> dict
 def _spectrum(told: Acquisition, options: ReadOptions) -> tuple[Acquisition, Spectrum | None]:
     """The caller's spectrum, else that of the tube and its filters behind a usual detector."""
     tube = told.tube
-    if options.spectrum is not None or told.unit == "pixel":
+    if options.spectrum is not None:
         return told, options.spectrum
+    if told.unit == "pixel":
+        lacking = "lengths are in pixels, with which a spectrum cannot be used; give pixel="
+        return told if tube.kvp is None else told.saying(lacking), None
     if tube.kvp is None:
         # A parallel beam is mostly a synchrotron's, of one energy.
         if _geometry(told).beam == "cone":
             told = told.saying(
-                "the voltage of the tube is not known: there is no spectrum, and one energy is taken, which does not "
-                "mend what metal does; give kvp=, filter= and detector= (--kvp, --filter, --detector)"
+                "the voltage of the tube is not known, and without a spectrum metal is not corrected; give kvp=, "
+                "filter= and detector="
             )
         return told, None
     if tube.filters is None:
@@ -230,8 +245,12 @@ def _filter_words(filters: Mapping[str, float]) -> str:
 
 
 def _tell(told: Acquisition, rays: dict[str, int], valid: np.ndarray) -> None:
-    for guess in told.said:
-        logger.warning("%s: %s", told.kind, guess)
+    """All guesses in one warning, a line each."""
+    if len(told.said) == 1:
+        logger.warning("%s: %s", told.kind, told.said[0])
+    elif told.said:
+        lines = "\n  - ".join(["what is not told is guessed:", *map(visible, told.said)])
+        logger.warning("%s: %s", visible(told.kind), lines, extra={"has_own_lines": True})
     lost = valid.size - np.count_nonzero(valid)
     if lost:
         kinds = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in rays.items() if count)

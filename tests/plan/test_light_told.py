@@ -1,0 +1,71 @@
+"""Some views are looked at first, and all of them where these show anything."""
+
+import numpy as np
+import pytest
+
+from tomo_polysplat.fit.residual_sums import ResidualSums
+from tomo_polysplat.nuisances.gains import Gains
+from tomo_polysplat.plan import light_told
+from tomo_polysplat.settings import Settings
+
+VIEWS, ROWS, COLUMNS, NOISE = 300, 61, 83, 0.02
+
+
+class _Scan:
+    """What `ask_light` reads of a problem and of rays."""
+
+    def __init__(self, gain):
+        rng = np.random.default_rng(3)
+        self.left = rng.normal(0, NOISE, (VIEWS, ROWS, COLUMNS)) + rng.normal(0, gain, (ROWS, COLUMNS))
+        self.held = rng.random(self.left.shape) < 0.05
+        self.views, self.steps, self.asked = range(VIEWS), [], []
+        self.taken, self.gains, self.drift = self, np.zeros((ROWS, COLUMNS)), np.zeros(VIEWS)
+
+    def sums(self, gaussians, scene, rays, settings, some=None):
+        some = np.arange(VIEWS) if some is None else some
+        self.asked.append(len(some))
+        left, held = self.left[some], self.held[some]
+        block = np.arange(len(some)) * 8 // len(some)
+        weight, total = np.zeros((2, 8, ROWS, COLUMNS))
+        np.add.at(weight, block, ~held)
+        np.add.at(total, block, np.where(held, 0.0, left))
+        view, row, column = np.nonzero(held)
+        by_view = np.zeros((2, len(some), 1))
+        deviation = np.full(len(view), NOISE)
+        parts = view, row * COLUMNS + column, left[held], deviation, some
+        return ResidualSums(weight, total, by_view, by_view, *parts)
+
+
+def asked(monkeypatch, gain, **options):
+    scan = _Scan(gain)
+    monkeypatch.setattr(light_told, "residual_sums", scan.sums)
+    monkeypatch.setattr(light_told, "_axis_column", lambda problem: np.nan)
+    told = light_told.ask_light(scan, None, None, scan, None, Settings(**options))
+    return scan.asked, told["gains"]
+
+
+def test_a_steady_scanner_is_looked_at_in_some_views_only(monkeypatch):
+    looks, gains = asked(monkeypatch, 0.0)
+    assert looks == [128] and not gains.kept and not gains.change.any()
+
+
+# The fainter one is a twentieth of the noise of a ray: of all views it is worth 0.1 % of the misfit, of some it is not.
+@pytest.mark.parametrize("gain", [0.05 * NOISE, 2 * NOISE])
+def test_what_all_views_tell_is_not_missed_by_some(monkeypatch, gain):
+    looks, gains = asked(monkeypatch, gain)
+    assert looks == [128, VIEWS]
+    assert gain < NOISE or gains.kept
+
+
+def test_what_a_caller_asks_for_is_told_by_all_views(monkeypatch):
+    assert asked(monkeypatch, 0.0, gains=True)[0] == [VIEWS]
+
+
+def test_a_part_of_the_views_rules_out_only_what_all_would_not_confirm():
+    # Gains of variance x in units of a ray's noise take x^2 / (x + 1 / n) of the misfit, as n views tell them.
+    for x in np.geomspace(1e-5, 1e-1, 41):
+        of_all, of_some = (x**2 / (x + 1 / n) for n in (1000, 100))
+        if Gains.gate({"rms": 1.0, "better": of_all, "error": 0.0}).kept:
+            assert not Gains.ruled_out({"better": of_some, "error": 0.0}, 0.1)
+    assert Gains.ruled_out({"better": 9e-5, "error": 0.0}, 0.1)
+    assert not Gains.ruled_out({"better": float("nan"), "error": float("nan")}, 0.1)
