@@ -7,6 +7,7 @@ import platform
 import shutil
 import subprocess
 import time
+from dataclasses import replace
 from importlib.util import find_spec
 
 import tomo_polysplat
@@ -14,7 +15,7 @@ from tomo_polysplat.free_memory import available_memory
 from tomo_polysplat.parallel import cpu_threads
 from tomo_polysplat.versions import installed_version
 
-__all__ = ["findings", "self_test"]
+__all__ = ["findings", "self_test", "warm"]
 
 Lines = list[tuple[str, str]]
 
@@ -86,6 +87,32 @@ def self_test() -> tuple[bool, str]:
         return False, f"{type(error).__name__}: {error}"
     seconds = time.perf_counter() - started
     return ours > standard, f"24^3 voxels: {ours:.1f} dB, FDK {standard:.1f} dB, {seconds:.1f} s in all"
+
+
+def warm() -> str:
+    """Compile the kernels of all kinds of scans, which stay on disk, so that no later run on this machine has to.
+
+    Returns
+    -------
+    str
+        How long compiling took, and all of it.
+    """
+    from tomo_polysplat.kernels.compile_time import compiled_seconds, track_compiling
+    from tomo_polysplat.simulate.scenes import simulate_scan
+
+    track_compiling()
+    started, before = time.perf_counter(), compiled_seconds()
+    for geometry in ("cone", "parallel", "fan"):
+        metal, plain = (
+            simulate_scan("pins", 16, 48, metal=there, geometry=geometry) for there in (True, False)
+        )
+        # Three images and averaged light or thin rays, one image under a spectrum, and one without.
+        kinds = ((metal, 2), (metal, 1), (plain, 1), (replace(plain, spectrum=None), 1))
+        for scan, rays in kinds:
+            settings = {"passes": 2.0, "pixel_rays": rays}
+            tomo_polysplat.reconstruct(scan, settings=settings, progress=False)
+    compiling, whole = compiled_seconds() - before, time.perf_counter() - started
+    return f"{compiling:.1f} s of compiling, {whole:.1f} s in all"
 
 
 def _packages() -> Lines:

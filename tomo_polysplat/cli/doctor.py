@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 
 NAME = "doctor"
 HELP = "say which versions, devices and kernels are there and why, and test them"
@@ -11,16 +12,30 @@ HELP = "say which versions, devices and kernels are there and why, and test them
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this subcommand."""
     parser.add_argument("--no-test", action="store_true", help="leave out the self-test")
+    parser.add_argument(
+        "--warm",
+        action="store_true",
+        help="compile all kernels now, so that no later run has to wait for them",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the findings; the exit status is 1 when the self-test fails."""
-    from tomo_polysplat.doctor import findings, self_test
+    from tomo_polysplat.doctor import findings, self_test, warm
 
     for heading, lines in findings():
         print(heading)
         for name, text in lines:
             print(f"  {name:<16} {text}")
+    if arguments.warm:
+        # What is wrong with the small scans that kernels are compiled by is nobody's concern.
+        logger = logging.getLogger("tomo_polysplat")
+        level = logger.level
+        logger.setLevel(logging.ERROR)
+        try:
+            print(f"kernels\n  {'compiled':<16} {warm()}")
+        finally:
+            logger.setLevel(level)
     if arguments.no_test:
         return 0
     passed, text = self_test()
