@@ -290,15 +290,16 @@ def test_doctor_compiles_for_every_kind_of_scan(monkeypatch, capsys):
     asked, seconds = set(), iter((1.5, 7.5))
 
     def reconstruct(scan, *, settings, progress):
-        kind = scan.proj_geom["type"].split("_")[0], scan.metal_mask.any(), scan.spectrum is not None
-        asked.add((*kind, settings["pixel_rays"]))
+        shape = scan.proj_geom["type"].split("_")[0], len(scan.projections) == 1
+        asked.add((shape, scan.metal_mask.any(), scan.spectrum is not None, settings["pixel_rays"]))
 
     monkeypatch.setattr(doctor.tomo_polysplat, "reconstruct", reconstruct)
     monkeypatch.setattr("tomo_polysplat.kernels.compile_time.compiled_seconds", lambda: next(seconds))
     assert main(["doctor", "--no-test", "--warm"]) == 0
     assert "6.0 s of compiling" in capsys.readouterr().out
     ways = {(True, True, 2), (True, True, 1), (False, True, 1), (False, False, 1)}
-    assert asked == {(kind, *way) for kind in ("cone", "parallel3d", "fanflat") for way in ways}
+    shapes = ("cone", False), ("parallel3d", False), ("cone", True)
+    assert asked == {(shape, *way) for shape in shapes for way in ways}
 
 
 def test_doctor_knows_the_wrong_dxchange(monkeypatch):
