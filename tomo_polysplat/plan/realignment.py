@@ -50,7 +50,7 @@ _WHOLE = ("u", "roll")
 _TOLD, _AXIS_KNOWN = 0.1, 0.02
 # Moves of more than this, in pixels of what is seen, beyond so many standard errors are looked for, and views shifted
 # by more than that; once any is, all that are sure to so many standard errors are made.
-_LEAST, _SURE, _LEAST_OF_VIEWS, _FOUND = 0.01, 2.5, 0.03, 2.0
+_LEAST, _SURE, _LEAST_OF_VIEWS, _FOUND = 0.01, 2.5, 0.05, 2.0
 # They are kept where the misfit of the same held-out rays falls by more than this, and by so many standard errors.
 _BETTER, _SURELY_BETTER = 0.01, 2.5
 # Fits, their passes, and the change, in pixels, after which the moves are known.
