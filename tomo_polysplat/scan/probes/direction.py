@@ -14,6 +14,9 @@ __all__ = ["direction_doubt", "turned_round"]
 
 # Views that are compared, and those that it takes to tell; pairs of any place that a place must have, of the most.
 _VIEWS, _FEWEST_VIEWS, _ENOUGH = 60, 24, 0.2
+# Where both ways leave less than this share of the variance, the object looks the same turned round: 80 scans that did
+# go the other way left 0.010 and more as told, and pins, on a circle, 0.0008 at most.
+_ALIKE = 0.003
 
 
 def turned_round(rays: OppositeRays) -> OppositeRays:
@@ -43,7 +46,7 @@ def direction_doubt(rays: OppositeRays, told: AxisOffset, turned: AxisOffset) ->
     both = [_sums(*one) for one in ((rays, told), (turned_round(rays), turned))]
     differences, variances, samples = (np.stack(one, axis=-1) for one in zip(*both))
     found = compare(differences, variances, samples)
-    if found is None or not np.isfinite(found.doubt).all():
+    if found is None or not np.isfinite(found.doubt).all() or found.mismatch.max() < _ALIKE:
         return 0.0, 1.0
     return float(found.doubt[1] - found.doubt[0]), float(found.mismatch[0] / found.mismatch[1])
 

@@ -173,7 +173,8 @@ def _shows(
     typical, usual : float
         Median of the first over a scan in order, and mean of any two views.
     """
-    error = views.error(nearer)
+    # What is known of the noise is wrong by as much as a squared difference less it lies below 0.
+    error = np.maximum(views.error(nearer), -between)
     apart = nearer - _FURTHER * np.maximum(between, 0) > _SURE * error
     apart &= nearer > np.clip(_TIMES * typical, _LEAST * usual, _FAR * usual)
     # The best of many: chance finds one more easily.
