@@ -1,5 +1,7 @@
 """`check` of objects and noise that tell nothing about directions and orders."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -26,3 +28,12 @@ class _Noise:
 def test_a_difference_far_below_nothing_says_that_the_noise_is_not_known(between, misplaced):
     nearer, between, like = np.array([[3e-3], [between], [-1.1e-3]])
     assert _shows(_Noise(), nearer, between, like, 1e-4, 1.3e-2).tolist() == [misplaced]
+
+
+def test_one_view_of_few_photons_at_the_border_is_no_object():
+    scan = simulate_scan("pins", 24, 48, geometry="fan", metal=False, photons=1e5)
+    for views, told in ((1, "ok"), (3, "defect")):
+        values = scan.projections.copy()
+        values[:, 7 : 7 + views, :2] += 0.9
+        (found,) = (f for f in check_scan(replace(scan, projections=values)) if f.probe == "truncation")
+        assert str(found.verdict) == told
