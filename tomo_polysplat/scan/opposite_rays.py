@@ -141,9 +141,7 @@ class OppositeRays:
         past = np.mod(there - self.azimuth[first] + 1e-9, 2 * np.pi)
         gap = np.mod(self._gaps[first], 2 * np.pi)
         # A half turn that ends where it began, but for what motors miss: the view at the gap's rim is opposite.
-        at_rim = (gap > _GAP * self._step) & (
-            np.minimum(past, gap - past) < 2 * _STILL / self.values.shape[1]
-        )
+        at_rim = (gap > _GAP * self._step) & (np.minimum(past, gap - past) < self._still)
         past = np.where(at_rim, np.where(past < 0.5 * gap, 0, self._step), past)
         return first, past, np.where(at_rim, self._step, gap)
 
@@ -281,6 +279,7 @@ class OppositeRays:
 
     @property
     def _still(self) -> float:
+        """Angle that moves no matter on the detector by more than `_STILL` columns."""
         return 2 * _STILL / self.values.shape[1]
 
     @property
