@@ -12,7 +12,7 @@ from tomo_polysplat.scan.centre import chosen_rows, estimate_centre
 from tomo_polysplat.scan.circular import parallel_geometry
 from tomo_polysplat.scan.counts import Counts, Marks
 from tomo_polysplat.scan.dxchange_host import read_block
-from tomo_polysplat.scan.hdf5 import find_array, text_attribute
+from tomo_polysplat.scan.hdf5 import find_array, is_in_radians, text_attribute
 from tomo_polysplat.scan.reading import ReadOptions
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def _angles(file: h5py.File, views: int, given: Any, centre: float | None) -> np
         dataset = find_array(file, "exchange/theta")
         if dataset is None:
             raise _missing_theta(views)
-        in_radians = (text_attribute(dataset, "units") or "").lower().startswith("rad")
+        in_radians = is_in_radians(dataset)
         if dataset.shape != (views,):
             raise fail("theta", f"shape {(views,)} (views,)", f"{dataset.shape}")
         given = read_block(dataset)

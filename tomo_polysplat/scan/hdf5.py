@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from tomo_polysplat.physics.spectrum import Spectrum
 
 __all__ = [
-    *("find_array", "find_group", "number_attribute", "opened", "read_attribute", "read_json"),
-    *("read_numbers", "read_spectrum", "read_text", "text_attribute", "write_spectrum"),
+    *("find_array", "find_group", "is_in_radians", "number_attribute", "opened", "read_attribute"),
+    *("read_json", "read_numbers", "read_spectrum", "read_text", "text_attribute", "write_spectrum"),
 ]
 
 _LARGEST_ATTRIBUTE = 2**16
@@ -225,6 +225,11 @@ def text_attribute(item: h5py.HLObject | StoredArray, name: str) -> str | None:
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.reshape(-1)[0]
     return _text(value) if isinstance(value, (str, bytes)) else None
+
+
+def is_in_radians(angles: h5py.HLObject | StoredArray) -> bool:
+    """Whether their attribute ``units`` says so; degrees are usual."""
+    return (text_attribute(angles, "units") or "").lower().startswith("rad")
 
 
 def number_attribute(item: h5py.HLObject | StoredArray, name: str) -> float | None:

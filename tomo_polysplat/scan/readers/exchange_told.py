@@ -13,7 +13,7 @@ import numpy as np
 
 from tomo_polysplat.checks import fail
 from tomo_polysplat.scan.data_exchange_pictures import input_kind, pictures_of
-from tomo_polysplat.scan.hdf5 import find_array, find_group, opened, read_numbers, read_text, text_attribute
+from tomo_polysplat.scan.hdf5 import find_array, find_group, is_in_radians, opened, read_numbers, read_text
 from tomo_polysplat.scan.readers.acquisition import Acquisition
 from tomo_polysplat.scan.readers.frames import ArrayFrames, Frames, Hdf5Frames
 from tomo_polysplat.scan.readers.picture_stack import full_turn, guessed
@@ -88,5 +88,4 @@ def _degrees(file: h5py.File, views: int) -> np.ndarray | None:
     if dataset is None:
         return None
     angles = read_numbers(file, "exchange/theta", (views,)).astype(np.float64)
-    in_radians = (text_attribute(dataset, "units") or "").lower().startswith("rad")
-    return np.rad2deg(angles) if in_radians else angles
+    return np.rad2deg(angles) if is_in_radians(dataset) else angles

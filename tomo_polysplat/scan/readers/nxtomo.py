@@ -23,6 +23,7 @@ import numpy as np
 from tomo_polysplat.checks import fail
 from tomo_polysplat.scan.hdf5 import (
     find_array,
+    is_in_radians,
     opened,
     read_attribute,
     read_numbers,
@@ -117,7 +118,7 @@ def _degrees(entry: h5py.Group, detector: str, pictures: int) -> np.ndarray:
     name = next((name for name in names if _is_there(entry, name, pictures)), names[0])
     angles = read_numbers(entry, name, (pictures,)).astype(np.float64)
     dataset = find_array(entry, name)
-    if dataset is not None and (text_attribute(dataset, "units") or "").lower().startswith("rad"):
+    if dataset is not None and is_in_radians(dataset):
         angles = np.rad2deg(angles)
     return angles
 
