@@ -18,7 +18,8 @@ SMALL = {
         '"unit": "cm"}': '"unit": "cm", "quality": "fast"}',
         'unit="cm").volume': 'unit="cm", quality="fast").volume',
     },
-    "03_astra_cone_geometry": {"SIZE, VIEWS, QUALITY = 40, 120": "SIZE, VIEWS, QUALITY = 16, 32"},
+    # Large enough for opposite rays to tell the axis, as in the notebook.
+    "03_astra_cone_geometry": {"SIZE, VIEWS, QUALITY = 40, 120": "SIZE, VIEWS, QUALITY = 20, 40"},
     "04_spectrum_and_materials": {"SIZE, VIEWS, QUALITY = 40, 120": "SIZE, VIEWS, QUALITY = 24, 40"},
     "05_speed_against_error": {
         "SIZE, VIEWS, PASSES = 40, 120, (10, 40)": "SIZE, VIEWS, PASSES = 16, 24, (1, 2)"
