@@ -4,6 +4,7 @@
 wrong, as JSON.
 """
 
+import gc
 import json
 import math
 import sys
@@ -158,6 +159,8 @@ def skip_unread_sums() -> None:
 
 
 def main() -> None:
+    # Nearly all of what the interpreter makes is gone with its last name; to look for circles takes a tenth.
+    gc.disable()
     poison()
     patch_once()
     hurry()
