@@ -99,6 +99,7 @@ def test_the_command_line_has_the_same_words(path, monkeypatch):
     command = ["import", path.name, "-o", "cone.h5"]
     command += ["--sod", str(at.source_object), "--sdd", str(at.source_detector), "--pixel", str(at.pixel)]
     assert main([*command, "--offset", str(at.pixel * at.columns_off), "0"]) == 0
-    scan = tps.load_scan(path.parent / "cone.h5")
-    np.testing.assert_array_equal(scan.projections, tps.load_scan(path, scanner=SCANNER).projections)
+    scan, told = tps.load_scan(path.parent / "cone.h5"), tps.load_scan(path, scanner=SCANNER)
+    np.testing.assert_array_equal(scan.projections, told.projections)
+    np.testing.assert_equal(scan.proj_geom, told.proj_geom)
     assert scan.unit == "mm"
