@@ -75,10 +75,11 @@ def move_sums(
         left = _left(measured - predicted, fitted, max(settings.model_error, _LEAST_ERROR))
         slopes, trust = _slopes(predicted, falls[:, here]), fitted.square()
         for side, part in enumerate((slice(0, columns // 2), slice(columns // 2, columns))):
-            one = slopes[..., part].flatten(2).double()
-            weighed = one * trust[:, None, :, part].flatten(2).double()
-            normal[side, here] = weighed @ one.transpose(1, 2)
-            told[side, here] = torch.einsum("vmp,vp->vm", weighed, left[..., part].flatten(1).double())
+            # Row by row: a GPU would make the products of a whole view on a single multiprocessor.
+            one = slopes[..., part].double().transpose(1, 2)
+            weighed = one * trust[:, :, None, part].double()
+            normal[side, here] = (weighed @ one.transpose(2, 3)).sum(dim=1)
+            told[side, here] = (weighed @ left[..., part, None].double())[..., 0].sum(dim=1)
     return MoveSums(*(part.cpu().numpy() for part in (normal, told, held_out)))
 
 
