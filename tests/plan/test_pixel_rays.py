@@ -109,7 +109,10 @@ def amid(monkeypatch, ahead, misfits=(1.0, 1.0)):
     monkeypatch.setattr("tomo_polysplat.plan.decisions.pixel_rays.close_up", lambda fitter, views: near)
     clock = Clock(10, working_time() + 3600)
     clock.done = 5
-    run, lab = Run(SimpleNamespace(branch=branch), clock), Lab(None, None, None, None, plan=planned(passes=15.0))
+    run, lab = (
+        Run(SimpleNamespace(branch=branch), clock),
+        Lab(None, None, None, None, plan=planned(passes=15.0)),
+    )
     fitter = run.fitter
     ask_between(lab, run, (PixelRays,))
     assert run.made is None and clock.done == 5
@@ -124,7 +127,9 @@ def test_a_budget_that_ends_amid_the_question_leaves_the_run_as_it_was(monkeypat
     assert after is fitter and answer.value == 1 and "time budget" in answer.why
 
 
-@pytest.mark.parametrize(("thin", "left", "taken"), [(1.0, 1.0, 2), (1.0, 1.5, 1), (1.0, 0.5, 1), (0.0, 1.0, 1)])
+@pytest.mark.parametrize(
+    ("thin", "left", "taken"), [(1.0, 1.0, 2), (1.0, 1.5, 1), (1.0, 0.5, 1), (0.0, 1.0, 1)]
+)
 def test_the_run_goes_on_from_where_it_stood_as_the_rays_at_metal_say(monkeypatch, thin, left, taken):
     answer, after, fitter, averaged = amid(monkeypatch, lambda clock, passes: None, (thin, left))
     assert answer.value == taken and answer.status is Status.ASKED
