@@ -192,7 +192,7 @@ def test_unknown_names_are_refused():
 
 def test_record_table_and_figures(folder, tmp_path):
     methods = ("fdk", "polysplat")
-    bench = ReconBench(("pins",), (11, 12), methods, views=44, settings=QUICK)
+    bench = ReconBench(("pins",), (11, 12), methods, views=20, settings=QUICK)
     seen = []
     record = run_recon_bench(bench, cache=folder, update=lambda r: seen.append(len(r["runs"])))
     assert seen == [2, 4]

@@ -51,11 +51,11 @@ def cone_beam_tilted_detector_three_channels(device):
 def a_large_cloud_portion_by_portion(device):
     """Without gradients; both a cone and a slice."""
     for scene, views in (
-        (as_float32(gaussians(9)), cone_views(3, 9, 13)),
-        (as_float32(gaussians(5, planar=True)), planar_views(True, 3, 13)),
+        (as_float32(gaussians(9)), cone_views(2, 9, 13)),
+        (as_float32(gaussians(5, planar=True)), planar_views(True, 2, 13)),
     ):
         whole, _ = project(*(t.to(device, torch.float32) for t in scene), views, kernel="triton", cutoff=3.0)
-        with mock.patch.object(portions, "FOOTPRINTS", 12), mock.patch.object(portions, "_WHOLE", 4):
+        with mock.patch.object(portions, "FOOTPRINTS", 8), mock.patch.object(portions, "_WHOLE", 4):
             parted, _ = project(
                 *(t.to(device, torch.float32) for t in scene), views, kernel="triton", cutoff=3.0
             )

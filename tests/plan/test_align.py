@@ -65,7 +65,8 @@ def test_an_axis_that_is_off_is_found_and_used():
 @pytest.mark.parametrize("align", ["auto", ("u",)])
 def test_what_no_ray_confirms_is_not_moved(align):
     scan = fan(metal=False)
-    asked, plain = (reconstruct(scan, scan.proj_geom, align=one) for one in (align, False))
+    settings = QUICK | {"passes": 1.0}  # the two are to be the same to the bit, whatever they come to
+    asked, plain = (reconstruct(scan, scan.proj_geom, align=one, settings=settings) for one in (align, False))
     assert asked.plan["alignment"].value == {}
     assert ("no move" if align != "auto" else "where it was told") in asked.plan["alignment"].why
     assert np.array_equal(asked.volume, plain.volume)

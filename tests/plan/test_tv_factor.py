@@ -114,9 +114,11 @@ def test_when_nothing_is_asked(changed, because):
     assert because in fitted(slice_of(FLAT, 0.05), **hasty).plan["tv_factor"].why
 
 
-@pytest.mark.parametrize(("discs", "noise", "more"), [(FLAT, 0.05, True), (RINGS, 0.005, False)])
-def test_a_slice_of_few_views_is_asked_as_well(discs, noise, more):
-    scan = slice_of(discs, noise, views=30)
+@pytest.mark.parametrize(
+    ("discs", "noise", "size", "more"), [(FLAT, 0.05, 40, True), (RINGS, 0.005, SIZE, False)]
+)
+def test_a_slice_of_few_views_is_asked_as_well(discs, noise, size, more):
+    scan = slice_of(discs, noise, views=30, size=size)
     found, other = (fitted(scan, views_per_step=3, tv_factor=k) for k in (None, 1 if more else 3))
     assert "misfit of the held-out rays" in found.plan["tv_factor"].why
     assert (found.plan["tv_factor"].value == 3) == more

@@ -1,14 +1,12 @@
 """Data Exchange without geometry, of a cone beam that the user describes."""
 
-import subprocess
-import sys
-
 import h5py
 import numpy as np
 import pytest
 from folders import marked, require_the_same_volume
 
 import tomo_polysplat as tps
+from tomo_polysplat.cli.main import main
 from tomo_polysplat.simulate.folders.scene import SETTINGS, pictures_of
 
 SCANNER = {
@@ -95,12 +93,13 @@ def test_a_file_with_a_geometry_is_not_described_again(path):
         tps.load_scan(path.parent / "own.h5", scanner=SCANNER)
 
 
-def test_the_command_line_has_the_same_words(path):
+def test_the_command_line_has_the_same_words(path, monkeypatch):
     at = SETTINGS
-    command = [sys.executable, "-m", "tomo_polysplat.cli.main", "import", path.name, "-o", "cone.h5"]
+    monkeypatch.chdir(path.parent)
+    command = ["import", path.name, "-o", "cone.h5"]
     command += ["--sod", str(at.source_object), "--sdd", str(at.source_detector), "--pixel", str(at.pixel)]
-    command += ["--offset", str(at.pixel * at.columns_off), "0"]
-    subprocess.run(command, capture_output=True, text=True, cwd=path.parent, check=True)
-    scan = tps.load_scan(path.parent / "cone.h5")
-    np.testing.assert_array_equal(scan.projections, tps.load_scan(path, scanner=SCANNER).projections)
+    assert main([*command, "--offset", str(at.pixel * at.columns_off), "0"]) == 0
+    scan, told = tps.load_scan(path.parent / "cone.h5"), tps.load_scan(path, scanner=SCANNER)
+    np.testing.assert_array_equal(scan.projections, told.projections)
+    np.testing.assert_equal(scan.proj_geom, told.proj_geom)
     assert scan.unit == "mm"
