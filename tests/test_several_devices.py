@@ -18,10 +18,15 @@ from small_scans import reconstruct as reconstruct_anywhere
 import tomo_polysplat as tps
 from tomo_polysplat.fit.fitter import Fitter
 from tomo_polysplat.fit.led_step import LedStep
+from tomo_polysplat.fit.move_sums import move_sums
+from tomo_polysplat.fit.residual_sums import residual_sums
 from tomo_polysplat.fit.step import EagerStep
 from tomo_polysplat.rank_processes import devices_of, sharing
 from tomo_polysplat.ranks import ALONE, RankFailed, current_ranks, led_by, part_of
 from tomo_polysplat.scan.io import save_scan
+
+sys.path.append(str(Path(__file__).parent / "kernels"))
+from step_scenes import fit_problem
 
 CPU = torch.device("cpu")
 TWO = ["cpu", "cpu"]
@@ -87,6 +92,21 @@ def three():
         yield current_ranks()
 
 
+@pytest.fixture
+def connected(three):
+    """The same, after they have begun to make something together."""
+    if three.connect is not None:
+        with three.together():
+            pass
+    return three
+
+
+def moves_left(gaussians, scene, rays, settings):
+    """`move_sums` of made-up moves."""
+    falls = np.random.default_rng(0).normal(0, 0.1, (2, len(rays.views), 3, 3))
+    return move_sums(gaussians, scene, rays, settings, torch.from_numpy(falls))
+
+
 class TestThreeProcesses:
     """What they make is what one makes."""
 
@@ -148,6 +168,25 @@ class TestThreeProcesses:
         monkeypatch.setattr(Fitter, "_end_pass", torch.no_grad()(turned_over))
         shared, one = reconstruct(scan, settings=settings), alone(scan, settings=settings)
         assert same(shared.volume, one.volume) and made
+
+    @pytest.mark.parametrize("sums", [residual_sums, moves_left])
+    def test_take_a_part_of_the_views_each_for_sums(self, connected, monkeypatch, sums):
+        """Views that go together are the same for any number of processes, so that each view's sums are, too."""
+        monkeypatch.setattr(sys.modules[residual_sums.__module__], "_AT_ONCE", 1)
+        monkeypatch.setattr(sys.modules[move_sums.__module__], "_AT_ONCE", 1)
+        fit, told = fit_problem("cone", True, "cpu", "numba"), []
+        parts = fit.gaussians, fit.scene, fit.rays, fit.settings
+        tell = type(connected).tell
+        monkeypatch.setattr(
+            type(connected), "tell", lambda *message: (told.append(message[1]), tell(*message))
+        )
+        shared = sums(*parts)
+        assert told == ["rays", "work"]
+        with led_by(ALONE):
+            one = sums(*parts)
+        for name, expected in vars(one).items():
+            np.testing.assert_allclose(getattr(shared, name), expected, rtol=1e-12, atol=0, err_msg=name)
+            assert expected.size and (expected != 0).any(), name
 
     def test_stand_still_after_ctrl_c_within_a_step(self, three, monkeypatch):
         """The last thing that they do: the best state is returned, and nothing more is asked of them."""

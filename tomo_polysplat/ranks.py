@@ -55,7 +55,7 @@ class Ranks:
     watch : callable or None
         Tells why a process that rank 0 has started has ended, where one has.
     lent : dict
-        Which large tensors the others hold, for whom that concerns.
+        Which large tensors the others hold, for whom that concerns; on another rank these, by their number.
     failed : RankFailed or None
         What another rank has failed of, once that is known.
     connect : callable or None
