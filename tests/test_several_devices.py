@@ -23,7 +23,11 @@ from tomo_polysplat.fit.residual_sums import residual_sums
 from tomo_polysplat.fit.step import EagerStep
 from tomo_polysplat.rank_processes import devices_of, sharing
 from tomo_polysplat.ranks import ALONE, RankFailed, current_ranks, led_by, part_of
+from tomo_polysplat.scan.geometry import from_astra, projections_from_astra
 from tomo_polysplat.scan.io import save_scan
+from tomo_polysplat.scan.moves import Scanner, moved_geometry
+from tomo_polysplat.start import fdk_by_ranks
+from tomo_polysplat.start.initial import initial_volume_on
 
 sys.path.append(str(Path(__file__).parent / "kernels"))
 from step_scenes import fit_problem
@@ -101,6 +105,13 @@ def connected(three):
     return three
 
 
+def told_to(ranks, monkeypatch):
+    """What the others are told from now on."""
+    told, tell = [], type(ranks).tell
+    monkeypatch.setattr(type(ranks), "tell", lambda *message: (told.append(message[1]), tell(*message)))
+    return told
+
+
 def moves_left(gaussians, scene, rays, settings):
     """`move_sums` of made-up moves."""
     falls = np.random.default_rng(0).normal(0, 0.1, (2, len(rays.views), 3, 3))
@@ -174,12 +185,8 @@ class TestThreeProcesses:
         """Views that go together are the same for any number of processes, so that each view's sums are, too."""
         monkeypatch.setattr(sys.modules[residual_sums.__module__], "_AT_ONCE", 1)
         monkeypatch.setattr(sys.modules[move_sums.__module__], "_AT_ONCE", 1)
-        fit, told = fit_problem("cone", True, "cpu", "numba"), []
+        fit, told = fit_problem("cone", True, "cpu", "numba"), told_to(connected, monkeypatch)
         parts = fit.gaussians, fit.scene, fit.rays, fit.settings
-        tell = type(connected).tell
-        monkeypatch.setattr(
-            type(connected), "tell", lambda *message: (told.append(message[1]), tell(*message))
-        )
         shared = sums(*parts)
         assert told == ["rays", "work"]
         with led_by(ALONE):
@@ -187,6 +194,32 @@ class TestThreeProcesses:
         for name, expected in vars(one).items():
             np.testing.assert_allclose(getattr(shared, name), expected, rtol=1e-12, atol=0, err_msg=name)
             assert expected.size and (expected != 0).any(), name
+
+    @pytest.mark.parametrize("degrees", [0.0, 3.0])
+    def test_make_slabs_of_the_first_volume(self, connected, monkeypatch, degrees):
+        """Also of a rolled detector, whose rows are levelled before they are handed out."""
+        monkeypatch.setattr(fdk_by_ranks, "_WORTH", 0)
+        geometry, grid = from_astra(cone().proj_geom, cone().vol_geom)
+        geometry = moved_geometry(Scanner(geometry), {"roll": torch.tensor(degrees, dtype=torch.float64)})
+        values = torch.from_numpy(projections_from_astra(cone().projections, cone().proj_geom))
+        told = told_to(connected, monkeypatch)
+        shared, how = initial_volume_on(values, geometry, grid)
+        assert told == ["work"] and how["method"] == "fdk"
+        with led_by(ALONE):
+            one, _ = initial_volume_on(values, geometry, grid)
+        assert float((shared - one).abs().max()) < 1e-5 * float(one.max())
+        assert float(one.max()) > 0
+
+    def test_make_the_first_volume_alone_where_one_has_no_room(self, connected, monkeypatch):
+        monkeypatch.setattr(fdk_by_ranks, "_WORTH", 0)
+        geometry, grid = from_astra(cone().proj_geom, cone().vol_geom)
+        values = torch.from_numpy(projections_from_astra(cone().projections, cone().proj_geom))
+        with monkeypatch.context() as lacking:
+            lacking.setattr(fdk_by_ranks, "_made", lambda *parts: None)
+            one, _ = initial_volume_on(values, geometry, grid)
+        shared, _ = initial_volume_on(values, geometry, grid)
+        assert connected.usable
+        assert float((shared - one).abs().max()) < 1e-5 * float(one.max())
 
     def test_stand_still_after_ctrl_c_within_a_step(self, three, monkeypatch):
         """The last thing that they do: the best state is returned, and nothing more is asked of them."""

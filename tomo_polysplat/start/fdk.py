@@ -22,7 +22,7 @@ from tomo_polysplat.start.weights import (
     reach,
 )
 
-__all__ = ["fdk", "fits_fdk"]
+__all__ = ["fdk", "fdk_cpu", "fits_fdk"]
 
 # Views filtered and backprojected together: few enough to stay in cache, enough to share out over threads.
 _CHUNK = 32
@@ -115,12 +115,18 @@ def fdk(
 
         if suits_fdk_cuda(geometry)[0]:
             return fdk_cuda(projections, geometry, grid, orbit, filter_name=filter_name, device=device)
-    return _fdk_cpu(projections, geometry, grid, orbit, filter_name)
+    from tomo_polysplat.start.fdk_by_ranks import fdk_by_ranks
+
+    shared = fdk_by_ranks(projections, geometry, grid, orbit, filter_name)
+    if shared is not None:
+        return shared.numpy()
+    return fdk_cpu(projections, geometry, grid, orbit, filter_name)
 
 
-def _fdk_cpu(
+def fdk_cpu(
     projections: np.ndarray, geometry: Geometry, grid: VolumeGrid, orbit: Orbit, filter_name: str
 ) -> np.ndarray:
+    """`fdk` by this process alone, on the CPU, of a scan that fits."""
     level = Level(geometry)
     flat = level.geometry
     arcs = ray_arcs(flat, orbit, grid)
