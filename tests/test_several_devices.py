@@ -26,7 +26,7 @@ from tomo_polysplat.ranks import ALONE, RankFailed, current_ranks, led_by, part_
 from tomo_polysplat.scan.geometry import from_astra, projections_from_astra
 from tomo_polysplat.scan.io import save_scan
 from tomo_polysplat.scan.moves import Scanner, moved_geometry
-from tomo_polysplat.start import fdk_by_ranks
+from tomo_polysplat.start import bridged, fdk_by_ranks, projected
 from tomo_polysplat.start.initial import initial_volume_on
 
 sys.path.append(str(Path(__file__).parent / "kernels"))
@@ -209,6 +209,23 @@ class TestThreeProcesses:
             one, _ = initial_volume_on(values, geometry, grid)
         assert float((shared - one).abs().max()) < 1e-5 * float(one.max())
         assert float(one.max()) > 0
+
+    def test_project_a_part_of_the_views_each_to_bridge_metal(self, connected, monkeypatch):
+        monkeypatch.setattr(fdk_by_ranks, "_WORTH", 0)
+        monkeypatch.setattr(projected, "_WORTH", 0)
+        # Portions of 16 views, and one of 8.
+        geometry, grid = from_astra(cone(metal=True).proj_geom, cone(metal=True).vol_geom)
+        monkeypatch.setitem(bridged._AT_ONCE, "cpu", 16 * geometry.rows * geometry.columns)
+        values = torch.from_numpy(projections_from_astra(cone(metal=True).projections, cone().proj_geom))
+        volume, _ = initial_volume_on(values, geometry, grid)
+        told, metal = told_to(connected, monkeypatch), 0.5 * float(volume.max())
+        shared, how = bridged.bridged_start(values, volume, "fdk", geometry, grid, metal=metal)
+        # Twice a volume and three portions; two volumes by filtered backprojection.
+        assert told == ["work"] * 10 and "through metal bridged" in how
+        with led_by(ALONE):
+            one, _ = bridged.bridged_start(values, volume, "fdk", geometry, grid, metal=metal)
+        assert not torch.equal(one, volume)
+        assert float((shared - one).abs().max()) < 1e-5 * float(one.max())
 
     def test_make_the_first_volume_alone_where_one_has_no_room(self, connected, monkeypatch):
         monkeypatch.setattr(fdk_by_ranks, "_WORTH", 0)

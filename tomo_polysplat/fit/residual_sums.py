@@ -74,12 +74,11 @@ def residual_sums(
     numbers = np.arange(len(rays.views)) if some is None else some
     at_once = max(1, min(_AT_ONCE, _RAYS // (rays.views.rows * rays.views.columns)))
     parts = by_views(_of_part, len(numbers), at_once, gaussians, scene, rays, settings, at_once, numbers)
-    weights, totals, *rest = zip(*parts)
-    maps = [sum(more, first) for first, *more in (weights, totals)]
-    counts, *aside = (torch.cat(of_each) for of_each in rest)
-    count, by_depth = counts.unbind(1)
-    sums = [*maps, count.transpose(0, 1), by_depth.transpose(0, 1), *aside]
-    return ResidualSums(*(part.cpu().numpy() for part in sums), numbers)
+    weights, totals, counts, *aside = zip(*parts)
+    count, by_depth = torch.cat(counts).permute(1, 2, 0, 3).cpu().numpy()
+    view, pixel, residual, deviation = (torch.cat(of_each).numpy() for of_each in aside)
+    weight, total = (sum(more, first).cpu().numpy() for first, *more in (weights, totals))
+    return ResidualSums(weight, total, count, by_depth, view, pixel, residual, deviation, numbers)
 
 
 # One walk over the views fills all sums: cut up, each part would be handed all of them.
