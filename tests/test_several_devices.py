@@ -16,6 +16,7 @@ from small_scans import QUICK, cone, fan
 from small_scans import reconstruct as reconstruct_anywhere
 
 import tomo_polysplat as tps
+from tomo_polysplat.fit import volume_by_ranks
 from tomo_polysplat.fit.fitter import Fitter
 from tomo_polysplat.fit.led_step import LedStep
 from tomo_polysplat.fit.move_sums import move_sums
@@ -237,6 +238,20 @@ class TestThreeProcesses:
         shared, _ = initial_volume_on(values, geometry, grid)
         assert connected.usable
         assert float((shared - one).abs().max()) < 1e-5 * float(one.max())
+
+    @pytest.mark.parametrize("slices", [1, 9])
+    def test_make_slices_of_the_volume(self, connected, monkeypatch, slices):
+        """Of four slices one process makes two, one after the other if need be."""
+        monkeypatch.setattr(volume_by_ranks, "_WORTH", 0)
+        fit, told = fit_problem("cone", True, "cpu", "numba"), told_to(connected, monkeypatch)
+        nz, ny, nx = fit.scene.box.shape
+        parts = fit.gaussians.copy(), 0.3, slices * ny * nx
+        shared = [made(*parts) for made in (fit.scene.basis_on_host, fit.scene.volume_on_host)]
+        assert told == ["work"] * 2 and nz % 3
+        with led_by(ALONE):
+            one = [made(*parts) for made in (fit.scene.basis_on_host, fit.scene.volume_on_host)]
+        for together, expected in zip(shared, one):
+            np.testing.assert_allclose(together, expected, rtol=1e-4, atol=1e-5 * expected.max())
 
     def test_stand_still_after_ctrl_c_within_a_step(self, three, monkeypatch):
         """The last thing that they do: the best state is returned, and nothing more is asked of them."""

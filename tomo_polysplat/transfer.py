@@ -17,12 +17,16 @@ __all__ = ["to_device", "to_host"]
 _PIECE = 1 << 24  # bytes; less is not worth a buffer
 
 
-def to_host(tensor: torch.Tensor) -> np.ndarray:
-    """A tensor as an array, which shares its memory where it is on the host."""
+def to_host(tensor: torch.Tensor, into: np.ndarray | None = None) -> np.ndarray:
+    """A tensor as an array, which shares its memory where it is on the host, or written ``into`` a contiguous one."""
     tensor = tensor.detach()
     if not tensor.is_cuda or tensor.nbytes < _PIECE:
-        return tensor.cpu().numpy()
-    whole = torch.empty(tensor.shape, dtype=tensor.dtype)
+        small = tensor.cpu().numpy()
+        if into is None or not small.size:
+            return small
+        copy_array(into, small)
+        return into
+    whole = torch.empty(tensor.shape, dtype=tensor.dtype) if into is None else torch.from_numpy(into)
     with torch.cuda.device(tensor.device):
         pieces, parts, buffers = _split(tensor.contiguous(), whole)
         arrived = [torch.cuda.Event(), torch.cuda.Event()]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,6 @@ from tomo_polysplat.free_memory import give_back
 from tomo_polysplat.rank_work import any_lacks, helpers
 from tomo_polysplat.ranks import Ranks, part_of
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
-from tomo_polysplat.start.fdk import fdk_cpu
 from tomo_polysplat.start.level import Level
 from tomo_polysplat.start.orbit import Orbit
 from tomo_polysplat.start.shadow import slices_seen
@@ -30,6 +29,10 @@ _WORTH = 1 << 33
 _SENT = 1 << 26
 
 
+# Gets (views, rows, columns) projections, their geometry, the grid, the orbit and the name of the filter.
+_Make = Callable[[torch.Tensor, Geometry, VolumeGrid, Orbit, str], torch.Tensor]
+
+
 class _Slab(NamedTuple):
     """Slices of a volume, the rows of the level detector that they need, and the geometry of these alone."""
 
@@ -39,7 +42,9 @@ class _Slab(NamedTuple):
     grid: VolumeGrid
 
 
+# What makes a slab, and all of what.
 def fdk_by_ranks(
+    make: _Make,
     projections: torch.Tensor | np.ndarray,
     geometry: Geometry,
     grid: VolumeGrid,
@@ -50,6 +55,8 @@ def fdk_by_ranks(
 
     Parameters
     ----------
+    make : callable
+        A function of a module that makes a slab of the rows which it needs, on any rank.
     projections : (views, rows, columns) float32 tensor or array
         -log(I/I0), finite.
     geometry, grid, orbit
@@ -81,7 +88,7 @@ def fdk_by_ranks(
     parts = [part_of(slices, rank, ranks.count) for rank in range(ranks.count)]
     slabs = [_slab(level.geometry, grid, part) for part in parts]
     with ranks.together():
-        whole = _made_together(ranks, values, level, grid, slabs, orbit, filter_name)
+        whole = _made_together(ranks, make, values, level, grid, slabs, orbit, filter_name)
     if whole is not None:
         whole[torch.from_numpy(~slices_seen(geometry, grid, orbit)).to(whole.device)] = 0.0
     return whole
@@ -96,6 +103,7 @@ def _slab(geometry: Geometry, grid: VolumeGrid, part: slice) -> _Slab:
 # All that is told, and what is sent of it.
 def _made_together(
     ranks: Ranks,
+    make: _Make,
     values: torch.Tensor,
     level: Level,
     grid: VolumeGrid,
@@ -104,7 +112,7 @@ def _made_together(
     filter_name: str,
 ) -> torch.Tensor | None:
     """Rank 0's part, and the volume of all; None where a rank has no room."""
-    ranks.tell("work", _follow, slabs, orbit, filter_name)
+    ranks.tell("work", _follow, make, slabs, orbit, filter_name)
     whole = _empty(grid.shape, values.device)
     if any_lacks(ranks, whole is None):
         return None
@@ -112,7 +120,9 @@ def _made_together(
     for rank, slab in enumerate(slabs[1:], 1):
         for some in _portions(slab.geometry):
             ranks.send([level.values(values[some], some, slab.rows, values.device)], rank)
-    own = _made(level.values(values, slice(None), slabs[0].rows, values.device), slabs[0], orbit, filter_name)
+    own = _made(
+        make, level.values(values, slice(None), slabs[0].rows, values.device), slabs[0], orbit, filter_name
+    )
     if any_lacks(ranks, own is None):
         return None
     assert own is not None
@@ -122,7 +132,7 @@ def _made_together(
     return whole
 
 
-def _follow(ranks: Ranks, slabs: list[_Slab], orbit: Orbit, filter_name: str) -> None:
+def _follow(ranks: Ranks, make: _Make, slabs: list[_Slab], orbit: Orbit, filter_name: str) -> None:
     """Another rank's part."""
     slab = slabs[ranks.rank]
     piece = _empty(slab.geometry.shape, ranks.device)
@@ -131,7 +141,7 @@ def _follow(ranks: Ranks, slabs: list[_Slab], orbit: Orbit, filter_name: str) ->
     assert piece is not None
     for some in _portions(slab.geometry):
         ranks.receive([piece[some]])
-    made = _made(piece, slab, orbit, filter_name)
+    made = _made(make, piece, slab, orbit, filter_name)
     if not any_lacks(ranks, made is None):
         assert made is not None
         ranks.send([made])
@@ -141,15 +151,12 @@ def _follow(ranks: Ranks, slabs: list[_Slab], orbit: Orbit, filter_name: str) ->
         give_back()
 
 
-def _made(piece: torch.Tensor, slab: _Slab, orbit: Orbit, filter_name: str) -> torch.Tensor | None:
+def _made(
+    make: _Make, piece: torch.Tensor, slab: _Slab, orbit: Orbit, filter_name: str
+) -> torch.Tensor | None:
     """The volume of a slab; None where there is no room for what that takes."""
     try:
-        if not piece.is_cuda:
-            made = fdk_cpu(piece.numpy(), slab.geometry, slab.grid, orbit, filter_name)
-            return torch.from_numpy(made)
-        from tomo_polysplat.start.astra_fdk import fdk_cuda_tensor
-
-        return fdk_cuda_tensor(piece, slab.geometry, slab.grid, orbit, filter_name)
+        return make(piece, slab.geometry, slab.grid, orbit, filter_name)
     except RuntimeError as problem:
         logger.info("Filtered backprojection is not shared out: %s", problem)
         return None

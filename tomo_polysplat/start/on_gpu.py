@@ -34,7 +34,7 @@ def fdk_on_gpu(
         If the GPU has no room for it, by slabs either; with bytes needed and bytes free. `RankFailed` if another rank
         fails.
     """
-    from tomo_polysplat.start.astra_fdk import suits_fdk_cuda
+    from tomo_polysplat.start.astra_fdk import fdk_cuda_tensor, suits_fdk_cuda
     from tomo_polysplat.start.fdk_by_ranks import fdk_by_ranks
     from tomo_polysplat.start.slabs import fdk_on_device
 
@@ -43,7 +43,7 @@ def fdk_on_gpu(
         return None
     # Smooth: the noise of a sharp filter would be seeded as if it were matter.
     device, filled = projections.device if device is None else device, fill_rows(projections)
-    shared = fdk_by_ranks(filled, geometry, grid, orbit, "hann")
+    shared = fdk_by_ranks(fdk_cuda_tensor, filled, geometry, grid, orbit, "hann")
     return fdk_on_device(filled, geometry, grid, orbit, "hann", device) if shared is None else shared
 
 
