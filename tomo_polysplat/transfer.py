@@ -12,7 +12,7 @@ import torch
 
 from tomo_polysplat.parallel import copy_array
 
-__all__ = ["to_device", "to_host"]
+__all__ = ["copied", "to_device", "to_host"]
 
 _PIECE = 1 << 24  # bytes; less is not worth a buffer
 
@@ -62,6 +62,15 @@ def to_device(array: np.ndarray, device: torch.device) -> torch.Tensor:
         # The buffers may go to others now.
         torch.cuda.current_stream().synchronize()
     return whole
+
+
+def copied(tensor: torch.Tensor, device: torch.device) -> torch.Tensor:
+    """A copy of a tensor without gradient on a device."""
+    if tensor.is_cuda and device.type == "cpu":
+        return torch.from_numpy(to_host(tensor))
+    if device.type == "cuda" and not tensor.is_cuda and not tensor.is_pinned():
+        return to_device(tensor.numpy(), device)
+    return tensor.to(device, copy=True)
 
 
 def _split(
