@@ -29,6 +29,7 @@ from tomo_polysplat.scan.io import save_scan
 from tomo_polysplat.scan.moves import Scanner, moved_geometry
 from tomo_polysplat.start import bridged, fdk_by_ranks, projected
 from tomo_polysplat.start.initial import initial_volume_on
+from tomo_polysplat.start.orbit import find_orbit
 
 sys.path.append(str(Path(__file__).parent / "kernels"))
 from step_scenes import fit_problem
@@ -299,13 +300,22 @@ def test_a_process_that_dies_ends_the_run_and_its_checkpoint_goes_on_in_one(tmp_
     assert same(resumed.volume, whole.volume)
 
 
-def test_what_a_process_fails_of_is_told():
+def test_what_a_process_fails_of_is_told(monkeypatch):
+    """Here amid the first volume, while this one waits for its part."""
+    monkeypatch.setattr(fdk_by_ranks, "_WORTH", 0)
+    monkeypatch.setattr(fdk_by_ranks, "_made", lambda make, piece, slab, *how: torch.zeros(slab.grid.shape))
+    geometry, grid = from_astra(cone().proj_geom, cone().vol_geom)
+    orbit, _ = find_orbit(geometry)
     with sharing([CPU] * 2):
         ranks = current_ranks()
-        with pytest.raises(RankFailed, match=r"rank 1 of 2 \(cpu\) failed: KeyError: 77"), ranks.together():
-            ranks.tell("read", 77)
-            ranks.total(0.0)
-        with pytest.raises(RankFailed, match="KeyError: 77"), ranks.together():
+        with ranks.together():
+            pass
+        begun = time.monotonic()
+        # What the other one cannot call.
+        with pytest.raises(RankFailed, match=r"rank 1 of 2 \(cpu\) failed: TypeError: .*abort"):
+            fdk_by_ranks.fdk_by_ranks(os.abort, np.zeros(geometry.shape), geometry, grid, orbit, "hann")
+        assert time.monotonic() - begun < 30
+        with pytest.raises(RankFailed, match="abort"), ranks.together():
             pass
     assert not children()
 

@@ -77,11 +77,9 @@ def fdk_by_ranks(
     ranks, slices = helpers(), grid.shape[0]
     if ranks.count == 1 or slices < ranks.count or math.prod(grid.shape) * geometry.views < _WORTH:
         return None
-    values = (
-        projections
-        if isinstance(projections, torch.Tensor)
-        else torch.from_numpy(np.require(projections, requirements=("C", "W")))
-    )
+    if not isinstance(projections, torch.Tensor):
+        projections = torch.from_numpy(np.require(projections, np.float32, ("C", "W")))
+    values = projections.float()
     level = Level(geometry)
     if values.device.type != ranks.device.type or not in_one_piece(values, level, grid):
         return None
