@@ -23,6 +23,7 @@ from tomo_polysplat.fit.move_sums import move_sums
 from tomo_polysplat.fit.residual_sums import residual_sums
 from tomo_polysplat.fit.step import EagerStep
 from tomo_polysplat.rank_processes import devices_of, sharing
+from tomo_polysplat.rank_work import helpers
 from tomo_polysplat.ranks import ALONE, RankFailed, current_ranks, led_by, part_of
 from tomo_polysplat.scan.geometry import from_astra, projections_from_astra
 from tomo_polysplat.scan.io import save_scan
@@ -308,8 +309,9 @@ def test_what_a_process_fails_of_is_told(monkeypatch):
     orbit, _ = find_orbit(geometry)
     with sharing([CPU] * 2):
         ranks = current_ranks()
-        with ranks.together():
-            pass
+        assert helpers().count == 1, "nobody waits for processes that have still to start"
+        while helpers().count == 1:
+            time.sleep(0.05)
         begun = time.monotonic()
         # What the other one cannot call.
         with pytest.raises(RankFailed, match=r"rank 1 of 2 \(cpu\) failed: TypeError: .*abort"):

@@ -20,7 +20,10 @@ def helpers() -> Ranks:
     Nobody waits for processes that have still to start, and none is asked after an interrupt amid a step.
     """
     ranks = current_ranks()
-    return ranks if ranks.count > 1 and ranks.usable and ranks.connect is None else ALONE
+    if ranks.count == 1 or not ranks.usable:
+        return ALONE
+    started = ranks.connect is None or (ranks.all_here is not None and ranks.all_here())
+    return ranks if started else ALONE
 
 
 def gathered(ranks: Ranks, tensors: Sequence[torch.Tensor]) -> list[list[torch.Tensor]]:

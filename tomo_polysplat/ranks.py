@@ -60,6 +60,8 @@ class Ranks:
         What another rank has failed of, once that is known.
     connect : callable or None
         Called before the first thing is made together.
+    all_here : callable or None
+        Tells, before that, whether all processes have started, where that is known.
     """
 
     rank: int = 0
@@ -70,6 +72,7 @@ class Ranks:
     lent: dict[int, Any] = field(default_factory=dict)
     failed: RankFailed | None = None
     connect: Any = None
+    all_here: Any = None
     _made: int = 0
     _gone: list[int] = field(default_factory=list)
     _broken: bool = False
