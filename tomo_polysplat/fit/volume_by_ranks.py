@@ -41,15 +41,17 @@ def volume_by_ranks(
     if ranks.count == 1 or nz < ranks.count or not alike or nz * ny * nx < _WORTH:
         return None
     depth = min(max(1, most // (ny * nx)), -(-nz // ranks.count))
+    buffer = _room((channels, depth, ny, nx), device)
+    if buffer is None:
+        return None
     whole = np.empty((channels, *shape), np.float32)
     with ranks.together(), torch.no_grad():
         ranks.tell("work", _follow, make, channels, shape, halo, depth)
         for slabs in _rounds(nz, depth, halo, ranks.count):
-            buffer = _room((channels, depth, ny, nx), device)
-            own = None if buffer is None else _made(make, slabs[0])
+            own = _made(make, slabs[0])
             if any_lacks(ranks, own is None):
                 return None
-            assert own is not None and buffer is not None
+            assert own is not None
             _keep(own, slabs[0], whole)
             del own
             for rank, slab in enumerate(slabs[1:], 1):

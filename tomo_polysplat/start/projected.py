@@ -62,32 +62,35 @@ def projected(
             if len(some) < ranks.count:
                 yield some, pair.forward(volume, some)
             else:
-                yield some, _portion(ranks, number, volume, pair, parts)
+                shape = (len(some), geometry.rows, geometry.columns)
+                yield some, _portion(ranks, number, volume, pair, parts, shape)
     finally:
         ranks.let_go(number)
 
 
+# What is projected by what, and which part of it each rank makes.
 def _portion(
-    ranks: Ranks, number: int, volume: torch.Tensor, pair: ProjectorPair, views: list[np.ndarray]
+    ranks: Ranks,
+    number: int,
+    volume: torch.Tensor,
+    pair: ProjectorPair,
+    views: list[np.ndarray],
+    shape: tuple[int, int, int],
 ) -> torch.Tensor:
     """A portion of the views, put together of the parts that the ranks make."""
+    # Before anybody is told: there may be no room for it.
+    whole = torch.empty(shape, dtype=torch.float32, device=volume.device)
+    parts = whole.split([len(part) for part in views])
     with ranks.together():
         ranks.tell("work", _follow, number, views)
         own = _lines(volume, pair, views[0])
         lack = any_lacks(ranks, own is None)
         if own is not None and not lack:
-            return _put_together(ranks, own, [len(part) for part in views])
+            parts[0].copy_(own)
+            for rank, part in enumerate(parts[1:], 1):
+                ranks.receive([part], rank)
+            return whole
     raise RuntimeError("a device has no room to project its part of the views")
-
-
-def _put_together(ranks: Ranks, own: torch.Tensor, counts: list[int]) -> torch.Tensor:
-    """This rank's lines and those that the others send."""
-    whole = own.new_empty((sum(counts), *own.shape[1:]))
-    parts = whole.split(counts)
-    parts[0].copy_(own)
-    for rank, part in enumerate(parts[1:], 1):
-        ranks.receive([part], rank)
-    return whole
 
 
 class _Held(NamedTuple):
