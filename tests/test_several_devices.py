@@ -285,6 +285,66 @@ def test_two_gpus_make_the_volume_of_one(scan):
     assert relative(shared.volume, one.volume) < SMOOTHED
 
 
+@pytest.fixture(scope="class")
+def two_gpus():
+    """Two processes on a GPU each, which have begun to make something together."""
+    with sharing([torch.device("cuda", k) for k in range(2)]):
+        with current_ranks().together():
+            pass
+        yield current_ranks()
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="there is one GPU at most")
+class TestTwoGpus:
+    """What they make beside steps is what one makes."""
+
+    def test_make_the_first_volume_and_bridge_metal(self, two_gpus, monkeypatch):
+        for module in (fdk_by_ranks, projected):
+            monkeypatch.setattr(module, "_WORTH", 0)
+        geometry, grid = from_astra(cone(metal=True).proj_geom, cone(metal=True).vol_geom)
+        values = torch.from_numpy(projections_from_astra(cone(metal=True).projections, cone().proj_geom))
+        values, told = values.to(two_gpus.device), told_to(two_gpus, monkeypatch)
+
+        def made():
+            first, _ = initial_volume_on(values, geometry, grid)
+            metal = 0.5 * float(first.max())
+            return first, *bridged.bridged_start(values, first, "fdk", geometry, grid, metal=metal)
+
+        *shared, how = made()
+        assert told == ["work"] * 7 and "through metal bridged" in how
+        with led_by(ALONE):
+            *one, _ = made()
+        for together, alone in zip(shared, one):
+            # ASTRA interpolates with weights of eight bits.
+            assert together.device == two_gpus.device
+            assert relative(together.cpu().numpy(), alone.cpu().numpy()) < 5e-3
+
+    @pytest.mark.parametrize("sums", [residual_sums, moves_left])
+    def test_add_up_residuals(self, two_gpus, monkeypatch, sums):
+        for of in (residual_sums, move_sums):
+            monkeypatch.setattr(sys.modules[of.__module__], "_AT_ONCE", 1)
+        fit, told = fit_problem("cone", True, "cuda:0", "triton"), told_to(two_gpus, monkeypatch)
+        parts = fit.gaussians, fit.scene, fit.rays, fit.settings
+        shared = sums(*parts)
+        assert told == ["rays", "work"]
+        with led_by(ALONE):
+            one = sums(*parts)
+        for name, expected in vars(one).items():
+            scale = np.nanmax(np.abs(expected))
+            np.testing.assert_allclose(getattr(shared, name) / scale, expected / scale, atol=1e-4)
+
+    def test_make_slices_of_the_volume(self, two_gpus, monkeypatch):
+        monkeypatch.setattr(volume_by_ranks, "_WORTH", 0)
+        fit, told = fit_problem("cone", True, "cuda:0", "triton"), told_to(two_gpus, monkeypatch)
+        parts = fit.gaussians.copy(), 0.3
+        shared = fit.scene.basis_on_host(*parts)
+        assert told == ["work"]
+        with led_by(ALONE):
+            one = fit.scene.basis_on_host(*parts)
+        np.testing.assert_allclose(shared, one, rtol=1e-4, atol=1e-5 * one.max())
+
+
 def test_a_process_that_dies_ends_the_run_and_its_checkpoint_goes_on_in_one(tmp_path):
     path, killed = tmp_path / "fit.npz", []
 
