@@ -17,6 +17,7 @@ from small_scans import reconstruct as reconstruct_anywhere
 
 import tomo_polysplat as tps
 from tomo_polysplat.fit import volume_by_ranks
+from tomo_polysplat.fit.filter_sums import filter_sums
 from tomo_polysplat.fit.fitter import Fitter
 from tomo_polysplat.fit.led_step import LedStep
 from tomo_polysplat.fit.move_sums import move_sums
@@ -121,6 +122,11 @@ def moves_left(gaussians, scene, rays, settings):
     return move_sums(gaussians, scene, rays, settings, torch.from_numpy(falls))
 
 
+def filters_left(gaussians, scene, rays, settings):
+    """`filter_sums` of aluminium."""
+    return filter_sums(gaussians, scene, rays, settings, scene.quadrature, 2.7)
+
+
 class TestThreeProcesses:
     """What they make is what one makes."""
 
@@ -183,20 +189,23 @@ class TestThreeProcesses:
         shared, one = reconstruct(scan, settings=settings), alone(scan, settings=settings)
         assert same(shared.volume, one.volume) and made
 
-    @pytest.mark.parametrize("sums", [residual_sums, moves_left])
+    @pytest.mark.parametrize("sums", [residual_sums, moves_left, filters_left])
     def test_take_a_part_of_the_views_each_for_sums(self, connected, monkeypatch, sums):
         """Views that go together are the same for any number of processes, so that each view's sums are, too."""
-        monkeypatch.setattr(sys.modules[residual_sums.__module__], "_AT_ONCE", 1)
-        monkeypatch.setattr(sys.modules[move_sums.__module__], "_AT_ONCE", 1)
-        fit, told = fit_problem("cone", True, "cpu", "numba"), told_to(connected, monkeypatch)
+        for of in (residual_sums, move_sums, filter_sums):
+            monkeypatch.setattr(sys.modules[of.__module__], "_AT_ONCE", 1)
+        fit = fit_problem("cone", True, "cpu", "numba", filtered=True)
+        told = told_to(connected, monkeypatch)
         parts = fit.gaussians, fit.scene, fit.rays, fit.settings
         shared = sums(*parts)
         assert told == ["rays", "work"]
         with led_by(ALONE):
             one = sums(*parts)
         for name, expected in vars(one).items():
-            np.testing.assert_allclose(getattr(shared, name), expected, rtol=1e-12, atol=0, err_msg=name)
-            assert expected.size and (expected != 0).any(), name
+            # Threads of torch cut arrays up otherwise than one does, which rounds some values otherwise.
+            scale = np.nanmax(np.abs(expected))
+            np.testing.assert_allclose(getattr(shared, name), expected, atol=1e-6 * scale, err_msg=name)
+            assert scale > 0, name
 
     @pytest.mark.parametrize("degrees", [0.0, 3.0])
     def test_make_slabs_of_the_first_volume(self, connected, monkeypatch, degrees):
@@ -320,11 +329,12 @@ class TestTwoGpus:
             assert together.device == two_gpus.device
             assert relative(together.cpu().numpy(), alone.cpu().numpy()) < 5e-3
 
-    @pytest.mark.parametrize("sums", [residual_sums, moves_left])
+    @pytest.mark.parametrize("sums", [residual_sums, moves_left, filters_left])
     def test_add_up_residuals(self, two_gpus, monkeypatch, sums):
-        for of in (residual_sums, move_sums):
+        for of in (residual_sums, move_sums, filter_sums):
             monkeypatch.setattr(sys.modules[of.__module__], "_AT_ONCE", 1)
-        fit, told = fit_problem("cone", True, "cuda:0", "triton"), told_to(two_gpus, monkeypatch)
+        fit = fit_problem("cone", True, "cuda:0", "triton", filtered=True)
+        told = told_to(two_gpus, monkeypatch)
         parts = fit.gaussians, fit.scene, fit.rays, fit.settings
         shared = sums(*parts)
         assert told == ["rays", "work"]
@@ -332,7 +342,7 @@ class TestTwoGpus:
             one = sums(*parts)
         for name, expected in vars(one).items():
             scale = np.nanmax(np.abs(expected))
-            np.testing.assert_allclose(getattr(shared, name) / scale, expected / scale, atol=1e-4)
+            np.testing.assert_allclose(getattr(shared, name), expected, atol=1e-4 * scale, err_msg=name)
 
     def test_make_slices_of_the_volume(self, two_gpus, monkeypatch):
         monkeypatch.setattr(volume_by_ranks, "_WORTH", 0)
