@@ -23,6 +23,7 @@ from tomo_polysplat.model.gaussians import OF_ALL, Gaussians
 from tomo_polysplat.parallel import kept_threads
 from tomo_polysplat.rank_processes import here, rank_of_torchrun
 from tomo_polysplat.ranks import Ranks, join, join_here, leave
+from tomo_polysplat.start.astra_pair import astra_has_gpu
 
 __all__ = ["follow", "follow_torchrun"]
 
@@ -176,6 +177,15 @@ def main(folder: str, rank: str, count: str, device: str) -> int:
 def _begin(ranks: Ranks) -> None:
     if pick_device(ranks.device).type == "cuda":
         torch.cuda.set_device(ranks.device)
+        _load(ranks.device)
+
+
+def _load(device: torch.device) -> None:
+    """What takes a second or two and is needed anyway, while rank 0 reads: the driver's context, and modules."""
+    torch.zeros(1, device=device)
+    astra_has_gpu()
+    with suppress(ImportError):
+        import tomo_polysplat.fit.graph_step  # noqa: F401
 
 
 def _end_with_parent() -> None:
