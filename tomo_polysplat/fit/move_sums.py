@@ -92,10 +92,11 @@ def _of_part(
         left = _left(measured - predicted, fitted, max(settings.model_error, _LEAST_ERROR))
         slopes, trust = _slopes(predicted, falls[:, first : first + len(some)]), fitted.square()
         for side, half in enumerate((slice(0, columns // 2), slice(columns // 2, columns))):
-            one = slopes[..., half].flatten(2).double()
-            weighed = one * trust[:, None, :, half].flatten(2).double()
-            normal[here, side] = weighed @ one.transpose(1, 2)
-            told[here, side] = torch.einsum("vmp,vp->vm", weighed, left[..., half].flatten(1).double())
+            # Row by row: a GPU would make the products of a whole view on a single multiprocessor.
+            one = slopes[..., half].double().transpose(1, 2)
+            weighed = one * trust[:, :, None, half].double()
+            normal[here, side] = (weighed @ one.transpose(2, 3)).sum(dim=1)
+            told[here, side] = (weighed @ left[..., half, None].double())[..., 0].sum(dim=1)
     return [normal, told, held_out]
 
 
