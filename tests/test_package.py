@@ -32,6 +32,7 @@ BASICS = (
     "transfer",
     "ranks",
     "rank_processes",
+    "rank_work",
 )
 LAYERS = (
     BASICS,

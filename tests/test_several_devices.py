@@ -16,12 +16,25 @@ from small_scans import QUICK, cone, fan
 from small_scans import reconstruct as reconstruct_anywhere
 
 import tomo_polysplat as tps
+from tomo_polysplat.fit import volume_by_ranks
+from tomo_polysplat.fit.filter_sums import filter_sums
 from tomo_polysplat.fit.fitter import Fitter
 from tomo_polysplat.fit.led_step import LedStep
+from tomo_polysplat.fit.move_sums import move_sums
+from tomo_polysplat.fit.residual_sums import residual_sums
 from tomo_polysplat.fit.step import EagerStep
 from tomo_polysplat.rank_processes import devices_of, sharing
-from tomo_polysplat.ranks import ALONE, RankFailed, current_ranks, led_by, part_of
+from tomo_polysplat.rank_work import helpers
+from tomo_polysplat.ranks import ALONE, RankFailed, Ranks, current_ranks, led_by, part_of
+from tomo_polysplat.scan.geometry import from_astra, projections_from_astra
 from tomo_polysplat.scan.io import save_scan
+from tomo_polysplat.scan.moves import Scanner, moved_geometry
+from tomo_polysplat.start import bridged, fdk_by_ranks, projected
+from tomo_polysplat.start.initial import initial_volume_on
+from tomo_polysplat.start.orbit import find_orbit
+
+sys.path.append(str(Path(__file__).parent / "kernels"))
+from step_scenes import fit_problem
 
 CPU = torch.device("cpu")
 TWO = ["cpu", "cpu"]
@@ -87,6 +100,33 @@ def three():
         yield current_ranks()
 
 
+@pytest.fixture
+def connected(three):
+    """The same, after they have begun to make something together."""
+    if three.connect is not None:
+        with three.together():
+            pass
+    return three
+
+
+def told_to(ranks, monkeypatch):
+    """What the others are told from now on."""
+    told, tell = [], type(ranks).tell
+    monkeypatch.setattr(type(ranks), "tell", lambda *message: (told.append(message[1]), tell(*message)))
+    return told
+
+
+def moves_left(gaussians, scene, rays, settings):
+    """`move_sums` of made-up moves."""
+    falls = np.random.default_rng(0).normal(0, 0.1, (2, len(rays.views), 3, 3))
+    return move_sums(gaussians, scene, rays, settings, torch.from_numpy(falls))
+
+
+def filters_left(gaussians, scene, rays, settings):
+    """`filter_sums` of aluminium."""
+    return filter_sums(gaussians, scene, rays, settings, scene.quadrature, 2.7)
+
+
 class TestThreeProcesses:
     """What they make is what one makes."""
 
@@ -149,6 +189,81 @@ class TestThreeProcesses:
         shared, one = reconstruct(scan, settings=settings), alone(scan, settings=settings)
         assert same(shared.volume, one.volume) and made
 
+    @pytest.mark.parametrize("sums", [residual_sums, moves_left, filters_left])
+    def test_take_a_part_of_the_views_each_for_sums(self, connected, monkeypatch, sums):
+        """Views that go together are the same for any number of processes, so that each view's sums are, too."""
+        for of in (residual_sums, move_sums, filter_sums):
+            monkeypatch.setattr(sys.modules[of.__module__], "_AT_ONCE", 1)
+        fit = fit_problem("cone", True, "cpu", "numba", filtered=True)
+        told = told_to(connected, monkeypatch)
+        parts = fit.gaussians, fit.scene, fit.rays, fit.settings
+        shared = sums(*parts)
+        assert told == ["rays", "work"]
+        with led_by(ALONE):
+            one = sums(*parts)
+        for name, expected in vars(one).items():
+            # Threads of torch cut arrays up otherwise than one does, which rounds some values otherwise.
+            scale = np.nanmax(np.abs(expected))
+            np.testing.assert_allclose(getattr(shared, name), expected, atol=1e-6 * scale, err_msg=name)
+            assert scale > 0, name
+
+    @pytest.mark.parametrize("degrees", [0.0, 3.0])
+    def test_make_slabs_of_the_first_volume(self, connected, monkeypatch, degrees):
+        """Also of a rolled detector, whose rows are levelled before they are handed out."""
+        monkeypatch.setattr(fdk_by_ranks, "_WORTH", 0)
+        geometry, grid = from_astra(cone().proj_geom, cone().vol_geom)
+        geometry = moved_geometry(Scanner(geometry), {"roll": torch.tensor(degrees, dtype=torch.float64)})
+        values = torch.from_numpy(projections_from_astra(cone().projections, cone().proj_geom))
+        told = told_to(connected, monkeypatch)
+        shared, how = initial_volume_on(values, geometry, grid)
+        assert told == ["work"] and how["method"] == "fdk"
+        with led_by(ALONE):
+            one, _ = initial_volume_on(values, geometry, grid)
+        assert float((shared - one).abs().max()) < 1e-5 * float(one.max())
+        assert float(one.max()) > 0
+
+    def test_project_a_part_of_the_views_each_to_bridge_metal(self, connected, monkeypatch):
+        monkeypatch.setattr(fdk_by_ranks, "_WORTH", 0)
+        monkeypatch.setattr(projected, "_WORTH", 0)
+        # Portions of 16 views, and one of 8.
+        geometry, grid = from_astra(cone(metal=True).proj_geom, cone(metal=True).vol_geom)
+        monkeypatch.setitem(bridged._AT_ONCE, "cpu", 16 * geometry.rows * geometry.columns)
+        values = torch.from_numpy(projections_from_astra(cone(metal=True).projections, cone().proj_geom))
+        volume, _ = initial_volume_on(values, geometry, grid)
+        told, metal = told_to(connected, monkeypatch), 0.5 * float(volume.max())
+        shared, how = bridged.bridged_start(values, volume, "fdk", geometry, grid, metal=metal)
+        # Twice a volume and three portions; two volumes by filtered backprojection.
+        assert told == ["work"] * 10 and "through metal bridged" in how
+        with led_by(ALONE):
+            one, _ = bridged.bridged_start(values, volume, "fdk", geometry, grid, metal=metal)
+        assert not torch.equal(one, volume)
+        assert float((shared - one).abs().max()) < 1e-5 * float(one.max())
+
+    def test_make_the_first_volume_alone_where_one_has_no_room(self, connected, monkeypatch):
+        monkeypatch.setattr(fdk_by_ranks, "_WORTH", 0)
+        geometry, grid = from_astra(cone().proj_geom, cone().vol_geom)
+        values = torch.from_numpy(projections_from_astra(cone().projections, cone().proj_geom))
+        with monkeypatch.context() as lacking:
+            lacking.setattr(fdk_by_ranks, "_made", lambda *parts: None)
+            one, _ = initial_volume_on(values, geometry, grid)
+        shared, _ = initial_volume_on(values, geometry, grid)
+        assert connected.usable
+        assert float((shared - one).abs().max()) < 1e-5 * float(one.max())
+
+    @pytest.mark.parametrize("slices", [1, 9])
+    def test_make_slices_of_the_volume(self, connected, monkeypatch, slices):
+        """Of four slices one process makes two, one after the other if need be."""
+        monkeypatch.setattr(volume_by_ranks, "_WORTH", 0)
+        fit, told = fit_problem("cone", True, "cpu", "numba"), told_to(connected, monkeypatch)
+        nz, ny, nx = fit.scene.box.shape
+        parts = fit.gaussians.copy(), 0.3, slices * ny * nx
+        shared = [made(*parts) for made in (fit.scene.basis_on_host, fit.scene.volume_on_host)]
+        assert told == ["work"] * 2 and nz % 3
+        with led_by(ALONE):
+            one = [made(*parts) for made in (fit.scene.basis_on_host, fit.scene.volume_on_host)]
+        for together, expected in zip(shared, one):
+            np.testing.assert_allclose(together, expected, rtol=1e-4, atol=1e-5 * expected.max())
+
     def test_stand_still_after_ctrl_c_within_a_step(self, three, monkeypatch):
         """The last thing that they do: the best state is returned, and nothing more is asked of them."""
         step, made = EagerStep.__call__, []
@@ -179,6 +294,67 @@ def test_two_gpus_make_the_volume_of_one(scan):
     assert relative(shared.volume, one.volume) < SMOOTHED
 
 
+@pytest.fixture(scope="class")
+def two_gpus():
+    """Two processes on a GPU each, which have begun to make something together."""
+    with sharing([torch.device("cuda", k) for k in range(2)]):
+        with current_ranks().together():
+            pass
+        yield current_ranks()
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="there is one GPU at most")
+class TestTwoGpus:
+    """What they make beside steps is what one makes."""
+
+    def test_make_the_first_volume_and_bridge_metal(self, two_gpus, monkeypatch):
+        for module in (fdk_by_ranks, projected):
+            monkeypatch.setattr(module, "_WORTH", 0)
+        geometry, grid = from_astra(cone(metal=True).proj_geom, cone(metal=True).vol_geom)
+        values = torch.from_numpy(projections_from_astra(cone(metal=True).projections, cone().proj_geom))
+        values, told = values.to(two_gpus.device), told_to(two_gpus, monkeypatch)
+
+        def made():
+            first, _ = initial_volume_on(values, geometry, grid)
+            metal = 0.5 * float(first.max())
+            return first, *bridged.bridged_start(values, first, "fdk", geometry, grid, metal=metal)
+
+        *shared, how = made()
+        assert told == ["work"] * 7 and "through metal bridged" in how
+        with led_by(ALONE):
+            *one, _ = made()
+        for together, alone in zip(shared, one):
+            # ASTRA interpolates with weights of eight bits.
+            assert together.device == two_gpus.device
+            assert relative(together.cpu().numpy(), alone.cpu().numpy()) < 5e-3
+
+    @pytest.mark.parametrize("sums", [residual_sums, moves_left, filters_left])
+    def test_add_up_residuals(self, two_gpus, monkeypatch, sums):
+        for of in (residual_sums, move_sums, filter_sums):
+            monkeypatch.setattr(sys.modules[of.__module__], "_AT_ONCE", 1)
+        fit = fit_problem("cone", True, "cuda:0", "triton", filtered=True)
+        told = told_to(two_gpus, monkeypatch)
+        parts = fit.gaussians, fit.scene, fit.rays, fit.settings
+        shared = sums(*parts)
+        assert told == ["rays", "work"]
+        with led_by(ALONE):
+            one = sums(*parts)
+        for name, expected in vars(one).items():
+            scale = np.nanmax(np.abs(expected))
+            np.testing.assert_allclose(getattr(shared, name), expected, atol=1e-4 * scale, err_msg=name)
+
+    def test_make_slices_of_the_volume(self, two_gpus, monkeypatch):
+        monkeypatch.setattr(volume_by_ranks, "_WORTH", 0)
+        fit, told = fit_problem("cone", True, "cuda:0", "triton"), told_to(two_gpus, monkeypatch)
+        parts = fit.gaussians.copy(), 0.3
+        shared = fit.scene.basis_on_host(*parts)
+        assert told == ["work"]
+        with led_by(ALONE):
+            one = fit.scene.basis_on_host(*parts)
+        np.testing.assert_allclose(shared, one, rtol=1e-4, atol=1e-5 * one.max())
+
+
 def test_a_process_that_dies_ends_the_run_and_its_checkpoint_goes_on_in_one(tmp_path):
     path, killed = tmp_path / "fit.npz", []
 
@@ -195,13 +371,24 @@ def test_a_process_that_dies_ends_the_run_and_its_checkpoint_goes_on_in_one(tmp_
     assert same(resumed.volume, whole.volume)
 
 
-def test_what_a_process_fails_of_is_told():
+def test_what_a_process_fails_of_is_told(monkeypatch):
+    """Here amid the first volume, while this one waits for its part."""
+    monkeypatch.setattr(fdk_by_ranks, "_WORTH", 0)
+    monkeypatch.setattr(fdk_by_ranks, "_made", lambda make, piece, slab, *how: torch.zeros(slab.grid.shape))
+    geometry, grid = from_astra(cone().proj_geom, cone().vol_geom)
+    orbit, _ = find_orbit(geometry)
     with sharing([CPU] * 2):
         ranks = current_ranks()
-        with pytest.raises(RankFailed, match=r"rank 1 of 2 \(cpu\) failed: KeyError: 77"), ranks.together():
-            ranks.tell("read", 77)
-            ranks.total(0.0)
-        with pytest.raises(RankFailed, match="KeyError: 77"), ranks.together():
+        assert helpers().count == 1
+        with ranks.together():
+            pass
+        assert helpers().count == 2
+        begun = time.monotonic()
+        # What the other one cannot call.
+        with pytest.raises(RankFailed, match=r"rank 1 of 2 \(cpu\) failed: TypeError: .*abort"):
+            fdk_by_ranks.fdk_by_ranks(os.abort, np.zeros(geometry.shape), geometry, grid, orbit, "hann")
+        assert time.monotonic() - begun < 30
+        with pytest.raises(RankFailed, match="abort"), ranks.together():
             pass
     assert not children()
 
@@ -223,6 +410,14 @@ def test_torchrun_reconstructs_by_the_command_line(tmp_path):
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("wrote volume.npy") == 1 and '"ranks"' in (tmp_path / "about.json").read_text()
     assert same(np.load(tmp_path / "volume.npy"), reconstruct(fan(metal=False), settings=ROUGH).volume)
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+@pytest.mark.parametrize("here", [False, True])
+def test_nobody_waits_for_processes_that_have_still_to_start(device, here):
+    """And on CPUs what is made, to the bit, does not depend on how soon they do."""
+    with led_by(Ranks(0, 2, torch.device(device), connect=print, all_here=lambda: here)):
+        assert helpers().count == (2 if here and device == "cuda" else 1)
 
 
 @pytest.mark.parametrize("length", [0, 1, 2, 7, 12])

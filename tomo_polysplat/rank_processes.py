@@ -177,6 +177,10 @@ def here(rank: int) -> str:
     return f"tomo_polysplat/here/{rank}"
 
 
+def _keys(ranks: Ranks) -> list[str]:
+    return [here(rank) for rank in range(1, ranks.count)]
+
+
 class _Started:
     """Processes that follow this one."""
 
@@ -201,7 +205,9 @@ class _Started:
     def ranks(self) -> Ranks:
         """This process as the first of all."""
         store = dist.FileStore(os.path.join(self._folder, "store"), len(self._devices))
-        return Ranks(0, len(self._devices), self._devices[0], store, self.why_ended)
+        ranks = Ranks(0, len(self._devices), self._devices[0], store, self.why_ended)
+        ranks.all_here = lambda: store.check(_keys(ranks))
+        return ranks
 
     def why_ended(self) -> str:
         """Words on the first process that has failed; none while all run or have ended well."""
@@ -219,8 +225,7 @@ class _Started:
 
     def _wait_for_all(self, ranks: Ranks) -> None:
         end = time.monotonic() + _START
-        keys = [here(rank) for rank in range(1, ranks.count)]
-        while not ranks.store.check(keys):
+        while not ranks.store.check(_keys(ranks)):
             if (failed := ranks.failure()) is not None:
                 raise failed
             if time.monotonic() > end:

@@ -55,11 +55,13 @@ class Ranks:
     watch : callable or None
         Tells why a process that rank 0 has started has ended, where one has.
     lent : dict
-        Which large tensors the others hold, for whom that concerns.
+        Which large tensors the others hold, for whom that concerns; on another rank these, by their number.
     failed : RankFailed or None
         What another rank has failed of, once that is known.
     connect : callable or None
         Called before the first thing is made together.
+    all_here : callable or None
+        Tells, before that, whether all processes have started, where that is known.
     """
 
     rank: int = 0
@@ -70,6 +72,7 @@ class Ranks:
     lent: dict[int, Any] = field(default_factory=dict)
     failed: RankFailed | None = None
     connect: Any = None
+    all_here: Any = None
     _made: int = 0
     _gone: list[int] = field(default_factory=list)
     _broken: bool = False

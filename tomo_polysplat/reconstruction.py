@@ -369,11 +369,11 @@ def _result(
         own = cut_out(own, problem.margin)
         heights = gaussians.weights(scene.reference_curve).sum(dim=0)
         parts = {
-            "position": gaussians.position.cpu().numpy() * length + problem.centre,
-            "scale": gaussians.scale().cpu().numpy() * length,
-            "rotation": torch.nn.functional.normalize(gaussians.rotation, dim=1).cpu().numpy(),
-            "density": heights.cpu().numpy() * plan.reference,
-            "u": gaussians.material().cpu().numpy(),
+            "position": to_host(gaussians.position) * length + problem.centre,
+            "scale": to_host(gaussians.scale()) * length,
+            "rotation": to_host(torch.nn.functional.normalize(gaussians.rotation, dim=1)),
+            "density": to_host(heights) * plan.reference,
+            "u": to_host(gaussians.material()),
         }
     curves = all_curves(problem, own, plan, about["settings"]["bone_level"])
     # Of the start, all matter is taken for soft.

@@ -12,17 +12,21 @@ import torch
 
 from tomo_polysplat.parallel import copy_array
 
-__all__ = ["to_device", "to_host"]
+__all__ = ["copied", "to_device", "to_host"]
 
 _PIECE = 1 << 24  # bytes; less is not worth a buffer
 
 
-def to_host(tensor: torch.Tensor) -> np.ndarray:
-    """A tensor as an array, which shares its memory where it is on the host."""
+def to_host(tensor: torch.Tensor, into: np.ndarray | None = None) -> np.ndarray:
+    """A tensor as an array, which shares its memory where it is on the host, or written ``into`` a contiguous one."""
     tensor = tensor.detach()
     if not tensor.is_cuda or tensor.nbytes < _PIECE:
-        return tensor.cpu().numpy()
-    whole = torch.empty(tensor.shape, dtype=tensor.dtype)
+        small = tensor.cpu().numpy()
+        if into is None or not small.size:
+            return small
+        copy_array(into, small)
+        return into
+    whole = torch.empty(tensor.shape, dtype=tensor.dtype) if into is None else torch.from_numpy(into)
     with torch.cuda.device(tensor.device):
         pieces, parts, buffers = _split(tensor.contiguous(), whole)
         arrived = [torch.cuda.Event(), torch.cuda.Event()]
@@ -58,6 +62,15 @@ def to_device(array: np.ndarray, device: torch.device) -> torch.Tensor:
         # The buffers may go to others now.
         torch.cuda.current_stream().synchronize()
     return whole
+
+
+def copied(tensor: torch.Tensor, device: torch.device) -> torch.Tensor:
+    """A copy of a tensor without gradient on a device."""
+    if tensor.is_cuda and device.type == "cpu":
+        return torch.from_numpy(to_host(tensor))
+    if device.type == "cuda" and not tensor.is_cuda and not tensor.is_pinned():
+        return to_device(tensor.numpy(), device)
+    return tensor.to(device, copy=True)
 
 
 def _split(

@@ -11,6 +11,7 @@ import torch
 from tomo_polysplat.fit import choose_step, follow
 from tomo_polysplat.fit.choose_step import NoRoom, own_step
 from tomo_polysplat.fit.led_step import LedStep
+from tomo_polysplat.fit.lent_rays import about_rays
 from tomo_polysplat.fit.shares import parted, planes_of_all
 from tomo_polysplat.fit.step import EagerStep
 from tomo_polysplat.ranks import Ranks
@@ -117,15 +118,14 @@ def test_after_a_step_that_has_no_room_ranks_make_others(problem):
 
 def test_a_rank_that_follows_shares_the_same_and_goes_on_without_a_step(problem, monkeypatch):
     gaussians, spacing, rays, scene, settings = problem
-    views, asked = rays.views, []
+    asked = []
     parts = parted(gaussians, 2)
     parts = {
         "gaussians": gaussians.select(parts[0][:0]),
         "counts": [len(part) for part in parts],
         "planes": planes_of_all(gaussians, parts, scene.box),
         "spacing": spacing,
-        "rays": (rays.photons, rays.model_error, rays.held_out, rays.dimmed),
-        "views": (views.cone, views.origin, views.matrix, views.rows, views.columns, views.planar),
+        "rays": about_rays(rays),
         "scene": scene,
         "settings": settings,
         "batch": BATCH,

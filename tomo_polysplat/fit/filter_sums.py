@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from tomo_polysplat.fit.by_views import by_views
 from tomo_polysplat.fit.loss import misfit
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
@@ -40,7 +41,6 @@ class FilterSums:
 
 
 # What a fit is, and what is to be known of the filter.
-@torch.no_grad()
 def filter_sums(
     gaussians: Gaussians,
     scene: FitScene,
@@ -49,7 +49,7 @@ def filter_sums(
     quadrature: Quadrature,
     grams: float,
 ) -> FilterSums:
-    """Those of all views.
+    """Those of all views; each rank adds up a part of them.
 
     Parameters
     ----------
@@ -62,13 +62,31 @@ def filter_sums(
     grams : float
         Its density in g/cm3.
     """
-    views, rows, columns = len(rays.views), rays.views.rows, rays.views.columns
-    sums = torch.zeros((5, rows, columns), dtype=torch.float64, device=rays.target)
-    held_out = torch.full((views,), torch.nan, dtype=torch.float64, device=rays.target)
+    at_once = max(1, min(_AT_ONCE, _RAYS // (rays.views.rows * rays.views.columns)))
+    fit = gaussians, scene, rays, settings
+    parts = by_views(_of_part, len(rays.views), at_once, *fit, at_once, quadrature, grams)
+    (first, *more), held_out = zip(*parts)
+    return FilterSums(sum(more, first).cpu().numpy(), torch.cat(held_out).cpu().numpy())
+
+
+# As `fit.by_views` calls it.
+def _of_part(
+    part: slice,
+    gaussians: Gaussians,
+    scene: FitScene,
+    rays: Rays,
+    settings: Settings,
+    at_once: int,
+    quadrature: Quadrature,
+    grams: float,
+) -> list[torch.Tensor]:
+    """Of a part of the views what `FilterSums` has."""
+    shape = rays.views.rows, rays.views.columns
+    sums = torch.zeros((5, *shape), dtype=torch.float64, device=rays.target)
+    held_out = torch.full((part.stop - part.start,), torch.nan, dtype=torch.float64, device=rays.target)
     allowed = max(settings.model_error, _LEAST_ERROR)
-    at_once = max(1, min(_AT_ONCE, _RAYS // (rows * columns)))
-    for first in range(0, views, at_once):
-        some = np.arange(first, min(first + at_once, views))
+    for first in range(part.start, part.stop, at_once):
+        some = np.arange(first, min(first + at_once, part.stop))
         seen, measured, fitted, aside = rays.batch(some)
         predicted, _ = scene.projections(gaussians, seen)
         slopes = scene.filter_slopes(gaussians, seen, quadrature) * grams
@@ -77,8 +95,8 @@ def filter_sums(
         sums += (parts * fitted.square()).double().sum(dim=1)
         for k in range(len(some)):
             if bool(aside[k].any()):
-                held_out[first + k] = misfit(predicted[k], measured[k], aside[k], settings)
-    return FilterSums(sums.cpu().numpy(), held_out.cpu().numpy())
+                held_out[first - part.start + k] = misfit(predicted[k], measured[k], aside[k], settings)
+    return [sums, held_out]
 
 
 def _clipped(residual: torch.Tensor, fitted: torch.Tensor, allowed: float) -> torch.Tensor:

@@ -14,16 +14,16 @@ import torch.distributed as dist
 
 from tomo_polysplat.fit.choose_step import NoRoom, own_step
 from tomo_polysplat.fit.led_step import of_all, of_all_moments, of_each, of_each_moment
-from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.fit.lent_rays import borrowed
 from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.fit.shares import Part
 from tomo_polysplat.fit.step import Step
 from tomo_polysplat.kernels.device import one_torch_thread, pick_device, usual_modes
-from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.model.gaussians import OF_ALL, Gaussians
 from tomo_polysplat.parallel import kept_threads
 from tomo_polysplat.rank_processes import here, rank_of_torchrun
 from tomo_polysplat.ranks import Ranks, join, join_here, leave
+from tomo_polysplat.start.astra_pair import astra_has_gpu
 
 __all__ = ["follow", "follow_torchrun"]
 
@@ -41,10 +41,7 @@ class _Followed:
     ) -> None:
         self.number_of_rays, self.ranks = number_of_rays, ranks
         self.gaussians = _received(about["gaussians"], about["counts"][ranks.rank], ranks)
-        streamed = ranks.device if projections.device.type != ranks.device.type else None
-        photons, model_error, held_out, dimmed = about["rays"]
-        views = DetectorViews(*about["views"])
-        self.rays = Rays(projections, views, photons, model_error, held_out, streamed, dimmed)
+        self.rays = borrowed(projections, about["rays"], ranks)
         setup = FitSetup(self.gaussians, about["spacing"], self.rays, about["scene"], about["settings"])
         part = Part(ranks, about["planes"][ranks.rank], ranks.device)
         self.step: Step = own_step(setup, about["batch"], ranks, beside, part)
@@ -83,7 +80,7 @@ def follow(ranks: Ranks) -> None:
 
 def _follow(ranks: Ranks) -> None:
     steps: dict[int, _Followed] = {}
-    lent: dict[int, torch.Tensor] = {}
+    lent: dict[int, torch.Tensor] = ranks.lent
     while True:
         gone, (what, *told) = ranks.hear()
         for number in gone:
@@ -91,6 +88,10 @@ def _follow(ranks: Ranks) -> None:
             lent.pop(number, None)
         if what == "end":
             return
+        if what == "work":
+            # What it gets is let go of with it.
+            told.pop(0)(ranks, *_taken(told))
+            continue
         number, *parts = told
         if what == "rays":
             _take(number, parts[0], lent, steps)
@@ -110,6 +111,13 @@ def _follow(ranks: Ranks) -> None:
             steps[number].read()
         elif what == "moments":
             ranks.send(of_each_moment(steps[number].step.moments))
+
+
+def _taken(values: list[Any]) -> list[Any]:
+    """The values, of which the list then holds none."""
+    taken = values[:]
+    values.clear()
+    return taken
 
 
 def _take(
@@ -169,6 +177,15 @@ def main(folder: str, rank: str, count: str, device: str) -> int:
 def _begin(ranks: Ranks) -> None:
     if pick_device(ranks.device).type == "cuda":
         torch.cuda.set_device(ranks.device)
+        _load(ranks.device)
+
+
+def _load(device: torch.device) -> None:
+    """What takes a second or two and is needed anyway, while rank 0 reads: the driver's context, and modules."""
+    torch.zeros(1, device=device)
+    astra_has_gpu()
+    with suppress(ImportError):
+        import tomo_polysplat.fit.graph_step  # noqa: F401
 
 
 def _end_with_parent() -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from tomo_polysplat.fit.lent_rays import about_rays, lent
 from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.fit.shares import Part, fit_in, parted, planes_of_all
 from tomo_polysplat.fit.step import Moments, Step
@@ -72,22 +73,21 @@ class LedStep:
         self._let_go = weakref.finalize(self, ranks.let_go, self._number)
         self._let_go.atexit = False
         beside = self._beside()
-        views, counts = rays.views, [len(part) for part in self._parts]
+        counts = [len(part) for part in self._parts]
         about = {
             # None of them, for their kinds.
             "gaussians": gaussians.select(self._parts[0][:0]),
             "counts": counts,
             "planes": self._planes,
             "spacing": setup.spacing,
-            "rays": (rays.photons, rays.model_error, rays.held_out, rays.dimmed),
-            "views": (views.cone, views.origin, views.matrix, views.rows, views.columns, views.planar),
+            "rays": about_rays(rays),
             # No rank but the first one asks it.
             "scene": replace(scene, solid_number=None),
             "settings": setup.settings,
             "batch": self._batch,
             "beside": 0 if beside is None else beside._number,
         }
-        ranks.tell("make", self._number, _lent(rays.projections, ranks), about)
+        ranks.tell("make", self._number, lent(rays.projections, ranks), about)
         self._hand_out(list(gaussians.each().values()))
         with torch.no_grad():
             common = {name: getattr(gaussians, name).clone() for name in OF_ALL}
@@ -158,7 +158,7 @@ class LedStep:
     def _send(self) -> None:
         """What the fit has changed between two passes."""
         gaussians, box = self._setup.gaussians, self._setup.scene.box
-        _lent(self._setup.rays.projections, self._ranks)
+        lent(self._setup.rays.projections, self._ranks)
         if self._whole is not None:
             # With their memory at hand each can go to whoever is to hold it now.
             self._parts = parted(gaussians, self._ranks.count)
@@ -243,21 +243,3 @@ def of_all_moments(moments: Moments) -> list[torch.Tensor]:
 def _copy(told: list[torch.Tensor], own: list[torch.Tensor]) -> None:
     for tensor, mine in zip(told, own):
         mine.copy_(tensor)
-
-
-def _lent(tensor: torch.Tensor, ranks: Ranks) -> int:
-    """The number under which the others hold the measured rays, which are sent when they are new or have changed."""
-    lent: dict[int, Any] = ranks.lent
-    number, version = lent.get(id(tensor), (0, -1))
-    if not number:
-        number = ranks.number()
-
-        def forget(key: int = id(tensor), number: int = number) -> None:
-            lent.pop(key, None)
-            ranks.let_go(number)
-
-        weakref.finalize(tensor, forget).atexit = False
-    if version != tensor._version:
-        lent[id(tensor)] = (number, tensor._version)
-        ranks.tell("rays", number, tensor)
-    return number

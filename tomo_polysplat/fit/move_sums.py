@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from tomo_polysplat.fit.by_views import by_views
 from tomo_polysplat.fit.loss import misfit
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
@@ -45,11 +46,10 @@ class MoveSums:
     held_out: np.ndarray
 
 
-@torch.no_grad()
 def move_sums(
     gaussians: Gaussians, scene: FitScene, rays: Rays, settings: Settings, falls: torch.Tensor
 ) -> MoveSums:
-    """Those of all views.
+    """Those of all views; each rank adds up a part of them.
 
     Parameters
     ----------
@@ -58,29 +58,46 @@ def move_sums(
     falls : (moves, views, 3, 3) float64 tensor
         How rays shift on the detector with each move (`scan.moved_rays.falls_of`).
     """
-    views, rows, columns = len(rays.views), rays.views.rows, rays.views.columns
+    falls = falls.to(rays.target, torch.float32)
+    pixels = rays.views.rows * rays.views.columns
+    at_once = max(1, min(_AT_ONCE, _RAYS // (pixels * (len(falls) + 1))))
+    parts = by_views(_of_part, len(rays.views), at_once, gaussians, scene, rays, settings, at_once, falls)
+    normal, told, held_out = (torch.cat(of_each).cpu().numpy() for of_each in zip(*parts))
+    return MoveSums(normal.swapaxes(0, 1), told.swapaxes(0, 1), held_out)
+
+
+# One walk over the views, as in `fit.residual_sums`.
+def _of_part(
+    part: slice,
+    gaussians: Gaussians,
+    scene: FitScene,
+    rays: Rays,
+    settings: Settings,
+    at_once: int,
+    falls: torch.Tensor,
+) -> list[torch.Tensor]:
+    """Of a part of the views, by these, what `MoveSums` has; sides come second."""
+    views, columns = part.stop - part.start, rays.views.columns
     device, many = rays.target, len(falls) + 1
-    falls = falls.to(device, torch.float32)
-    normal = torch.zeros((2, views, many, many), dtype=torch.float64, device=device)
-    told = torch.zeros((2, views, many), dtype=torch.float64, device=device)
+    normal = torch.zeros((views, 2, many, many), dtype=torch.float64, device=device)
+    told = torch.zeros((views, 2, many), dtype=torch.float64, device=device)
     held_out = torch.full((views,), torch.nan, dtype=torch.float64, device=device)
-    at_once = max(1, min(_AT_ONCE, _RAYS // (rows * columns * many)))
-    for first in range(0, views, at_once):
-        some = np.arange(first, min(first + at_once, views))
-        here = slice(first, first + len(some))
+    for first in range(part.start, part.stop, at_once):
+        some = np.arange(first, min(first + at_once, part.stop))
+        here = slice(first - part.start, first - part.start + len(some))
         seen, measured, fitted, aside = rays.batch(some)
         predicted, _ = scene.projections(gaussians, seen)
-        for k, view in enumerate(some.tolist() if rays.held_out else ()):
+        for k, view in enumerate(range(here.start, here.stop) if rays.held_out else ()):
             held_out[view] = misfit(predicted[k], measured[k], aside[k], settings)
         left = _left(measured - predicted, fitted, max(settings.model_error, _LEAST_ERROR))
-        slopes, trust = _slopes(predicted, falls[:, here]), fitted.square()
-        for side, part in enumerate((slice(0, columns // 2), slice(columns // 2, columns))):
+        slopes, trust = _slopes(predicted, falls[:, first : first + len(some)]), fitted.square()
+        for side, half in enumerate((slice(0, columns // 2), slice(columns // 2, columns))):
             # Row by row: a GPU would make the products of a whole view on a single multiprocessor.
-            one = slopes[..., part].double().transpose(1, 2)
-            weighed = one * trust[:, :, None, part].double()
-            normal[side, here] = (weighed @ one.transpose(2, 3)).sum(dim=1)
-            told[side, here] = (weighed @ left[..., part, None].double())[..., 0].sum(dim=1)
-    return MoveSums(*(part.cpu().numpy() for part in (normal, told, held_out)))
+            one = slopes[..., half].double().transpose(1, 2)
+            weighed = one * trust[:, :, None, half].double()
+            normal[here, side] = (weighed @ one.transpose(2, 3)).sum(dim=1)
+            told[here, side] = (weighed @ left[..., half, None].double())[..., 0].sum(dim=1)
+    return [normal, told, held_out]
 
 
 def _left(residual: torch.Tensor, fitted: torch.Tensor, allowed: float) -> torch.Tensor:

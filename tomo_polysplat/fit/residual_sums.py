@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from tomo_polysplat.fit.by_views import by_views
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
@@ -21,6 +22,8 @@ _AT_ONCE, _RAYS = 8, 1 << 24
 # Residuals beyond so many allowed deviations count as so many.
 _FAR = 4.0
 _LEAST_ERROR = 1e-3
+# Of view, pixel, residual and deviation of a ray held out.
+_OF_ASIDE = (torch.int64, torch.int64, torch.float32, torch.float32)
 
 
 @dataclass(frozen=True)
@@ -60,8 +63,6 @@ class ResidualSums:
         return replace(self, total=total, by_depth=by_depth, residual=self.residual - drift[self.view])
 
 
-# One walk over the views fills all sums: cut up, each part would be handed all of them.
-@torch.no_grad()
 def residual_sums(
     gaussians: Gaussians,
     scene: FitScene,
@@ -69,8 +70,28 @@ def residual_sums(
     settings: Settings,
     some: np.ndarray | None = None,
 ) -> ResidualSums:
-    """Those of all views, or of ``some`` by their numbers."""
+    """Those of all views, or of ``some`` by their numbers; each rank adds up a part of them."""
     numbers = np.arange(len(rays.views)) if some is None else some
+    at_once = max(1, min(_AT_ONCE, _RAYS // (rays.views.rows * rays.views.columns)))
+    parts = by_views(_of_part, len(numbers), at_once, gaussians, scene, rays, settings, at_once, numbers)
+    weights, totals, counts, *aside = zip(*parts)
+    count, by_depth = torch.cat(counts).permute(1, 2, 0, 3).cpu().numpy()
+    view, pixel, residual, deviation = (torch.cat(of_each).numpy() for of_each in aside)
+    weight, total = (sum(more, first).cpu().numpy() for first, *more in (weights, totals))
+    return ResidualSums(weight, total, count, by_depth, view, pixel, residual, deviation, numbers)
+
+
+# One walk over the views fills all sums: cut up, each part would be handed all of them.
+def _of_part(
+    part: slice,
+    gaussians: Gaussians,
+    scene: FitScene,
+    rays: Rays,
+    settings: Settings,
+    at_once: int,
+    numbers: np.ndarray,
+) -> list[torch.Tensor]:
+    """Sums by pixel, those by view, (views, 2, halves, depths), and the rays held out, of a part of the views."""
     allowed = max(settings.model_error, _LEAST_ERROR)
     views, rows, columns = len(numbers), rays.views.rows, rays.views.columns
     blocks = min(_BLOCKS, views)
@@ -78,13 +99,12 @@ def residual_sums(
     block = _blocks(views, blocks).tolist()
     weight, total = double.new_zeros((2, blocks, rows, columns))
     ends, many = torch.tensor(_DEPTHS, device=rays.target), len(_DEPTHS) + 1
-    count, by_depth = double.new_zeros((2, views, 2, many))
+    counts = double.new_zeros((part.stop - part.start, 2, 2, many))
     # The right half's depths come after the left one's, and what is not fitted after both.
     right = many * (torch.arange(columns, device=rays.target) >= columns // 2)
-    held: list[list[torch.Tensor]] = []
-    at_once = max(1, min(_AT_ONCE, _RAYS // (rows * columns)))
-    for first in range(0, views, at_once):
-        now = slice(first, min(first + at_once, views))
+    held: list[list[torch.Tensor]] = [[torch.empty(0, dtype=kind) for kind in _OF_ASIDE]]
+    for first in range(part.start, part.stop, at_once):
+        now = slice(first, min(first + at_once, part.stop))
         seen, measured, fitted, aside = rays.batch(numbers[now])
         predicted, _ = scene.projections(gaussians, seen)
         far = _FAR * allowed / fitted.clamp(min=1e-12)
@@ -96,9 +116,10 @@ def residual_sums(
             total[into_block] += trust[k] * left[k]
         depth = torch.where(trust > 0, torch.bucketize(predicted, ends) + right, 2 * many)
         depth = depth.flatten(1) + (2 * many + 1) * torch.arange(len(depth), device=depth.device)[:, None]
-        for into, values in ((count, None), (by_depth, left.double().flatten())):
+        for k, values in enumerate((None, left.double().flatten())):
             found = torch.bincount(depth.flatten(), values, minlength=len(measured) * (2 * many + 1))
-            into[now] = found.reshape(len(measured), -1)[:, :-1].reshape(-1, 2, many)
+            found = found.reshape(len(measured), -1)[:, :-1].reshape(-1, 2, many)
+            counts[now.start - part.start : now.stop - part.start, k] = found
         where = (aside > 0).nonzero(as_tuple=True)
         parts = (
             where[0] + first,
@@ -107,10 +128,7 @@ def residual_sums(
             allowed / aside[where],
         )
         held.append([part.cpu() for part in parts])
-    aside_parts = [torch.cat(parts).numpy() for parts in zip(*held)] + [numbers]
-    sums = (weight, total, count.transpose(0, 1), by_depth.transpose(0, 1))
-    maps = [part.cpu().numpy() for part in sums]
-    return ResidualSums(*maps, *aside_parts)
+    return [weight, total, counts, *(torch.cat(parts) for parts in zip(*held))]
 
 
 def _blocks(views: int, blocks: int) -> np.ndarray:

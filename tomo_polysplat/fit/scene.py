@@ -169,26 +169,20 @@ class FitScene:
 
     def volume_on_host(self, gaussians: Gaussians, factor: float, most: int | None = None) -> np.ndarray:
         """`volume` times a factor, made by slabs (`fit.slabs`), of ``most`` voxels or what there is room for."""
-        return self._by_slabs(gaussians, lambda part: part.volume(gaussians)[None] * factor, 1, most)[0]
+        return self._by_slabs(gaussians, "volume", factor, 1, most)[0]
 
     def basis_on_host(self, gaussians: Gaussians, factor: float, most: int | None = None) -> np.ndarray:
         """`basis` times a factor, likewise."""
         channels = 1 if self.reference_curve is None else len(self.reference_curve)
-        return self._by_slabs(gaussians, lambda part: part.basis(gaussians) * factor, channels, most)
+        return self._by_slabs(gaussians, "basis", factor, channels, most)
 
     def _by_slabs(
-        self,
-        gaussians: Gaussians,
-        made: Callable[[FitScene], torch.Tensor],
-        channels: int,
-        most: int | None,
+        self, gaussians: Gaussians, name: str, factor: float, channels: int, most: int | None
     ) -> np.ndarray:
-        def make(first: int, last: int) -> torch.Tensor:
-            size = (last - first, *self.box.shape[1:])
-            return made(replace(self, box=self.box.part((first, 0, 0), size)))
-
         # Without metal a voxel depends on no other one.
         halo = HALO if bool((gaussians.group > 0).any()) else 0
+        # No other rank asks what solid there is.
+        make = _Slices(replace(self, solid_number=None), gaussians, name, factor)
         place = gaussians.position.device
         return on_host(make, channels, self.box.shape, place, halo=halo, most=most)
 
@@ -241,3 +235,19 @@ class FitScene:
     def _output_weights(self, gaussians: Gaussians) -> torch.Tensor:
         weights = gaussians.weights(self.reference_curve)
         return weights if self.output_curve is None else self.output_curve[None] @ weights
+
+
+@dataclass(frozen=True)
+class _Slices:
+    """What makes slices of a volume of Gaussians, `FitScene.basis` or `FitScene.volume`, times a factor."""
+
+    scene: FitScene
+    gaussians: Gaussians
+    name: str
+    factor: float
+
+    def __call__(self, first: int, last: int) -> torch.Tensor:
+        """(channels, slices, ny, nx) of those from the first up to, and without, the last."""
+        box = self.scene.box.part((first, 0, 0), (last - first, *self.scene.box.shape[1:]))
+        values: torch.Tensor = getattr(replace(self.scene, box=box), self.name)(self.gaussians)
+        return values.reshape(-1, *box.shape) * self.factor

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.fit.memory import voxels_at_once
+from tomo_polysplat.fit.volume_by_ranks import volume_by_ranks
 from tomo_polysplat.start.slabs import slabs
 from tomo_polysplat.transfer import to_host
 
@@ -28,7 +29,8 @@ def on_host(
     Parameters
     ----------
     make : callable
-        Gets the first slice and the one behind the last, and makes (channels, slices, ny, nx) of them.
+        Gets the first slice and the one behind the last, and makes (channels, slices, ny, nx) of them. Other ranks get
+        it, if there are any.
     channels : int
     shape : (nz, ny, nx)
     device : torch.device
@@ -45,6 +47,9 @@ def on_host(
     """
     nz, ny, nx = shape
     most = voxels_at_once(device) if most is None else most
+    shared = volume_by_ranks(make, channels, shape, device, halo, most)
+    if shared is not None:
+        return shared
     depth = max(1, most // (ny * nx))
     if depth >= nz:
         return to_host(make(0, nz))
@@ -52,5 +57,5 @@ def on_host(
     for wanted, first, last in slabs(nz, depth, halo):
         part = make(first, last)[:, wanted.start - first : wanted.stop - first]
         for channel, values in zip(whole, part):
-            channel[wanted] = to_host(values)
+            to_host(values, channel[wanted])
     return whole

@@ -12,6 +12,8 @@ from dataclasses import dataclass, fields
 
 import torch
 
+from tomo_polysplat.transfer import copied
+
 __all__ = ["OF_ALL", "Gaussians"]
 
 # Parameters that belong to no single Gaussian.
@@ -69,7 +71,7 @@ class Gaussians:
     def to(self, device: torch.device) -> Gaussians:
         """Detached copies of everything on a device."""
         parts = {field.name: getattr(self, field.name) for field in fields(self)}
-        return Gaussians(**{name: tensor.detach().to(device, copy=True) for name, tensor in parts.items()})
+        return Gaussians(**{name: copied(tensor.detach(), device) for name, tensor in parts.items()})
 
     def kept(self, before: Gaussians | None) -> Gaussians:
         """Detached copies of everything on the host, in place of those made ``before`` where there are as many."""

@@ -14,6 +14,7 @@ from tomo_polysplat.plan.hardening import coarse, hardening_of
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.bridged import bridged_start
 from tomo_polysplat.start.initial import initial_volume_on
+from tomo_polysplat.transfer import copied
 
 __all__ = ["first_volume"]
 
@@ -31,9 +32,9 @@ def first_volume(problem: Problem, device: torch.device, settings: Settings) -> 
     volume, how = _made(problem, device, settings)
     if keeps_more_than(MUCH, volume.device):
         # Anew: amid what copies of the rays took it would keep all of that from being given back.
-        volume = volume.cpu()
+        volume = copied(volume, torch.device("cpu"))
         give_back()
-        volume = volume.to(device)
+        volume = copied(volume, device)
     return volume, how
 
 

@@ -8,17 +8,19 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 import torch
 
 from tomo_polysplat.physics.typical import largest_finite
+from tomo_polysplat.ranks import RankFailed
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.astra_pair import astra_has_gpu
 from tomo_polysplat.start.initial import initial_volume_on
 from tomo_polysplat.start.levels import mass_level
 from tomo_polysplat.start.on_gpu import fill_rows
+from tomo_polysplat.start.projected import projected
 from tomo_polysplat.start.voxel_projector import ProjectorPair, projector_pair
 
 __all__ = ["THIN", "bridged_start", "normalising_volume"]
@@ -89,6 +91,8 @@ def bridged_start(
     try:
         with projector_pair(geometry, grid, volume.device) as pair:
             return _better(values if spare else values.clone(), volume, mask, geometry, grid, pair, metal)
+    except RankFailed:
+        raise
     except RuntimeError as problem:
         if not on_gpu:
             raise
@@ -111,7 +115,8 @@ def _better(
 
     The rays are overwritten: copies of all of a large scan would not fit on a GPU.
     """
-    covered = _blank(rays, mask.float(), 0.5 * float(grid.voxel_size.min()), pair)
+    dense = projected(mask.float(), pair, geometry, grid, _portions(rays))
+    covered = _blank(rays, dense, 0.5 * float(grid.voxel_size.min()))
     if covered > _MOST_OF_RAYS:
         return volume, f"; metal not bridged: {covered:.0%} of the object's rays pass through it"
     views = np.unique(np.linspace(0, len(rays) - 1, min(_JUDGES, len(rays))).astype(int))
@@ -127,14 +132,15 @@ def _better(
     return volume, f"; metal not bridged, which {words}"
 
 
-def _blank(rays: torch.Tensor, dense: torch.Tensor, wide: float, pair: ProjectorPair) -> float:
+def _blank(rays: torch.Tensor, dense: Iterable[tuple[np.ndarray, torch.Tensor]], wide: float) -> float:
     """Make rays through metal NaN, and tell which share of the object's rays they are.
 
-    ``wide`` is half a voxel: less is the blur of the threshold's edge, and a wider trace loses more than it heals.
+    ``dense`` has how far each ray goes through metal, by portions of the views. ``wide`` is half a voxel: less is the
+    blur of the threshold's edge, and a wider trace loses more than it heals.
     """
     least, through, known = THIN * float(largest_finite(rays)), 0, 0
-    for some in _portions(rays):
-        trace = pair.forward(dense, some) > wide
+    for some, lengths in dense:
+        trace = lengths > wide
         part = rays[some[0] : some[-1] + 1]
         matter = part > least
         through, known = through + int((trace & matter).sum()), known + int(matter.sum())
@@ -175,8 +181,8 @@ def _made_without(
     first, _ = initial_volume_on(rays, geometry, grid)
     main = mass_level(first.masked_fill_(mask, 0.0))
     prior, thickness = normalising_volume(first, mask, main, metal), torch.empty_like(rays)
-    for some in _portions(rays):
-        thickness[some[0] : some[-1] + 1] = pair.forward(prior, some)
+    for some, lines in projected(prior, pair, geometry, grid, _portions(rays)):
+        thickness[some[0] : some[-1] + 1] = lines
     least = THIN * float(thickness.max())
     for some in _portions(rays):
         whole = slice(some[0], some[-1] + 1)

@@ -9,6 +9,7 @@ from tomo_polysplat.checks import require_array, require_choice, require_shape
 from tomo_polysplat.parallel import run_tasks, split_range
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.backproject import accumulate, voxel_maps
+from tomo_polysplat.start.fdk_by_ranks import fdk_by_ranks
 from tomo_polysplat.start.filters import FILTERS, filter_rows
 from tomo_polysplat.start.level import Level
 from tomo_polysplat.start.orbit import Orbit, find_orbit
@@ -115,7 +116,16 @@ def fdk(
 
         if suits_fdk_cuda(geometry)[0]:
             return fdk_cuda(projections, geometry, grid, orbit, filter_name=filter_name, device=device)
+    shared = fdk_by_ranks(_slab_on_cpu, projections, geometry, grid, orbit, filter_name)
+    if shared is not None:
+        return shared.numpy()
     return _fdk_cpu(projections, geometry, grid, orbit, filter_name)
+
+
+def _slab_on_cpu(
+    projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid, orbit: Orbit, filter_name: str
+) -> torch.Tensor:
+    return torch.from_numpy(_fdk_cpu(projections.numpy(), geometry, grid, orbit, filter_name))
 
 
 def _fdk_cpu(

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.checks import fail, require_array, require_shape
+from tomo_polysplat.ranks import RankFailed
 from tomo_polysplat.scan.defects import fill_invalid
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.continued import continued
@@ -54,6 +55,8 @@ def initial_volume_on(
                 wide, wider, longer = continued(fill_rows(projections), geometry, grid)
                 volume = fdk_on_gpu(wide, wider, grid, device=device)
                 reason += longer
+        except RankFailed:
+            raise
         except RuntimeError as problem:
             # Torch's, or ASTRA's, whose memory comes on top of torch's.
             _log.warning("The start is made on the CPU: %s", problem)

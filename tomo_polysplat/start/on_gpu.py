@@ -31,17 +31,20 @@ def fdk_on_gpu(
     Raises
     ------
     RuntimeError
-        If the GPU has no room for it, by slabs either; with bytes needed and bytes free.
+        If the GPU has no room for it, by slabs either; with bytes needed and bytes free. `RankFailed` if another rank
+        fails.
     """
-    from tomo_polysplat.start.astra_fdk import suits_fdk_cuda
+    from tomo_polysplat.start.astra_fdk import fdk_cuda_tensor, suits_fdk_cuda
+    from tomo_polysplat.start.fdk_by_ranks import fdk_by_ranks
     from tomo_polysplat.start.slabs import fdk_on_device
 
     orbit, _ = find_orbit(geometry)
     if orbit is None or not suits_fdk_cuda(geometry)[0]:
         return None
     # Smooth: the noise of a sharp filter would be seeded as if it were matter.
-    device = projections.device if device is None else device
-    return fdk_on_device(fill_rows(projections), geometry, grid, orbit, "hann", device)
+    device, filled = projections.device if device is None else device, fill_rows(projections)
+    shared = fdk_by_ranks(fdk_cuda_tensor, filled, geometry, grid, orbit, "hann")
+    return fdk_on_device(filled, geometry, grid, orbit, "hann", device) if shared is None else shared
 
 
 def fill_rows(projections: torch.Tensor) -> torch.Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ from tomo_polysplat.start.shadow import corners_of, ellipse_of, margins, slices_
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["fdk_cuda", "fdk_of_slabs", "fdk_on_device", "rows_of", "slab_of", "slabs"]
+__all__ = ["fdk_cuda", "fdk_of_slabs", "fdk_on_device", "in_one_piece", "rows_of", "slab_of", "slabs"]
 
 logger = logging.getLogger(__name__)
 
@@ -156,6 +157,15 @@ def fdk_on_device(
         # What torch holds for later is of no use to ASTRA; only now does the error no longer hold the tensors.
         give_back()
     raise AssertionError("unreachable")
+
+
+def in_one_piece(projections: torch.Tensor, level: Level, grid: VolumeGrid) -> bool:
+    """Whether the device of the projections has room to make a volume of theirs in one piece; always on the host."""
+    if not projections.is_cuda:
+        return True
+    room = _SHARE * free_bytes(projections.device)
+    whole = _depth(level.geometry, grid, room, not level.moved) == grid.shape[0]
+    return whole and 8 * math.prod(grid.shape) < room
 
 
 def _depth(geometry: Geometry, grid: VolumeGrid, room: float, resident: bool) -> int:
