@@ -97,43 +97,41 @@ def test_a_budget_with_time_to_spare_does_not_hinder_it():
     assert np.array_equal(told.volume, hurried.volume)
 
 
-def amid(monkeypatch, ahead, misfits=(1.0, 1.0)):
-    """The answer to the question of a run whose ways go ``ahead`` and leave these misfits, and the run."""
-    ways = [SimpleNamespace(ahead=ahead, left=left, name=name) for left, name in zip(misfits, "12")]
-    averaged = SimpleNamespace()
-
-    def branch(rays, batch, pixel_rays):
-        return ways[pixel_rays - 1] if rays else averaged
-
-    near = SimpleNamespace(rays="near metal", misfit_at_metal=lambda way: way.left)
-    monkeypatch.setattr("tomo_polysplat.plan.decisions.pixel_rays.close_up", lambda fitter, views: near)
-    clock = Clock(10, working_time() + 3600)
-    clock.done = 5
-    run, lab = (
-        Run(SimpleNamespace(branch=branch), clock),
-        Lab(None, None, None, None, plan=planned(passes=15.0)),
-    )
-    fitter = run.fitter
+def amid(ahead, clock, steps=30):
+    """The answer to the question of a run whose passes are ``ahead``, and the run."""
+    other = SimpleNamespace(ahead=ahead)
+    fitter = SimpleNamespace(ahead=ahead, branch=lambda pixel_rays: other, steps_of_a_pass=steps)
+    run, lab = Run(fitter, clock), Lab(None, None, None, None, plan=planned(passes=15.0))
+    clock.done = clock.steps // 2
     ask_between(lab, run, (PixelRays,))
-    assert run.made is None and clock.done == 5
-    return lab.plan.answers["pixel_rays"], run.fitter, fitter, averaged
+    return lab.plan.answers["pixel_rays"], run, fitter
 
 
-def test_a_budget_that_ends_amid_the_question_leaves_the_run_as_it_was(monkeypatch):
+@pytest.mark.parametrize("passes", [0, 1])
+def test_a_budget_that_ends_amid_the_question_leaves_the_run_as_it_was(passes):
+    """However few passes it was able to make."""
+    made = [(0.2, 0.3, 1)] * passes
+
     def slowly(clock, passes):
         clock.deadline = working_time() - 1
+        return made
 
-    answer, after, fitter, _ = amid(monkeypatch, slowly)
-    assert after is fitter and answer.value == 1 and "time budget" in answer.why
+    answer, run, fitter = amid(slowly, Clock(10, working_time() + 3600))
+    assert run.fitter is fitter and run.made == (made[0] if made else None)
+    assert answer.value == 1 and "time budget" in answer.why
 
 
-@pytest.mark.parametrize(
-    ("thin", "left", "taken"), [(1.0, 1.0, 2), (1.0, 1.5, 1), (1.0, 0.5, 1), (0.0, 1.0, 1)]
-)
-def test_the_run_goes_on_from_where_it_stood_as_the_rays_at_metal_say(monkeypatch, thin, left, taken):
-    answer, after, fitter, averaged = amid(monkeypatch, lambda clock, passes: None, (thin, left))
-    assert answer.value == taken and answer.status is Status.ASKED
-    assert after is (averaged if taken == 2 else fitter)
+@pytest.mark.parametrize(("steps", "passes"), [(90, 2), (30, 2), (24, 3), (1, 3)])
+def test_each_way_has_steps_enough_to_get_used_to_it_but_no_more_than_a_fifth_of_the_run(steps, passes):
+    asked = []
+
+    def ahead(clock, some):
+        asked.append(some)
+        clock.deadline = working_time() - 1
+        return []
+
+    amid(ahead, Clock(10, None), steps)
+    assert asked == [passes, passes]
 
 
 def test_a_run_resumed_around_the_question_is_the_uninterrupted_one(tmp_path, monkeypatch):

@@ -110,21 +110,12 @@ class Fitter:
         """What so many more passes gave, as `passes` tells it."""
         return list(itertools.islice(self.passes(clock), passes))
 
-    def branch(self, rays: Rays | None = None, batch: int | None = None, **changes: Any) -> Fitter:
-        """The same run from here on, with changes to its scene by name, on Gaussians of its own.
-
-        With some ``rays`` of the run, ``batch`` views of them a step, it leaves out what is about the whole volume:
-        smoothing and flatness.
-        """
-        scene, rng, settings = replace(self.scene, **changes), copy.deepcopy(self.rng), self.settings
-        if rays is not None:
-            settings = replace(settings, tv_weight=0.0, soft_gain=0.0)
-        setup = FitSetup(self.gaussians.copy(), self.spacing, rays or self.rays, scene, settings)
-        batches = Batches(batch or self.batch, self.steps, rng)
-        other = Fitter(setup, batches, beside=None if rays else self)
+    def branch(self, **changes: Any) -> Fitter:
+        """The same run from here on, with changes to its scene by name, on Gaussians of its own."""
+        scene, rng = replace(self.scene, **changes), copy.deepcopy(self.rng)
+        setup = FitSetup(self.gaussians.copy(), self.spacing, self.rays, scene, self.settings)
+        other = Fitter(setup, Batches(self.batch, self.steps, rng), beside=self)
         other.restore(self.snapshot(None, {}))
-        if rays is not None:
-            other.order = np.empty(0, int)
         return other
 
     def _learn_as_in(self, steps: int) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -80,15 +80,6 @@ class Rays:
             weight = weight * torch.rsqrt(1 + torch.exp(depth) * self.noise)
         aside = self._aside(chosen, values.shape[1:])
         return self.views.select(chosen), values, weight * ~aside, weight * aside
-
-    def part(self, views: np.ndarray, rows: slice, columns: slice) -> Rays:
-        """The rays of some pixels, the same ones in each of these views."""
-        values = self.projections[:, rows, columns]
-        values = values[torch.as_tensor(views, device=values.device)].contiguous()
-        shape = (rows.stop - rows.start, columns.stop - columns.start)
-        seen = self.views.select(views).window((rows.start, columns.start), shape)
-        dimmed = None if self.dimmed is None else self.dimmed[rows, columns].contiguous()
-        return replace(self, projections=values, views=seen, dimmed=dimmed)
 
     @functools.cached_property
     def totals(self) -> torch.Tensor:

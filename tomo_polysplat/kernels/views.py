@@ -80,18 +80,6 @@ class DetectorViews:
             origin = origin + back
         return DetectorViews(self.cone, origin, matrix, down * self.rows, parts * self.columns, self.planar)
 
-    def window(self, first: tuple[int, int], shape: tuple[int, int]) -> DetectorViews:
-        """The same views by so many rows and columns of the detector, from this row and column on."""
-        matrix = self.matrix.copy()
-        # From the centre of pixel (0, 0) to that of the first one that stays.
-        ahead = matrix[:, :, :2] @ np.array(first[::-1], dtype=np.float64)
-        origin = self.origin
-        if self.cone:
-            matrix[:, :, 2] += ahead
-        else:
-            origin = origin + ahead
-        return DetectorViews(self.cone, origin, matrix, *shape, self.planar)
-
     def table(self, device: torch.device) -> torch.Tensor:
         """(views, 21) float64 origin, inverse and matrix, row by row, on a device.
 

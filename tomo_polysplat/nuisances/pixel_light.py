@@ -26,7 +26,7 @@ class PixelLight(Nuisance):
     gauge = (
         "edges of metal, which a fit moves to make up for either: they are told apart by what is left there"
     )
-    cost = "two short fits near metal; steps of averaged light take up to four times as long"
+    cost = "some passes of the run are made a second time, each up to four times as long"
 
     @classmethod
     def gate(cls, evidence: Mapping[str, float]) -> Verdict:

@@ -105,8 +105,8 @@ class Lab:
         """What a short fit under these settings may use."""
         return Means(settings, self.time_budget, self.seed, self.device)
 
-    def branch(self, rays: Rays | None = None, batch: int | None = None, **changes: Any) -> Fitter:
-        """Another way for the run to go on, as `Fitter.branch` has it.
+    def branch(self, **changes: Any) -> Fitter:
+        """Another way for the run to go on, with changes to its scene by name.
 
         Raises
         ------
@@ -115,7 +115,7 @@ class Lab:
         """
         assert self.run is not None
         try:
-            return self.run.fitter.branch(rays, batch, **changes)
+            return self.run.fitter.branch(**changes)
         except RuntimeError as full:  # torch's, of a GPU
             raise Untold(f"{full}") from full
 

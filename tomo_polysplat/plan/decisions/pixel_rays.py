@@ -1,34 +1,41 @@
 """Whether pixels average the light over their area, asked of the rays at metal in the middle of a run.
 
 Real pixels do, and simulators that send several rays through each; others send one. Who is wrong about it puts up to
-a third too little metal there, or a quarter too much. At first a fit is too rough to tell: later the run is made
-both ways for two passes over the rays at metal in some views, and goes on as that explains these rays.
+a third too little metal there, or a quarter too much. At first a fit is too rough to tell: later the run is
+made both ways for a few passes over the views, and goes on as it explains the rays at metal.
 """
 
 from __future__ import annotations
 
-import copy
 import logging
+from collections.abc import Sequence
 
-from tomo_polysplat.fit.close_up import close_up
-from tomo_polysplat.fit.fork import why_no_fork
+import torch
+
+from tomo_polysplat.fit.fitter import Fitter
+from tomo_polysplat.fit.fork import fork, passes_of_a_fork, why_no_fork
+from tomo_polysplat.fit.loss import misfit
+from tomo_polysplat.fit.rays import batches_around
+from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.nuisances.pixel_light import PixelLight
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.decision import Decision, Known, When
 from tomo_polysplat.plan.decisions.passes import Passes
 from tomo_polysplat.plan.first_gaussians import AVERAGED_RAYS, why_one_run
 from tomo_polysplat.plan.lab import Lab, Untold
+from tomo_polysplat.render.renderer import project_gaussians
 
 __all__ = ["PixelRays"]
 
 logger = logging.getLogger(__name__)
 
-# Share of the run after which it is asked.
-_FROM = 0.4
-# Views, views of a step and passes of each way (docs/decisions/pixel_rays.md). One pass tells less than two.
-_VIEWS, _OF_A_STEP, _PASSES = 120, 2, 2
+# Share of the run after which it is asked, and the steps of each way, but for more than this share of the run: the
+# first ones are spent on getting used to it.
+_FROM, _STEPS, _MOST = 0.4, 60, 0.2
 # Factor of the time of a step, at most, where light is averaged over two rays a pixel and axis.
 _SLOWER = 4.0
+# Rays at metal: they and their neighbours see this share of the most metal that any does.
+_SEEN = 0.05
 
 
 class PixelRays(Decision):
@@ -61,34 +68,53 @@ class PixelRays(Decision):
         return why or why_one_run(len(lab.gaussians), lab.plan, lab.problem, lab.device)
 
     def ask(self, known: Known, lab: Lab) -> Answer:
-        """Both ways are tried on the rays at metal, and the run goes on as these are explained."""
+        """The run is made both ways for some passes, and goes on as it explains the rays at metal."""
         run = lab.run
         assert run is not None
         if not run.clock.allows(_SLOWER):
             raise Untold("the time budget is kept for the fit")
-        near, left = close_up(run.fitter, _VIEWS), []
-        if near is None:
-            raise Untold("no ray meets metal")
-        for rays in (1, AVERAGED_RAYS):
-            clock = copy.copy(run.clock)
-            branch = lab.branch(near.rays, _OF_A_STEP, pixel_rays=rays)
-            branch.ahead(clock, _PASSES)
-            if clock.late:
-                raise Untold("the time budget was used before the rays could tell")
-            left.append(near.misfit_at_metal(branch))
-            # A GPU need not have room for both.
-            del branch
+        fitter = run.fitter
+        other = lab.branch(pixel_rays=AVERAGED_RAYS)
+        ways = fork(fitter, other, run.clock, passes_of_a_fork(fitter, known[Passes], _STEPS, _MOST))
+        if ways.late:
+            run.made = ways.was
+            raise Untold("the time budget was used before the rays could tell")
+        left = _misfits_at_metal([fitter, other])
         share = left[1] / left[0] if left[0] else float("inf")
         verdict = PixelLight.gate({"share": share})
         averaged, why = verdict.kept, verdict.why
-        if averaged:
-            run.fitter = lab.branch(pixel_rays=AVERAGED_RAYS)
+        run.fitter, run.made = (other, ways.other) if averaged else (fitter, ways.was)
         logger.info("Pixels: %s.", why)
         return Answer(AVERAGED_RAYS if averaged else 1, why, Status.ASKED, {"share": share})
 
     def alternative(self, lab: Lab) -> str:
-        """Saying it saves the question."""
+        """Saying it saves the fork."""
         if lab.settings.pixel_rays or not lab.plan.blurred:
             return ""
         rays = "twice" if lab.problem.planar else "four times"
         return f"1 or 2: not asked in the middle of the run; with 2 {rays} the pairs"
+
+
+@torch.no_grad()
+def _misfits_at_metal(fitters: Sequence[Fitter]) -> list[float]:
+    """Mean misfit of the fitted rays that meet the first one's metal, and of their neighbours."""
+    one, totals, weighed = fitters[0], [0.0 for _ in fitters], 0.0
+    for views, measured, weight, _ in batches_around(one.rays):
+        weight = weight * _at_metal(one, views)
+        sum_of_weights = float(weight.sum())
+        weighed += sum_of_weights
+        for k, fitter in enumerate(fitters):
+            predicted, _ = fitter.scene.projections(fitter.gaussians, views)
+            totals[k] += sum_of_weights * float(misfit(predicted, measured, weight, fitter.settings))
+    return [total / weighed if weighed else 0.0 for total in totals]
+
+
+def _at_metal(fitter: Fitter, views: DetectorViews) -> torch.Tensor:
+    """(views, rows, columns) whether a ray meets metal, or one beside it does."""
+    gaussians, scene = fitter.gaussians, fitter.scene
+    metal = torch.where(gaussians.group > 0, gaussians.attenuation, 0.0)
+    seen, _ = project_gaussians(gaussians, metal[None], views, scene.kernel)
+    met = (seen > _SEEN * seen.max()).to(seen.dtype)
+    reach = (min(views.rows, 3), min(views.columns, 3))
+    padding = (reach[0] // 2, reach[1] // 2)
+    return torch.nn.functional.max_pool2d(met, reach, 1, padding)[0, :, : views.rows, : views.columns]
