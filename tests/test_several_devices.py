@@ -294,6 +294,14 @@ def test_two_gpus_make_the_volume_of_one(scan):
     assert relative(shared.volume, one.volume) < SMOOTHED
 
 
+@pytest.mark.gpu
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="there is one GPU at most")
+def test_the_second_gpu_alone_makes_the_volume_of_the_first():
+    """Torch hands out to ASTRA what is on the current GPU, which is the first one."""
+    first, second = (reconstruct(cone(), settings=ROUGH, device=f"cuda:{k}") for k in range(2))
+    assert relative(second.volume, first.volume) < SMOOTHED
+
+
 @pytest.fixture(scope="class")
 def two_gpus():
     """Two processes on a GPU each, which have begun to make something together."""

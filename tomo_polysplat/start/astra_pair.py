@@ -92,7 +92,9 @@ class AstraPair:
         # It takes as much again on its way.
         make_room(self.index, volume.nbytes + projections.nbytes)
         try:
-            run(projector, volume, projections)
+            # torch hands out tensors of the current GPU alone.
+            with torch.cuda.device_of(volume):
+                run(projector, volume, projections)
         except AstraError as problem:
             # Other releases say nothing, and leave the tensor unwritten.
             raise RuntimeError(f"{_no_room(volume, projections)} ASTRA says: {problem}") from problem
