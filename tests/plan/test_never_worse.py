@@ -21,8 +21,14 @@ from tomo_polysplat.report.decided import doubts
 from tomo_polysplat.settings import Settings
 
 CPU = torch.device("cpu")
-# No short fits, which would take their share of a budget.
-UNASKED = {"tv_factor": 1.0, "edges": "blurred", "growth": 1.0, "closer_seeds": 0.0}
+# No short fits and no timed steps, which would take their share of a budget.
+UNASKED = {
+    "tv_factor": 1.0,
+    "edges": "blurred",
+    "growth": 1.0,
+    "closer_seeds": 0.0,
+    "max_gaussians": 60_000,
+}
 
 
 class HeldClock:

@@ -164,11 +164,11 @@ def test_scatter_shows_where_rays_are_straight_sums():
 def test_ctrl_c_while_it_begins_anew_returns_what_it_had_come_to(monkeypatch):
     begun = []
 
-    def once(*scan):
+    def once(*scan, **more):
         begun.append(scan)
         if len(begun) > 1:
             raise KeyboardInterrupt
-        return prepare(*scan)
+        return prepare(*scan, **more)
 
     monkeypatch.setattr(solver, "prepare", once)
     result = reconstruct(pins(0.05), settings=ROUGH)

@@ -86,7 +86,7 @@ class Fitter:
             self.step(views, share)
             clock.done += 1
             clock.tick()
-            clock.look_ahead(self._settle)
+            clock.look_ahead(self.settle)
             made += 1
             if made == 1:
                 # The first step of a pass may wait for what lies between passes, and the first of all compiles.
@@ -100,7 +100,8 @@ class Fitter:
         if made:
             yield self._end_pass(1.0)
 
-    def _settle(self) -> None:
+    def settle(self) -> None:
+        """Wait until the steps that were asked for are made."""
         device = self.gaussians.position.device
         if device.type == "cuda":
             # Its own work alone: while another thread records a graph, nobody may wait for the whole device.

@@ -28,6 +28,7 @@ from tomo_polysplat.plan.means import Means
 from tomo_polysplat.plan.model import rays_of, scene_of
 from tomo_polysplat.plan.order import alternatives, decide, decide_start
 from tomo_polysplat.plan.plan import Plan
+from tomo_polysplat.plan.seeds_in_time import seed_for_time
 from tomo_polysplat.plan.short_fit import ShortFit, short_fit
 from tomo_polysplat.settings import Settings, make_settings
 
@@ -119,6 +120,7 @@ def under(problem: Problem, found: dict[str, Any] | None) -> tuple[Problem, Plan
     return with_fitted(problem, found["fitted"]), plan
 
 
+# What is to be fitted, how, what is known of it already, and by when.
 def prepare(
     problem: Problem,
     plan: Plan,
@@ -126,6 +128,7 @@ def prepare(
     saved: Checkpoint | None,
     report: Callable[[float, str], Any],
     lab: Lab | None = None,
+    end: float | None = None,
 ) -> PreparedFit:
     """Decide, seed and set up, or go on from where a checkpoint was.
 
@@ -140,6 +143,8 @@ def prepare(
         Gets the share done, none, and words.
     lab : Lab or None
         Of this problem, where a look at it has made one.
+    end : float or None
+        When a time budget ends, in seconds of ``kernels.compile_time.working_time``.
 
     Raises
     ------
@@ -158,8 +163,10 @@ def prepare(
         else:
             lab.plan.facts = plan.facts | lab.plan.facts
             plan = lab.plan
-        scene, rays = lab.scene, lab.rays
         report(0.0, "seeds")
+        if end is not None:
+            seed_for_time(lab, end)
+        scene, rays = lab.scene, lab.rays
         decide(lab, When.TRIAL)
         gaussians, facts = lab.seeds(), lab.facts_of_seeds()
     _tell(plan, problem, facts)

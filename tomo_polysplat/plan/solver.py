@@ -108,7 +108,7 @@ class Solver:
         plan.facts |= facts if filters is None else facts | {"bowtie": filters}
         # Other physics have another start.
         lab = lab if problem is told else None
-        prepared = prepare(problem, plan, self.run_options, self.saved, self.report, lab)
+        prepared = prepare(problem, plan, self.run_options, self.saved, self.report, lab, self._end)
         # A GPU has room for its short fits no longer.
         del lab
         if self.saved is not None:
@@ -154,7 +154,7 @@ class Solver:
         other, plan = under(problem, found)
         plan.facts |= {name: fact for name, fact in prepared.plan.facts.items() if name in STAYS}
         try:
-            anew = prepare(other, plan, self.run_options, self.saved, self.report)
+            anew = prepare(other, plan, self.run_options, self.saved, self.report, end=self._end)
             outcome = self._fit(anew, other, ask_scatter=False)
             if outcome.history or outcome.stop is None or outcome.stop.reason is not StopReason.INTERRUPTED:
                 return other, anew, outcome
@@ -235,13 +235,17 @@ class Solver:
 
         return between
 
+    @property
+    def _end(self) -> float | None:
+        """When the time budget ends."""
+        budget = self.run_options.time_budget
+        return None if budget is None else self.started + budget
+
     def _deadline(self, prepared: PreparedFit) -> float | None:
         """When the fit ends at the latest, so that the volume is made in time."""
-        budget = self.run_options.time_budget
-        if budget is None:
+        if (end := self._end) is None:
             return None
         # A volume that takes most of the budget still needs a fit: then the end is late.
-        end = self.started + budget
         left = max(end - working_time(), 0.0)
         volume = prepared.plan.growth * prepared.scene.seconds_of_basis(prepared.gaussians)
         return end - min(volume + _FINISHING, 0.5 * left)

@@ -76,6 +76,7 @@ _TOLD = {
     "growth": "The number of Gaussians, in those of the seeds",
     "tv_factor": "Smoothing, in times the usual",
     "passes": "Passes over the views",
+    "seeds_in_time": "Gaussians that the time budget has room for",
     "time_budget": "The time budget, as a share of the run",
     "compiling": "Compiling, in seconds",
     "stop": "The end",
