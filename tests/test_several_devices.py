@@ -12,16 +12,22 @@ import astra
 import numpy as np
 import pytest
 import torch
-from small_scans import QUICK, cone, fan
-from small_scans import reconstruct as reconstruct_anywhere
+from shared_out import (
+    ROUGH,
+    SMOOTHED,
+    SUMS,
+    assert_sums_are_those_of_one,
+    reconstruct,
+    relative,
+    same,
+    told_to,
+)
+from small_scans import cone, fan
 
 import tomo_polysplat as tps
 from tomo_polysplat.fit import volume_by_ranks
-from tomo_polysplat.fit.filter_sums import filter_sums
 from tomo_polysplat.fit.fitter import Fitter
 from tomo_polysplat.fit.led_step import LedStep
-from tomo_polysplat.fit.move_sums import move_sums
-from tomo_polysplat.fit.residual_sums import residual_sums
 from tomo_polysplat.fit.step import EagerStep
 from tomo_polysplat.rank_processes import devices_of, sharing
 from tomo_polysplat.rank_work import helpers
@@ -38,13 +44,6 @@ from step_scenes import fit_problem
 
 CPU = torch.device("cpu")
 TWO = ["cpu", "cpu"]
-# What is added up in another order differs by rounding, which grows with every step. A Gaussian whose gradient is all
-# rounding may step either way: so much of nearly all voxels, in the largest one, and so much of the volume, in L2.
-SAME, NEARLY_ALL, OF_ALL = 3e-5, 0.95, 1e-4
-# Smoothing takes the sign of a slope from it where neighbouring voxels are as good as equal. One process whose volumes
-# are rounded otherwise differs by up to 4e-4 in L2, and one that does not smooth by 8e-2.
-SMOOTHED = 1e-3
-ROUGH = QUICK | {"tv_weight": 0.0}
 
 
 def children():
@@ -54,12 +53,6 @@ def children():
     return [
         pid for pid, command in commands.items() if command.exists() and b"fit.follow" in command.read_bytes()
     ]
-
-
-def reconstruct(*args, **options):
-    """On the CPU, as the other processes, where no devices are named: a machine with a GPU would take that."""
-    where = {} if "devices" in options else {"device": "cpu"}
-    return reconstruct_anywhere(*args, **(where | options))
 
 
 def alone(*args, **options):
@@ -82,17 +75,6 @@ def tilted():
     return replace(scan, proj_geom=proj_geom)
 
 
-def relative(volume, reference):
-    """Difference over the reference, in L2."""
-    return float(np.linalg.norm(volume - reference) / np.linalg.norm(reference))
-
-
-def same(volume, reference):
-    """Whether two volumes differ by rounding alone."""
-    apart = np.abs(volume - reference)[reference > 0]
-    return np.quantile(apart, NEARLY_ALL) < SAME * reference.max() and relative(volume, reference) < OF_ALL
-
-
 @pytest.fixture(scope="class")
 def three():
     """Three processes that share out what is fitted while they live; they are started once."""
@@ -107,24 +89,6 @@ def connected(three):
         with three.together():
             pass
     return three
-
-
-def told_to(ranks, monkeypatch):
-    """What the others are told from now on."""
-    told, tell = [], type(ranks).tell
-    monkeypatch.setattr(type(ranks), "tell", lambda *message: (told.append(message[1]), tell(*message)))
-    return told
-
-
-def moves_left(gaussians, scene, rays, settings):
-    """`move_sums` of made-up moves."""
-    falls = np.random.default_rng(0).normal(0, 0.1, (2, len(rays.views), 3, 3))
-    return move_sums(gaussians, scene, rays, settings, torch.from_numpy(falls))
-
-
-def filters_left(gaussians, scene, rays, settings):
-    """`filter_sums` of aluminium."""
-    return filter_sums(gaussians, scene, rays, settings, scene.quadrature, 2.7)
 
 
 class TestThreeProcesses:
@@ -189,23 +153,12 @@ class TestThreeProcesses:
         shared, one = reconstruct(scan, settings=settings), alone(scan, settings=settings)
         assert same(shared.volume, one.volume) and made
 
-    @pytest.mark.parametrize("sums", [residual_sums, moves_left, filters_left])
+    @pytest.mark.parametrize("sums", SUMS)
     def test_take_a_part_of_the_views_each_for_sums(self, connected, monkeypatch, sums):
         """Views that go together are the same for any number of processes, so that each view's sums are, too."""
-        for of in (residual_sums, move_sums, filter_sums):
-            monkeypatch.setattr(sys.modules[of.__module__], "_AT_ONCE", 1)
         fit = fit_problem("cone", True, "cpu", "numba", filtered=True)
-        told = told_to(connected, monkeypatch)
-        parts = fit.gaussians, fit.scene, fit.rays, fit.settings
-        shared = sums(*parts)
-        assert told == ["rays", "work"]
-        with led_by(ALONE):
-            one = sums(*parts)
-        for name, expected in vars(one).items():
-            # Threads of torch cut arrays up otherwise than one does, which rounds some values otherwise.
-            scale = np.nanmax(np.abs(expected))
-            np.testing.assert_allclose(getattr(shared, name), expected, atol=1e-6 * scale, err_msg=name)
-            assert scale > 0, name
+        # Threads of torch cut arrays up otherwise than one does, which rounds some values otherwise.
+        assert_sums_are_those_of_one(sums, fit, connected, monkeypatch, within=1e-6)
 
     @pytest.mark.parametrize("degrees", [0.0, 3.0])
     def test_make_slabs_of_the_first_volume(self, connected, monkeypatch, degrees):
@@ -281,86 +234,6 @@ class TestThreeProcesses:
         assert not three.usable
         with pytest.raises(RankFailed, match="left in the middle of a step"):
             reconstruct(cone())
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="there is one GPU at most")
-@pytest.mark.parametrize("scan", [cone, fan])
-def test_two_gpus_make_the_volume_of_one(scan):
-    shared, one = (
-        reconstruct(scan(), settings=ROUGH, **on) for on in ({"devices": [0, 1]}, {"device": "cuda:0"})
-    )
-    assert shared.plan["ranks"].value == 2
-    assert relative(shared.volume, one.volume) < SMOOTHED
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="there is one GPU at most")
-def test_the_second_gpu_alone_makes_the_volume_of_the_first():
-    """Torch hands out to ASTRA what is on the current GPU, which is the first one."""
-    first, second = (reconstruct(cone(), settings=ROUGH, device=f"cuda:{k}") for k in range(2))
-    assert relative(second.volume, first.volume) < SMOOTHED
-
-
-@pytest.fixture(scope="class")
-def two_gpus():
-    """Two processes on a GPU each, which have begun to make something together."""
-    with sharing([torch.device("cuda", k) for k in range(2)]):
-        with current_ranks().together():
-            pass
-        yield current_ranks()
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="there is one GPU at most")
-class TestTwoGpus:
-    """What they make beside steps is what one makes."""
-
-    def test_make_the_first_volume_and_bridge_metal(self, two_gpus, monkeypatch):
-        for module in (fdk_by_ranks, projected):
-            monkeypatch.setattr(module, "_WORTH", 0)
-        geometry, grid = from_astra(cone(metal=True).proj_geom, cone(metal=True).vol_geom)
-        values = torch.from_numpy(projections_from_astra(cone(metal=True).projections, cone().proj_geom))
-        values, told = values.to(two_gpus.device), told_to(two_gpus, monkeypatch)
-
-        def made():
-            first, _ = initial_volume_on(values, geometry, grid)
-            metal = 0.5 * float(first.max())
-            return first, *bridged.bridged_start(values, first, "fdk", geometry, grid, metal=metal)
-
-        *shared, how = made()
-        assert told == ["work"] * 7 and "through metal bridged" in how
-        with led_by(ALONE):
-            *one, _ = made()
-        for together, alone in zip(shared, one):
-            # ASTRA interpolates with weights of eight bits.
-            assert together.device == two_gpus.device
-            assert relative(together.cpu().numpy(), alone.cpu().numpy()) < 5e-3
-
-    @pytest.mark.parametrize("sums", [residual_sums, moves_left, filters_left])
-    def test_add_up_residuals(self, two_gpus, monkeypatch, sums):
-        for of in (residual_sums, move_sums, filter_sums):
-            monkeypatch.setattr(sys.modules[of.__module__], "_AT_ONCE", 1)
-        fit = fit_problem("cone", True, "cuda:0", "triton", filtered=True)
-        told = told_to(two_gpus, monkeypatch)
-        parts = fit.gaussians, fit.scene, fit.rays, fit.settings
-        shared = sums(*parts)
-        assert told == ["rays", "work"]
-        with led_by(ALONE):
-            one = sums(*parts)
-        for name, expected in vars(one).items():
-            scale = np.nanmax(np.abs(expected))
-            np.testing.assert_allclose(getattr(shared, name), expected, atol=1e-4 * scale, err_msg=name)
-
-    def test_make_slices_of_the_volume(self, two_gpus, monkeypatch):
-        monkeypatch.setattr(volume_by_ranks, "_WORTH", 0)
-        fit, told = fit_problem("cone", True, "cuda:0", "triton"), told_to(two_gpus, monkeypatch)
-        parts = fit.gaussians.copy(), 0.3
-        shared = fit.scene.basis_on_host(*parts)
-        assert told == ["work"]
-        with led_by(ALONE):
-            one = fit.scene.basis_on_host(*parts)
-        np.testing.assert_allclose(shared, one, rtol=1e-4, atol=1e-5 * one.max())
 
 
 def test_a_process_that_dies_ends_the_run_and_its_checkpoint_goes_on_in_one(tmp_path):

@@ -20,10 +20,15 @@ from tomo_polysplat.rank_work import gathered, helpers
 from tomo_polysplat.ranks import Ranks, part_of
 from tomo_polysplat.settings import Settings
 
-__all__ = ["by_views"]
+__all__ = ["by_views", "views_at_once"]
 
-# Gets the part of the views, and all that a sum over them is made of.
+# Gets the part of the views, how many are looked at together, and all that a sum over them is made of.
 _Work = Callable[..., list[torch.Tensor]]
+
+
+def views_at_once(rays: Rays, most: int, most_rays: int, images: int = 1) -> int:
+    """How many views are looked at together: so many at most, and no more rays, of which there are some images."""
+    return max(1, min(most, most_rays // (rays.views.rows * rays.views.columns * images)))
 
 
 # What is done, with what of a fit, and how the views go together: nothing else holds these.
@@ -43,8 +48,8 @@ def by_views(
     Parameters
     ----------
     work : callable
-        A function of a module. Gets a slice of ``range(views)`` and all that comes after ``at_once``; gives tensors as
-        `rank_work.gathered` takes them.
+        A function of a module. Gets a slice of ``range(views)``, ``at_once`` and all that comes after it; gives tensors
+        as `rank_work.gathered` takes them.
     views, at_once : int
         Views, and how many of them are looked at together. The parts are cut between such portions, so that these are
         the same for any number of ranks.
@@ -55,15 +60,16 @@ def by_views(
     """
     ranks, portions = helpers(), -(-views // at_once)
     if portions < ranks.count or ranks.count == 1:
-        return [work(slice(0, views), gaussians, scene, rays, settings, *more)]
+        return [work(slice(0, views), at_once, gaussians, scene, rays, settings, *more)]
     shares = [part_of(portions, rank, ranks.count) for rank in range(ranks.count)]
     parts = [slice(share.start * at_once, min(share.stop * at_once, views)) for share in shares]
     with ranks.together():
         number = lent(rays.projections, ranks)
         # No rank but the first one asks what solid there is.
         told = replace(scene, solid_number=None)
-        ranks.tell("work", _follow, work, parts, gaussians, told, number, about_rays(rays), settings, *more)
-        return gathered(ranks, work(parts[0], gaussians, scene, rays, settings, *more))
+        about = number, about_rays(rays), settings
+        ranks.tell("work", _follow, work, parts, at_once, gaussians, told, *about, *more)
+        return gathered(ranks, work(parts[0], at_once, gaussians, scene, rays, settings, *more))
 
 
 # As many as `by_views` tells.
@@ -72,6 +78,7 @@ def _follow(
     ranks: Ranks,
     work: _Work,
     parts: list[slice],
+    at_once: int,
     gaussians: Gaussians,
     scene: FitScene,
     number: int,
@@ -81,4 +88,4 @@ def _follow(
 ) -> None:
     """Another rank's part."""
     rays = borrowed(ranks.lent[number], about, ranks)
-    gathered(ranks, work(parts[ranks.rank], gaussians, scene, rays, settings, *more))
+    gathered(ranks, work(parts[ranks.rank], at_once, gaussians, scene, rays, settings, *more))

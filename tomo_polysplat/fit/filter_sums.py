@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.by_views import by_views
+from tomo_polysplat.fit.by_views import by_views, views_at_once
 from tomo_polysplat.fit.loss import misfit
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
@@ -62,9 +62,8 @@ def filter_sums(
     grams : float
         Its density in g/cm3.
     """
-    at_once = max(1, min(_AT_ONCE, _RAYS // (rays.views.rows * rays.views.columns)))
-    fit = gaussians, scene, rays, settings
-    parts = by_views(_of_part, len(rays.views), at_once, *fit, at_once, quadrature, grams)
+    at_once, fit = views_at_once(rays, _AT_ONCE, _RAYS), (gaussians, scene, rays, settings)
+    parts = by_views(_of_part, len(rays.views), at_once, *fit, quadrature, grams)
     (first, *more), held_out = zip(*parts)
     return FilterSums(sum(more, first).cpu().numpy(), torch.cat(held_out).cpu().numpy())
 
@@ -72,11 +71,11 @@ def filter_sums(
 # As `fit.by_views` calls it.
 def _of_part(
     part: slice,
+    at_once: int,
     gaussians: Gaussians,
     scene: FitScene,
     rays: Rays,
     settings: Settings,
-    at_once: int,
     quadrature: Quadrature,
     grams: float,
 ) -> list[torch.Tensor]:

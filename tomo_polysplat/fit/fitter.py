@@ -27,7 +27,7 @@ from tomo_polysplat.kernels.spatial_order import spatial_order
 from tomo_polysplat.model.density_control import grow, relocate, splittable
 from tomo_polysplat.model.gaussians import OF_ALL, Gaussians
 
-__all__ = ["Batches", "Fitter", "next_views", "views_of_a_pass"]
+__all__ = ["Batches", "Fitter", "next_views", "steps_of_a_run"]
 
 # A pass over fewer views than this makes the steps of one over as many.
 _FEWEST_VIEWS = 10
@@ -65,7 +65,7 @@ class Fitter:
         self.step: Step = make_step(setup._replace(settings=hurry), batch=batch, beside=shared)
         self.batch, self.order = batch, np.empty(0, int)
         self.steps = steps
-        self.steps_of_a_pass = max(1, round(views_of_a_pass(rays) / batch))
+        self.steps_of_a_pass = max(1, round(_views_of_a_pass(rays) / batch))
         self.relocated = 0
         self.relocation_due = False
         light = int(splittable(gaussians, settings.bone_level).sum())
@@ -227,6 +227,11 @@ def next_views(
     return order[:batch], order[batch:]
 
 
-def views_of_a_pass(rays: Rays) -> int:
+def steps_of_a_run(passes: float, rays: Rays, batch: int) -> int:
+    """Steps of so many views each that passes over all of them come to."""
+    return max(1, math.ceil(passes * _views_of_a_pass(rays) / batch))
+
+
+def _views_of_a_pass(rays: Rays) -> int:
     """As many as its steps have views in all."""
     return max(len(rays.views), _FEWEST_VIEWS)

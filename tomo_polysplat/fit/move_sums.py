@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.by_views import by_views
+from tomo_polysplat.fit.by_views import by_views, views_at_once
 from tomo_polysplat.fit.loss import misfit
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
@@ -59,9 +59,8 @@ def move_sums(
         How rays shift on the detector with each move (`scan.moved_rays.falls_of`).
     """
     falls = falls.to(rays.target, torch.float32)
-    pixels = rays.views.rows * rays.views.columns
-    at_once = max(1, min(_AT_ONCE, _RAYS // (pixels * (len(falls) + 1))))
-    parts = by_views(_of_part, len(rays.views), at_once, gaussians, scene, rays, settings, at_once, falls)
+    at_once = views_at_once(rays, _AT_ONCE, _RAYS, len(falls) + 1)
+    parts = by_views(_of_part, len(rays.views), at_once, gaussians, scene, rays, settings, falls)
     normal, told, held_out = (torch.cat(of_each).cpu().numpy() for of_each in zip(*parts))
     return MoveSums(normal.swapaxes(0, 1), told.swapaxes(0, 1), held_out)
 
@@ -69,11 +68,11 @@ def move_sums(
 # One walk over the views, as in `fit.residual_sums`.
 def _of_part(
     part: slice,
+    at_once: int,
     gaussians: Gaussians,
     scene: FitScene,
     rays: Rays,
     settings: Settings,
-    at_once: int,
     falls: torch.Tensor,
 ) -> list[torch.Tensor]:
     """Of a part of the views, by these, what `MoveSums` has; sides come second."""

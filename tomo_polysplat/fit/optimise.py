@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.fitter import Batches, Fitter, views_of_a_pass
+from tomo_polysplat.fit.fitter import Batches, Fitter, steps_of_a_run
 from tomo_polysplat.fit.memory import told_of_lack
 from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.fit.snapshot import Keeps
@@ -239,9 +238,8 @@ def fit(setup: FitSetup, course: Course) -> FitOutcome:
         words = "nothing to fit: the start volume is empty"
         return FitOutcome(gaussians, stop=Stop(StopReason.EMPTY, words))
     batch = min(course.views_per_step, len(rays.views))
-    steps = max(1, math.ceil((settings.passes or 1.0) * views_of_a_pass(rays) / batch))
-    outcome = FitOutcome(gaussians)
     passes = settings.passes or 1.0
+    steps, outcome = steps_of_a_run(passes, rays, batch), FitOutcome(gaussians)
     watch: Watch[Gaussians] = Watch(settings.patience or usual_patience(passes), Gaussians.kept)
     # Nobody else holds the fitter, which makes room for another one where a question is answered by that.
     run = _Keeper(

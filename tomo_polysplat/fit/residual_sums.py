@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.by_views import by_views
+from tomo_polysplat.fit.by_views import by_views, views_at_once
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
@@ -72,8 +72,8 @@ def residual_sums(
 ) -> ResidualSums:
     """Those of all views, or of ``some`` by their numbers; each rank adds up a part of them."""
     numbers = np.arange(len(rays.views)) if some is None else some
-    at_once = max(1, min(_AT_ONCE, _RAYS // (rays.views.rows * rays.views.columns)))
-    parts = by_views(_of_part, len(numbers), at_once, gaussians, scene, rays, settings, at_once, numbers)
+    at_once = views_at_once(rays, _AT_ONCE, _RAYS)
+    parts = by_views(_of_part, len(numbers), at_once, gaussians, scene, rays, settings, numbers)
     weights, totals, counts, *aside = zip(*parts)
     count, by_depth = torch.cat(counts).permute(1, 2, 0, 3).cpu().numpy()
     view, pixel, residual, deviation = (torch.cat(of_each).numpy() for of_each in aside)
@@ -84,11 +84,11 @@ def residual_sums(
 # One walk over the views fills all sums: cut up, each part would be handed all of them.
 def _of_part(
     part: slice,
+    at_once: int,
     gaussians: Gaussians,
     scene: FitScene,
     rays: Rays,
     settings: Settings,
-    at_once: int,
     numbers: np.ndarray,
 ) -> list[torch.Tensor]:
     """Sums by pixel, those by view, (views, 2, halves, depths), and the rays held out, of a part of the views."""

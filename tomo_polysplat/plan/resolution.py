@@ -8,11 +8,11 @@ import numpy as np
 
 from tomo_polysplat.fit.problem import Problem
 
-__all__ = ["APART", "cells", "finest_spacing", "most_seeds"]
+__all__ = ["APART", "FEWEST_SEEDS", "cells", "finest_spacing", "most_seeds"]
 
 # Seeds along the longest edge: a ray through few large voxels tells what is inside them, and an object's outline
 # in a handful of Gaussians would leave its mass wrong.
-_FEWEST_SEEDS = 12
+FEWEST_SEEDS = 12
 # Voxels between seeds, or detector pixels where these are larger or voxels are few.
 APART = 1.3
 
@@ -43,7 +43,7 @@ def finest_spacing(problem: Problem) -> tuple[float, str]:
     edge = float((problem.grid.extent / problem.voxel)[: problem.dimensions].max())
     if pixel > 1.0:
         return APART * pixel, f"{APART} detector pixels at the object"
-    few = max(APART * pixel, edge / _FEWEST_SEEDS)
+    few = max(APART * pixel, edge / FEWEST_SEEDS)
     if few < APART - 1e-6:
-        return few, f"a volume of few voxels: {_FEWEST_SEEDS} seeds along it, or {APART} detector pixels"
+        return few, f"a volume of few voxels: {FEWEST_SEEDS} seeds along it, or {APART} detector pixels"
     return APART, f"{APART} voxels"

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tomo_polysplat.fit.fitter import Batches, Fitter, views_of_a_pass
+from tomo_polysplat.fit.fitter import Batches, Fitter, steps_of_a_run
 from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.kernels.compile_time import working_time
 from tomo_polysplat.model.gaussians import Gaussians
@@ -25,6 +25,7 @@ from tomo_polysplat.plan.decisions.views_per_step import ViewsPerStep
 from tomo_polysplat.plan.lab import Lab
 from tomo_polysplat.plan.model import scene_of
 from tomo_polysplat.plan.order import decide_start
+from tomo_polysplat.plan.resolution import FEWEST_SEEDS
 
 __all__ = ["seed_for_time"]
 
@@ -34,8 +35,6 @@ logger = logging.getLogger(__name__)
 _AGAIN = (SeedSpacing, FinerSeeds, SmallestScale, Passes, ViewsPerStep, TvEvery)
 # Steps that are timed after a first one, unless these take more than a share of the time that is left.
 _TIMED, _MOST = 2, 0.05
-# Seeds along an edge below which there is no outline.
-_FEWEST = 12
 
 
 def seed_for_time(lab: Lab, end: float) -> None:
@@ -57,7 +56,7 @@ def seed_for_time(lab: Lab, end: float) -> None:
     room = max(end - working_time(), 0.0) / needed
     if room >= 1:
         return
-    many = max(int(math.sqrt(room) * len(seeds)), _FEWEST**lab.problem.dimensions)
+    many = max(int(math.sqrt(room) * len(seeds)), FEWEST_SEEDS**lab.problem.dimensions)
     if many >= len(seeds):
         return
     lab.settings = replace(lab.settings, max_gaussians=many)
@@ -73,7 +72,7 @@ def _seconds_of_run(lab: Lab, seeds: Gaussians, left: float) -> float:
     """What all steps of the run would take with these, by the pace of some, for a part of what is ``left``."""
     plan, views = lab.plan, len(lab.rays.views)
     batch = min(plan.views_per_step, views)
-    steps = max(1, math.ceil(plan.passes * views_of_a_pass(lab.rays) / batch))
+    steps = steps_of_a_run(plan.passes, lab.rays, batch)
     spacing = plan.spacing * lab.problem.voxel
     # Not the lab's: that is of the plan with as many Gaussians as there will be.
     scene = scene_of(lab.problem, plan, lab.settings, lab.device)
