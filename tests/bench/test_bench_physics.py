@@ -81,7 +81,9 @@ def test_every_material_is_known():
     assert len({entry[0] for entry in materials.MATERIALS}) == len(materials.MATERIALS) > 15
 
 
-@pytest.mark.parametrize("settings", [{}, {"passes": 10.0, "views_per_step": 4}], ids=["960 steps", "120 steps"])
+@pytest.mark.parametrize(
+    "settings", [{}, {"passes": 10.0, "views_per_step": 4}], ids=["960 steps", "120 steps"]
+)
 def test_bone_is_as_dense_as_bone_however_long_it_is_fitted(settings):
     """A blurred edge looks like matter of a larger number: left to rise, inside it was 8 and 11 % too dense."""
     beam = materials.MaterialsBench().spectrum
