@@ -59,8 +59,10 @@ def test_what_is_unknown_is_refused():
 
 
 def test_the_command_leaves_a_record(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(PRESETS, "balanced", {"passes": 1.0, "tv_factor": 1.0, "edges": "blurred"})
-    options = ["--sizes", "16", "--kinds", "bone", "--feature", "4", "--views", "24", "--metal", "both"]
+    monkeypatch.setitem(
+        PRESETS, "balanced", {"passes": 1.0, "views_per_step": 8, "tv_factor": 1.0, "edges": "blurred"}
+    )
+    options = ["--sizes", "24", "--kinds", "bone", "--feature", "4", "--views", "24", "--metal", "both"]
     options += ["--methods", "fdk-water", "polysplat", "--record", str(tmp_path), "--device", "cpu"]
     assert main(["bench", "scale", *options]) == 0
     record = json.loads((tmp_path / "scale.json").read_text())
@@ -68,6 +70,6 @@ def test_the_command_leaves_a_record(tmp_path, monkeypatch, capsys):
         ("fdk-water", True), ("polysplat", True), ("fdk-water", False), ("polysplat", False)
     ]  # fmt: skip
     assert all(0.3 < run["dice"] <= 1 and run["contrast"] > 0.2 for run in record["runs"])
-    assert "bone 16, no metal" in (tmp_path / "scale.md").read_text()
+    assert "bone 24, no metal" in (tmp_path / "scale.md").read_text()
     assert "near metal" in capsys.readouterr().out
     assert (tmp_path / "scale.png").stat().st_size > 1000
