@@ -123,7 +123,7 @@ def as_many_views_as_columns(scene, geometry):
 @pytest.mark.parametrize("axes", [(0, 2), (1, 2)], ids=str)
 def test_swapped_axes(axes):
     """Only axes of equal length can be swapped without anything else noticing."""
-    for scene, geometry in SCANS:
+    for scene, geometry in CLEAN:
         if geometry == "fan" and 0 in axes:
             continue
         scan = as_many_views_as_columns(scene, geometry)
