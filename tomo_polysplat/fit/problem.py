@@ -18,7 +18,7 @@ from tomo_polysplat.checks import require_choice
 from tomo_polysplat.fit.host_rays import HostRays
 from tomo_polysplat.fit.inside import matter_is_inside
 from tomo_polysplat.fit.memory import projections_stay
-from tomo_polysplat.fit.surroundings import widened_grid
+from tomo_polysplat.fit.surroundings import NO_MARGIN, Margin, surroundings_of
 from tomo_polysplat.fit.taken_out import Step, TakenOut
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.filter_map import FilterMap
@@ -79,8 +79,8 @@ class Problem:
         That the rays hold besides what passes.
     beam : float
         Brightness of the beam, in those of the open field that the rays are relative to.
-    margin : (y, x) int
-        Voxels that the grid has more on either side than the volume that is asked for; see `fit.surroundings`.
+    margin : tuple of int
+        Voxels that the grid has more than the volume that is asked for; see `fit.surroundings.Surroundings`.
     surroundings : str
         Why, if so.
     filter_map : FilterMap or None
@@ -101,7 +101,7 @@ class Problem:
     materials: Materials | None = None
     scatter: Scatter = Scatter()
     beam: float = 1.0
-    margin: tuple[int, int] = (0, 0)
+    margin: Margin = NO_MARGIN
     surroundings: str = ""
     order: np.ndarray | None = None
     filter_map: FilterMap | None = None
@@ -130,7 +130,12 @@ class Problem:
         if spectrum is not None and spectrum.is_monochromatic:
             spectrum = None
         curves = Materials.under(materials, None if spectrum is None else spectrum.effective_energy)
-        grid, margin, why = widened_grid(projections, geometry, grid, surroundings, device)
+        around = surroundings_of(projections, geometry, grid, surroundings, device)
+        grid = around.grid
+        if around.missed.any():
+            projections = projections if own else projections.copy()
+            projections[:, around.missed] = np.nan
+            own = True
         planar = geometry.planar and grid.planar
         # A plane beside the slice is another plane.
         planar = planar and bool(grid.lower[2] <= geometry.corner[0, 2] <= grid.upper[2])
@@ -148,7 +153,7 @@ class Problem:
         rays = HostRays(projections) if own and device.type == "cuda" else projections
         return cls(
             rays, outside, inside, grid.centre, length, depth, planar, spectrum, curves,
-            margin=margin, surroundings=why, order=order if mixed else None,
+            margin=around.margin, surroundings=around.why, order=order if mixed else None,
         )  # fmt: skip
 
     @property

@@ -1,31 +1,58 @@
 """Matter beside the volume, where neither volume nor detector holds all of the object.
 
 Rays of a region of interest pass through what lies around it. Gaussians that may lie in the volume alone would have to
-stand for that, too; so the volume that is fitted is widened, and what was asked for is cut out of it in the end.
+stand for that, too; so the volume that is fitted is larger, and what was asked for is cut out of it in the end.
 """
 
 from __future__ import annotations
 
 import logging
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
+from tomo_polysplat.fit.long_object import long_object
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.continued import few_rows, half_width
 from tomo_polysplat.start.orbit import find_orbit
 from tomo_polysplat.start.weights import ray_offsets
 
-__all__ = ["cut_out", "widened_grid"]
+__all__ = ["NO_MARGIN", "Margin", "Surroundings", "cut_out", "go_on", "surroundings_of"]
 
 logger = logging.getLogger(__name__)
 
+# Voxels more below, above, on either side in y, and in x.
+Margin = tuple[int, int, int, int]
+NO_MARGIN: Margin = (0, 0, 0, 0)
 
-def widened_grid(
+
+@dataclass(frozen=True)
+class Surroundings:
+    """The volume that is fitted for one that is asked for.
+
+    Attributes
+    ----------
+    grid : VolumeGrid
+    margin : tuple of int
+        Voxels that it has more: below, above, on either side in y, and in x.
+    why : str
+        Words that say so; empty if it is the one that is asked for.
+    missed : (rows,) bool array
+        Rows of the detector that see none of the volume, but matter above or below it.
+    """
+
+    grid: VolumeGrid
+    margin: Margin
+    why: str
+    missed: np.ndarray
+
+
+def surroundings_of(
     projections: np.ndarray, geometry: Geometry, grid: VolumeGrid, most: float, device: torch.device
-) -> tuple[VolumeGrid, tuple[int, int], str]:
-    """The volume to be fitted, by how many voxels it is wider on either side in y and x, and words that say why.
+) -> Surroundings:
+    """The volume to be fitted: wider where the detector sees the object's sides nowhere, longer where it goes on.
 
     Parameters
     ----------
@@ -33,41 +60,79 @@ def widened_grid(
         -log(I/I0); NaN for rays that are not to be used.
     geometry, grid : Geometry, VolumeGrid
     most : float
-        Share of its edges that the volume is widened by at most on every side; 0: never.
+        Share of its edges that the volume is widened by at most at every side; 0: never.
     device : torch.device
-        Where that is asked: on the host of a GPU it took 3 ms or, until its threads had woken up, 80.
+        Where the width is asked: on the host of a GPU it took 3 ms or, until its threads had woken up, 80.
     """
-    reach = None
-    if most:
-        few = torch.from_numpy(np.ascontiguousarray(few_rows(projections)))
-        reach = half_width(few.to(device), geometry)
-    orbit = find_orbit(geometry)[0] if reach is not None else None
-    if reach is None or orbit is None:
-        return grid, (0, 0), ""
-    middle = 0.5 * (geometry.columns - 1)
-    radius = float(np.abs(ray_offsets(geometry, orbit, (middle - reach, middle + reach))).mean())
-    more = []
-    for k in (1, 0):
-        beyond = max(grid.lower[k] - orbit.axis[k], orbit.axis[k] - grid.upper[k]) + radius
-        # Half a voxel less is none: an object that fills the volume touches its sides.
-        wanted = math.ceil(beyond / grid.voxel_size[k] - 0.5)
-        more.append(min(max(wanted, 0), math.ceil(most * grid.shape[2 - k])))
-    if not any(more):
-        return grid, (0, 0), ""
-    margin = np.array([more[1], more[0], 0]) * grid.voxel_size
-    nz, ny, nx = grid.shape
-    wider = VolumeGrid((nz, ny + 2 * more[0], nx + 2 * more[1]), grid.lower - margin, grid.upper + margin)
-    why = (
-        f"fitted with {max(more)} voxels more on every side: the object reaches beyond the detector and the volume,"
-        f" {radius:.3g} from the axis if it is round"
-    )
+    as_it_is = Surroundings(grid, NO_MARGIN, "", np.zeros(geometry.rows, bool))
+    orbit = find_orbit(geometry)[0] if most else None
+    if orbit is None:
+        return as_it_is
+    few = torch.from_numpy(np.ascontiguousarray(few_rows(projections)))
+    columns, radius, aside, words = half_width(few.to(device), geometry), 0.0, [0, 0], []
+    if columns is not None:
+        middle = 0.5 * (geometry.columns - 1)
+        ends = (middle - columns, middle + columns)
+        radius = float(np.abs(ray_offsets(geometry, orbit, ends)).mean())
+        for k in (0, 1):
+            beyond = max(grid.lower[k] - orbit.axis[k], orbit.axis[k] - grid.upper[k]) + radius
+            aside[k] = _voxels(beyond, grid, k, most)
+    if any(aside):
+        words.append(
+            f"{max(aside)} voxels more on every side: the object reaches beyond the detector and the volume,"
+            f" {radius:.3g} from the axis if it is round"
+        )
+    long = long_object(projections, geometry, grid, orbit, radius)
+    below = _voxels(grid.lower[2] - long.lower, grid, 2, most)
+    above = _voxels(long.upper - grid.upper[2], grid, 2, most)
+    if below or above:
+        words.append(f"{below} slices more below and {above} above: the object is longer than the volume")
+    if long.missed.any():
+        words.append(
+            f"{long.missed.sum()} rows of the detector left out, which see it beside the volume alone"
+        )
+    margin = (below, above, aside[1], aside[0])
+    if not words:
+        return as_it_is
+    why = "fitted with " + "; ".join(words)
     logger.info("The volume is %s", why)
-    return wider, (more[0], more[1]), why
+    return Surroundings(_grown(grid, margin), margin, why, long.missed)
 
 
-def cut_out(volume: np.ndarray, margin: tuple[int, int]) -> np.ndarray:
-    """What was asked for of a volume (..., y, x) that is so much wider."""
+def _voxels(beyond: float, grid: VolumeGrid, axis: int, most: float) -> int:
+    """How many voxels a length beyond an end of the volume takes, up to a share of those along the axis."""
+    # Half a voxel less is none: an object that fills the volume touches its sides.
+    wanted = math.ceil(beyond / grid.voxel_size[axis] - 0.5)
+    return min(max(wanted, 0), math.ceil(most * grid.shape[2 - axis]))
+
+
+def _grown(grid: VolumeGrid, margin: Margin) -> VolumeGrid:
+    """The grid with so many voxels more."""
+    if not any(margin):
+        return grid
+    below, above, y, x = margin
+    nz, ny, nx = grid.shape
+    shape = nz + below + above, ny + 2 * y, nx + 2 * x
+    lower, upper = (np.array([x, y, z]) * grid.voxel_size for z in (below, above))
+    return VolumeGrid(shape, grid.lower - lower, grid.upper + upper)
+
+
+def cut_out(volume: np.ndarray, margin: Margin) -> np.ndarray:
+    """What was asked for of a volume (..., z, y, x), or (y, x), that has so many voxels more."""
     if not any(margin):
         return volume
-    y, x = margin
+    below, above, y, x = margin
+    if below or above:
+        volume = volume[..., below : volume.shape[-3] - above, :, :]
     return np.ascontiguousarray(volume[..., y : volume.shape[-2] - y, x : volume.shape[-1] - x])
+
+
+def go_on(volume: torch.Tensor, margin: Margin) -> None:
+    """Let slices (z, y, x) in the margin that are empty, as no ray tells of them, go on as the next ones, in place."""
+    below, above, _, _ = margin
+    last = len(volume) - 1
+    for inner, outer in ((below, -1), (last - above, last + 1)):
+        step = 1 if outer > inner else -1
+        for k in range(inner + step, outer, step):
+            if not bool(volume[k].any()):
+                volume[k] = volume[k - step]

@@ -9,6 +9,7 @@ import numpy as np
 
 from tomo_polysplat.fit.host_rays import HostRays
 from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.fit.surroundings import NO_MARGIN
 from tomo_polysplat.parallel import run_tasks, split_range
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.settings import Settings
@@ -36,7 +37,7 @@ def coarse_problem(problem: Problem, factor: int) -> tuple[Problem, int]:
     grid = VolumeGrid((voxels[0], voxels[1], voxels[2]), problem.grid.lower, problem.grid.upper)
     values = joined_pixels(problem.projections, rows, factor)
     behind = None if problem.filter_map is None else problem.filter_map.joined(rows, factor)
-    whole = replace(problem, projections=values, geometry=geometry, grid=grid, margin=(0, 0))
+    whole = replace(problem, projections=values, geometry=geometry, grid=grid, margin=NO_MARGIN)
     return replace(whole, filter_map=behind), rows
 
 

@@ -6,6 +6,7 @@ import torch
 
 from tomo_polysplat.fit.memory import start_stays
 from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.fit.surroundings import go_on
 from tomo_polysplat.free_memory import MUCH, give_back, keeps_more_than
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.physics.water import areal_density, transmitted_energy
@@ -59,6 +60,7 @@ def _made(problem: Problem, device: torch.device, settings: Settings) -> tuple[t
     volume, bridged = bridged_start(
         values, volume, done["method"], problem.geometry, problem.grid, metal=metal, spare=spare
     )
+    go_on(volume, problem.margin)
     return _looked_at(volume, device), f"{done['method'].upper()}: {done['reason']}{bridged}"
 
 

@@ -1,0 +1,93 @@
+"""An object that is longer than the volume, seen by a scanner whose rays are known in closed form."""
+
+import numpy as np
+import pytest
+
+from tomo_polysplat.fit.long_object import long_object
+from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.start.orbit import find_orbit
+
+RADIUS = 0.6
+GRID = VolumeGrid((8, 11, 11), [-1.0, -1.0, -0.5], [1.0, 1.0, 0.5])
+
+
+def scanner(beam, height, source=0.0, views=9, rows=41, columns=21):
+    """Sources at a distance of 3 that see ``height`` above and below their plane at the axis."""
+    angle = 2 * np.pi * np.arange(views) / views
+    across = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
+    out = np.stack([np.sin(angle), -np.cos(angle), 0 * angle], 1)
+    at = np.array([0.0, 0.0, source])
+    times = 2.0 if beam == "cone" else 1.0
+    u, v = 0.12 * times * across, times * 2 * height / (rows - 1) * np.tile([0.0, 0.0, 1.0], (views, 1))
+    corner = at - 3.0 * out - 0.5 * (columns - 1) * u - 0.5 * (rows - 1) * v
+    return Geometry(beam, at + 3.0 * out if beam == "cone" else -out, corner, u, v, rows, columns)
+
+
+def points(geometry, count=801):
+    """(count, views, rows, columns, 3) along the rays."""
+    row, column = np.mgrid[: geometry.rows, : geometry.columns][..., None]
+    corner, u, v, origin = (
+        part[:, None, None] for part in (geometry.corner, geometry.u, geometry.v, geometry.origin)
+    )
+    pixel = corner + row * v + column * u
+    start = origin if geometry.beam == "cone" else pixel - 6 * origin
+    return start + np.linspace(0, 1, count)[:, None, None, None, None] * (pixel - start)
+
+
+def of_cylinder(where, lower, upper):
+    """Which points lie in a cylinder about the axis."""
+    z = where[..., 2]
+    return (np.hypot(where[..., 0], where[..., 1]) < RADIUS) & (z > lower) & (z < upper)
+
+
+def found(geometry, lower, upper, grid=GRID):
+    where = points(geometry)
+    inside = of_cylinder(where, lower, upper)
+    values = 0.01 * inside.sum(axis=0).astype(np.float32)
+    return long_object(values, geometry, grid, find_orbit(geometry)[0]), where, inside
+
+
+@pytest.mark.parametrize("source", [0.0, 0.2, -0.7])
+@pytest.mark.parametrize("height", [0.5, 0.9])
+def test_all_that_rays_through_the_volume_meet_of_a_long_rod_is_held(height, source):
+    geometry = scanner("cone", height, source)
+    long, where, inside = found(geometry, -9.0, 9.0)
+    crossed = (inside & (np.abs(where[..., 2]) < 0.5)).any(axis=0)
+    assert crossed.any() and not crossed[:, long.missed].any()
+    z = where[..., 2][inside & (crossed & ~long.missed[:, None])[None]]
+    assert long.lower <= z.min() + 0.02 and long.upper >= z.max() - 0.02
+    # And no more than that by much: the columns tell the radius, and the rows the height, to a pixel or two.
+    assert long.lower > min(z.min(), -0.5) - 0.12 and long.upper < max(z.max(), 0.5) + 0.12
+
+
+def test_rows_that_see_the_rod_beside_the_volume_alone_are_left_out():
+    geometry = scanner("cone", 0.9)
+    long, where, inside = found(geometry, -9.0, 9.0)
+    crossed = (inside & (np.abs(where[..., 2]) < 0.5)).any(axis=(0, 1, 3))
+    assert long.missed.any() and long.missed[0] and long.missed[-1]
+    assert (~crossed == long.missed).mean() > 0.9 and not (crossed & long.missed).any()
+
+
+def test_an_object_that_ends_within_the_volume_changes_nothing():
+    long, _, _ = found(scanner("cone", 0.9), -0.45, 0.45)
+    assert (long.lower, long.upper) == (-0.5, 0.5) and not long.missed.any()
+
+
+def test_an_end_that_is_seen_is_found():
+    long, _, _ = found(scanner("cone", 0.9), -0.3, 0.6)
+    assert long.lower == -0.5 and long.upper == pytest.approx(0.6, abs=0.05)
+
+
+def test_parallel_rays_meet_nothing_above_or_below():
+    geometry = scanner("parallel", 0.9)
+    long, _, _ = found(geometry, -9.0, 9.0)
+    assert (long.lower, long.upper) == (-0.5, 0.5)
+    z = geometry.corner[0, 2] + np.arange(geometry.rows) * geometry.v[0, 2]
+    assert np.array_equal(long.missed, np.abs(z) > 0.5)
+
+
+def test_nothing_at_all_is_no_long_object():
+    geometry = scanner("cone", 0.9)
+    values = np.full((geometry.views, geometry.rows, geometry.columns), np.nan, np.float32)
+    long = long_object(values, geometry, GRID, find_orbit(geometry)[0])
+    assert (long.lower, long.upper) == (-0.5, 0.5) and not long.missed.any()
