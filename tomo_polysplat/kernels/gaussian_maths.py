@@ -5,34 +5,28 @@ from __future__ import annotations
 import numpy as np
 
 from tomo_polysplat.compiled import called, njit
+from tomo_polysplat.kernels.numba_lanes import power_of_two, within
 
-__all__ = ["FAST", "gaussian", "whitening", "whitening_adjoint"]
+__all__ = ["FAST", "gaussian", "squared", "whitening", "whitening_adjoint"]
 
 # Rounding may be reordered for speed; NaN and infinity keep their meaning (planar Gaussians use infinity).
 FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
 
 
-@njit(inline="always")
-def gaussian(q, cut):
-    """``exp(-q / 2)`` in float32 within 2e-7 relative for 0 <= q <= cut, else 0; written so that it vectorises.
+# Beyond this square of a distance a Gaussian is below 2e-22, and where it is zero none is too small for a float.
+_FARTHEST = np.float32(100)
 
-    2^t is split into an integer, set directly as the float's exponent, and a fraction in [-1/2, 1/2] whose
-    power is a Taylor polynomial of degree 6. Beyond q = 100 the result stays at 2e-22, since subnormal numbers
-    would be slow.
-    """
-    deepest = cut if cut < np.float32(100) else np.float32(100)
-    t = (q if q < deepest else deepest) * np.float32(-0.7213475204444817)
-    whole = np.int32(t - np.float32(0.5))
-    f = (t - np.float32(whole)) * np.float32(0.6931471805599453)
-    p = np.float32(1 / 720)
-    p = p * f + np.float32(1 / 120)
-    p = p * f + np.float32(1 / 24)
-    p = p * f + np.float32(1 / 6)
-    p = p * f + np.float32(0.5)
-    p = p * f + np.float32(1.0)
-    p = p * f + np.float32(1.0)
-    power = p * np.int32((whole + np.int32(127)) << np.int32(23)).view(np.float32)
-    return power if q <= cut else np.float32(0)
+
+@njit(inline="always")
+def squared(cutoff):
+    """The square of the distance at which Gaussians end, for `gaussian`."""
+    return min(np.float32(cutoff * cutoff), _FARTHEST)
+
+
+@njit(inline="always")
+def gaussian(q, cut, factor):
+    """``factor exp(-q / 2)`` of lanes, the exponential within 4e-7 relative, where ``q <= cut``, else 0."""
+    return within(q, cut, power_of_two(q * np.float32(-0.7213475204444817)) * factor)
 
 
 @njit(inline="always")

@@ -14,7 +14,7 @@ import numpy as np
 from tomo_polysplat.compiled import called, njit
 from tomo_polysplat.kernels.project.numba_group import GROUP, SIZE, gaussian_of, put_group
 
-__all__ = ["MOMENTS", "RECORD", "pull_back", "pull_back_view", "ray_frame", "rows_of", "set_up"]
+__all__ = ["MOMENTS", "RECORD", "numbers_of", "pull_back", "pull_back_view", "ray_frame", "rows_of", "set_up"]
 
 RECORD = 12  # numbers of a footprint, in the order of _described
 MOMENTS = 11  # sums over a footprint, in the order read by pull_back
@@ -178,6 +178,13 @@ def set_up(
                 for i in range(4):
                     span[v, first + k, i] = int(out[(RECORD + i) * GROUP + k]) if ahead else 0
     return skipped
+
+
+@njit(inline="always")
+def numbers_of(record, v, n):
+    """The numbers of a footprint as a tuple: an array would be read again after every store to another."""
+    a = record[v, n]
+    return a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], a[8], a[9], a[10], a[11]
 
 
 @_step

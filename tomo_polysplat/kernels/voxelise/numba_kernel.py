@@ -10,8 +10,18 @@ import math
 import numpy as np
 
 from tomo_polysplat.compiled import called, njit
-from tomo_polysplat.kernels.gaussian_maths import FAST, gaussian, whitening, whitening_adjoint
-from tomo_polysplat.kernels.numba_lanes import LANES, add_product, add_scaled, lane_sums
+from tomo_polysplat.kernels.gaussian_maths import FAST, gaussian, squared, whitening, whitening_adjoint
+from tomo_polysplat.kernels.numba_lanes import (
+    HALF,
+    LANES,
+    add_blocks,
+    halves,
+    lane_sums,
+    load,
+    load_blocks,
+    ramp,
+    store,
+)
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.parallel import cpu_threads, run_tasks, shares
 
@@ -65,7 +75,7 @@ def _slices(rec, cutoff, length):
 
 @njit(inline="always")
 def _columns(rec, cutoff, length):
-    """The columns a Gaussian reaches in any row, and whether they are more than one block."""
+    """The columns a Gaussian reaches in any row, whether they fit in half a block, and whether in no single one."""
     r11, r12, r13, r22, r23, r33 = rec[3:]
     # The first row of the inverse of r: its length is the deviation along a row of voxels.
     by_r11, by_r22 = np.float32(1) / r11, np.float32(1) / r22
@@ -74,7 +84,15 @@ def _columns(rec, cutoff, length):
         third = (second * r23 - r13) / r33
     spread = cutoff * by_r11 * math.sqrt(np.float32(1) + second * second + third * third)
     j0, j1 = _interval(rec[0], np.float32(0), spread, np.float32(1), length)
-    return j0, j1, j1 - j0 > LANES
+    return j0, j1, j1 - j0 <= HALF, j1 - j0 > LANES
+
+
+@njit(inline="always")
+def _row_columns(rec, y, z, cut, length):
+    """The columns a Gaussian reaches in one row."""
+    w, u, across = rec[8] * z, rec[6] * y + rec[7] * z, rec[4] * y + rec[5] * z
+    root = math.sqrt(max(np.float32(0), cut - w * w - u * u))
+    return _interval(rec[0], across, root, rec[3], length)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -87,84 +105,96 @@ def _set_up(start, stop, position, scale, rotation, first, spacing, record):
 
 
 @njit(inline="always")
-def _block(x0, r11, across, rest, cut, value):
-    """``exp(-distance^2 / 2)`` of the voxels x0, x0 + 1, ... of one row, zero beyond the cut."""
-    for k in range(LANES):
-        t = r11 * (np.float32(k) + x0) + across
-        value[k] = gaussian(t * t + rest, cut)
+def _numbers_of(record, n):
+    """The numbers of a Gaussian as a tuple: an array would be read again after every store to another."""
+    a = record[n]
+    return a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], a[8]
 
 
 @njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def _fill(first, last, record, weight, cutoff, ny, nx, volume):
     """Add every Gaussian to the slices first..last of ``volume`` (nz, ny, channels, padded nx)."""
-    cut = np.float32(cutoff * cutoff)
-    value = np.empty(LANES, np.float32)
+    cut, one, none = squared(cutoff), np.float32(1), np.float32(0)
     nz, _, channels, stride = volume.shape
     for n in range(len(record)):
-        rec = record[n]
+        rec = _numbers_of(record, n)
         xc, yc, zc, r11, r12, r13, r22, r23, r33 = rec
         low, high = _slices(rec, cutoff, nz)
         # A Gaussian of at most one block a row needs no range of columns for every row.
-        j0, j1, wide = _columns(rec, cutoff, nx)
+        j0, j1, narrow, wide = _columns(rec, cutoff, nx)
         for iz in range(max(low, first), min(high, last)):
             z = np.float32(iz) - zc
             z2 = (r33 * z) * (r33 * z)
-            y0, y1 = _interval(yc, r23 * z, math.sqrt(max(np.float32(0), cut - z2)), r22, ny)
-            for iy in range(y0, y1):
-                y = np.float32(iy) - yc
-                up = r22 * y + r23 * z
-                rest, across = z2 + up * up, r12 * y + r13 * z
+            iy, end = _interval(yc, r23 * z, math.sqrt(max(none, cut - z2)), r22, ny)
+            while iy < end:
+                # Two short rows at once, where there are two.
+                two = narrow and iy + 1 < end
+                y0 = np.float32(iy) - yc
+                y = halves(y0, np.float32(iy + 1) - yc if two else y0)
+                apart = channels * stride if two else HALF
                 if wide:
-                    j0, j1 = _interval(xc, across, math.sqrt(max(np.float32(0), cut - rest)), r11, nx)
+                    j0, j1 = _row_columns(rec, y0, z, cut, nx)
+                u = r22 * y + r23 * z
+                rest, across = u * u + z2, r12 * y + r13 * z
                 for j in range(j0, j1, LANES):
-                    _block(np.float32(j) - xc, r11, across, rest, cut, value)
+                    x0 = np.float32(j) - xc
+                    x = halves(x0, x0 + np.float32(0 if two else HALF)) + ramp()
+                    t = r11 * x + across
+                    value = gaussian(t * t + rest, cut, one)
+                    at = ((iz * ny + iy) * channels) * stride + j
                     for c in range(channels):
-                        at = ((iz * ny + iy) * channels + c) * stride + j
-                        add_scaled(volume, at, weight[c, n], value, 0)
+                        add_blocks(volume, at + c * stride, apart, weight[c, n], value)
+                iy += 2 if two else 1
 
 
 @njit(inline="always")
-def _gather(n, rec, weight, cutoff, nx, grad_volume, value, total, acc):
-    """Lane sums over the voxels of one Gaussian: of h times (t, u, w, tt, tu, tw, uu, uw, ww), with
-    h = dL/d(distance^2) = dL/d(t^2 + u^2 + w^2), and of dL/df f by channel."""
-    cut = np.float32(cutoff * cutoff)
-    half = np.float32(-0.5)
+def _gather(n, rec, weight, cutoff, nx, grad_volume, acc):
+    """Write to ``acc``, lane by lane, the sums over the voxels of one Gaussian: of h times (t, u, w, tt, tu, tw, uu, uw,
+    ww), with h = dL/d(distance^2) = dL/d(t^2 + u^2 + w^2), and of dL/df f by channel."""
+    cut, half, one, none = squared(cutoff), np.float32(-0.5), np.float32(1), np.float32(0)
     xc, yc, zc, r11, r12, r13, r22, r23, r33 = rec
     nz, ny, channels, stride = grad_volume.shape
     low, high = _slices(rec, cutoff, nz)
-    j0, j1, wide = _columns(rec, cutoff, nx)
+    j0, j1, narrow, wide = _columns(rec, cutoff, nx)
+    zero = halves(none, none)
+    m0 = m1 = m2 = m3 = m4 = m5 = m6 = m7 = m8 = zero
+    for c in range(channels):
+        store(acc, (_MOMENTS + c) * LANES, zero)
     for iz in range(low, high):
         z = np.float32(iz) - zc
-        deep = r33 * z
-        z2 = deep * deep
-        y0, y1 = _interval(yc, r23 * z, math.sqrt(max(np.float32(0), cut - z2)), r22, ny)
-        for iy in range(y0, y1):
-            y = np.float32(iy) - yc
-            up = r22 * y + r23 * z
-            rest, across = z2 + up * up, r12 * y + r13 * z
+        w = r33 * z
+        z2 = w * w
+        iy, end = _interval(yc, r23 * z, math.sqrt(max(none, cut - z2)), r22, ny)
+        while iy < end:
+            two = narrow and iy + 1 < end
+            y0 = np.float32(iy) - yc
+            y = halves(y0, np.float32(iy + 1) - yc if two else y0)
+            apart = channels * stride if two else HALF
             if wide:
-                j0, j1 = _interval(xc, across, math.sqrt(max(np.float32(0), cut - rest)), r11, nx)
+                j0, j1 = _row_columns(rec, y0, z, cut, nx)
+            u = r22 * y + r23 * z
+            rest, across = u * u + z2, r12 * y + r13 * z
             for j in range(j0, j1, LANES):
                 x0 = np.float32(j) - xc
-                _block(x0, r11, across, rest, cut, value)
-                for k in range(LANES):
-                    total[k] = np.float32(0)
+                x = halves(x0, x0 + np.float32(0 if two else HALF)) + ramp()
+                t = r11 * x + across
+                value = gaussian(t * t + rest, cut, one)
+                at = ((iz * ny + iy) * channels) * stride + j
+                total = zero
                 for c in range(channels):
-                    at = ((iz * ny + iy) * channels + c) * stride + j
-                    add_product(acc, (_MOMENTS + c) * LANES, grad_volume, at, value, 0)
-                    add_scaled(total, 0, weight[c, n], grad_volume, at)
-                for k in range(LANES):
-                    t = r11 * (np.float32(k) + x0) + across
-                    h = half * total[k] * value[k]
-                    acc[0 * LANES + k] += h * t
-                    acc[1 * LANES + k] += h * up
-                    acc[2 * LANES + k] += h * deep
-                    acc[3 * LANES + k] += h * t * t
-                    acc[4 * LANES + k] += h * t * up
-                    acc[5 * LANES + k] += h * t * deep
-                    acc[6 * LANES + k] += h * up * up
-                    acc[7 * LANES + k] += h * up * deep
-                    acc[8 * LANES + k] += h * deep * deep
+                    slope = load_blocks(grad_volume, at + c * stride, apart)
+                    total = total + weight[c, n] * slope
+                    to = (_MOMENTS + c) * LANES
+                    store(acc, to, load(acc, to) + slope * value)
+                h = half * total * value
+                ht, hu, hw = h * t, h * u, h * w
+                m0, m1, m2, m3, m4 = m0 + ht, m1 + hu, m2 + hw, m3 + ht * t, m4 + ht * u
+                m5, m6, m7, m8 = m5 + ht * w, m6 + hu * u, m7 + hu * w, m8 + hw * w
+            iy += 2 if two else 1
+    to = 0
+    for m in (m0, m1, m2, m3, m4, m5, m6, m7, m8):
+        store(acc, to, m)
+        to += LANES
 
 
 # Inlined by LLVM, which compiles sooner than where Numba does it; the loop along a row would lose its vectors so.
@@ -192,19 +222,17 @@ def _gather_range(
 ):  # fmt: skip
     """The gradients of the Gaussians start..stop."""
     white, q, rec, grad_white = np.empty((3, 3)), np.empty((3, 3)), np.empty(9), np.empty((3, 3))
-    single = np.empty(9, np.float32)
-    value, total = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
+    single = np.empty((1, 9), np.float32)
     # As many sums as `lane_sums` makes at once.
     sums = np.empty(-(-(_MOMENTS + len(weight)) // LANES) * LANES, np.float32)
-    acc = np.empty(len(sums) * LANES, np.float32)
+    acc = np.zeros(len(sums) * LANES, np.float32)
     for n in range(start, stop):
         _triangle(position, scale, rotation, n, first, spacing, white, q, rec)
         for k in range(9):
-            single[k] = rec[k]
-        acc[:] = np.float32(0)
-        _gather(n, single, weight, cutoff, nx, grad_volume, value, total, acc)
+            single[0, k] = rec[k]
+        _gather(n, _numbers_of(single, 0), weight, cutoff, nx, grad_volume, acc)
         for some in range(0, len(sums), LANES):
-            lane_sums(sums, some, acc, some * LANES)
+            store(sums, some, lane_sums(acc, some * LANES))
         for c in range(len(weight)):
             grad_weight[c, n] = sums[_MOMENTS + c]
         _pull_back(n, white, q, rec, spacing, sums, grad_position, grad_white)
