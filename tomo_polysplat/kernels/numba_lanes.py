@@ -23,6 +23,10 @@ __all__ = [
     "HALF",
     "LANES",
     "add_blocks",
+    "ceiling",
+    "floor",
+    "larger",
+    "smaller",
     "halves",
     "inverse_root",
     "lane_sums",
@@ -198,18 +202,63 @@ def add_blocks(typing, array, start, apart, factor, value):
     return types.void(array, types.intp, types.intp, types.float32, _lanes), generate
 
 
+def _called(builder, name, values, **more):
+    """The compiler's own function ``llvm.NAME`` of lanes."""
+    kind = ir.FunctionType(_VECTOR, [_VECTOR] * len(values))
+    function = get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}f32")
+    return builder.call(function, [_spread(builder, value) for value in values], **more)
+
+
+@_intrinsic
+def floor(typing, value):
+    """The largest whole numbers up to these."""
+
+    def generate(context, builder, signature, values):
+        return _called(builder, "floor", values)
+
+    return _lanes(_lanes), generate
+
+
+@_intrinsic
+def ceiling(typing, value):
+    """The smallest whole numbers from these on."""
+
+    def generate(context, builder, signature, values):
+        return _called(builder, "ceil", values)
+
+    return _lanes(_lanes), generate
+
+
+@_intrinsic
+def larger(typing, value, number):
+    """These, or ``number`` where that is larger."""
+
+    def generate(context, builder, signature, values):
+        return _called(builder, "maxnum", values)
+
+    return _lanes(_lanes, types.float32), generate
+
+
+@_intrinsic
+def smaller(typing, value, number):
+    """These, or ``number`` where that is smaller."""
+
+    def generate(context, builder, signature, values):
+        return _called(builder, "minnum", values)
+
+    return _lanes(_lanes, types.float32), generate
+
+
 @_intrinsic
 def inverse_root(typing, value):
     """``1 / sqrt(value)`` within 2e-7 relative, of at least 1e-20."""
 
     def generate(context, builder, signature, values):
         flags = ("afn", "arcp", "contract")
-        (value,) = values
-        enough = builder.fcmp_ordered(">", value, _all(_LEAST))
-        value = builder.select(enough, value, _all(_LEAST))
-        kind = ir.FunctionType(_VECTOR, [_VECTOR])
-        root = get_or_insert_function(builder.module, kind, f"llvm.sqrt.v{LANES}f32")
-        return builder.fdiv(_all(1.0), builder.call(root, [value], fastmath=flags), flags=flags)
+        root = _called(
+            builder, "sqrt", [_called(builder, "maxnum", [*values, _FLOAT(_LEAST)])], fastmath=flags
+        )
+        return builder.fdiv(_all(1.0), root, flags=flags)
 
     return _lanes(_lanes), generate
 

@@ -155,7 +155,9 @@ def _gather(v, n, k, record, span, weight, cutoff, columns, grad_image, acc):
 
 
 @njit(inline="always")
-def _gather_group(v, first, some, record, span, weight, cutoff, columns, grad_image, acc, of_group, of_weight):
+def _gather_group(
+    v, first, some, record, span, weight, cutoff, columns, grad_image, acc, of_group, of_weight
+):
     """Fill ``of_group`` with the moments of a group in view ``v``, and with whether there is a footprint; add the
     gradients of the weights to ``of_weight``."""
     of_group[MOMENTS * GROUP :] = 0.0

@@ -15,11 +15,16 @@ from tomo_polysplat.kernels.numba_lanes import (
     HALF,
     LANES,
     add_blocks,
+    ceiling,
+    floor,
     halves,
+    inverse_root,
     lane_sums,
+    larger,
     load,
     load_blocks,
     ramp,
+    smaller,
     store,
 )
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
@@ -27,6 +32,7 @@ from tomo_polysplat.parallel import cpu_threads, run_tasks, shares
 
 __all__ = ["backward", "forward"]
 
+_NUMBERS = 15  # numbers of a Gaussian, in the order of _described
 _MOMENTS = 9  # sums over the voxels of a Gaussian, in the order read by _pull_back
 
 
@@ -66,25 +72,41 @@ def _interval(centre, shift, root, factor, length):
 
 
 @njit(inline="always")
-def _slices(rec, cutoff, length):
-    """The slices a Gaussian reaches; a two-dimensional one (r33 = 0) reaches all."""
-    if rec[8] == 0.0:
-        return 0, length
-    return _interval(rec[2], 0.0, cutoff, rec[8], length)
+def _described(rec, cutoff, nz, nx, record, at):
+    """Write the numbers of a Gaussian to ``record[at]``: those of `_triangle`; the slices that it reaches, a
+    two-dimensional one (r33 = 0) all; the columns that it reaches in any row; 1 / r22 and r23 / r22."""
+    r11, r12, r13, r22, r23, r33 = rec[3], rec[4], rec[5], rec[6], rec[7], rec[8]
+    # The first row of the inverse of r: its length is the deviation along a row of voxels.
+    second, third, low, high = r12 / r22, 0.0, 0, nz
+    if r33 > 0.0:
+        third = (second * r23 - r13) / r33
+        low, high = _interval(rec[2], 0.0, cutoff, r33, nz)
+    spread = cutoff * math.sqrt(1.0 + second * second + third * third)
+    j0, j1 = _interval(rec[0], 0.0, spread, r11, nx)
+    for k in range(9):
+        record[at, k] = rec[k]
+    record[at, 9], record[at, 10], record[at, 11], record[at, 12] = low, high, j0, j1
+    record[at, 13], record[at, 14] = 1.0 / r22, r23 / r22
 
 
 @njit(inline="always")
-def _columns(rec, cutoff, length):
-    """The columns a Gaussian reaches in any row, whether they fit in half a block, and whether in no single one."""
-    r11, r12, r13, r22, r23, r33 = rec[3:]
-    # The first row of the inverse of r: its length is the deviation along a row of voxels.
-    by_r11, by_r22 = np.float32(1) / r11, np.float32(1) / r22
-    second, third = r12 * by_r22, np.float32(0)
-    if r33 > np.float32(0):
-        third = (second * r23 - r13) / r33
-    spread = cutoff * by_r11 * math.sqrt(np.float32(1) + second * second + third * third)
-    j0, j1 = _interval(rec[0], np.float32(0), spread, np.float32(1), length)
-    return j0, j1, j1 - j0 <= HALF, j1 - j0 > LANES
+def _numbers_of(record, at):
+    """The numbers of a Gaussian as tuples: an array would be read again after every store to another."""
+    a = record[at]
+    ranges = int(a[9]), int(a[10]), int(a[11]), int(a[12])
+    return (a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], a[8]), ranges, (a[13], a[14])
+
+
+@njit(inline="always")
+def _rows(rec, by, cut, ny, iz, rows):
+    """Fill ``rows`` with the first row that a Gaussian reaches in each of ``LANES`` slices from ``iz`` on, and then with
+    the one after its last: no more than the first where it reaches none."""
+    (by_r22, slope), z0 = by, np.float32(iz) - rec[2]
+    z = halves(z0, z0 + np.float32(HALF)) + ramp()
+    left = cut - (rec[8] * z) * (rec[8] * z)
+    spread, middle = by_r22 * left * inverse_root(left), rec[1] - slope * z
+    store(rows, 0, ceiling(larger(middle - spread, np.float32(0))))
+    store(rows, LANES, floor(smaller(middle + spread, np.float32(ny - 1))) + np.float32(1))
 
 
 @njit(inline="always")
@@ -96,36 +118,32 @@ def _row_columns(rec, y, z, cut, length):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _set_up(start, stop, position, scale, rotation, first, spacing, record):
+def _set_up(start, stop, position, scale, rotation, first, spacing, cutoff, nz, nx, record):
     white, q, rec = np.empty((3, 3)), np.empty((3, 3)), np.empty(9)
     for n in range(start, stop):
         _triangle(position, scale, rotation, n, first, spacing, white, q, rec)
-        for k in range(9):
-            record[n, k] = rec[k]
-
-
-@njit(inline="always")
-def _numbers_of(record, n):
-    """The numbers of a Gaussian as a tuple: an array would be read again after every store to another."""
-    a = record[n]
-    return a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], a[8]
+        _described(rec, cutoff, nz, nx, record, n)
 
 
 @njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def _fill(first, last, record, weight, cutoff, ny, nx, volume):
     """Add every Gaussian to the slices first..last of ``volume`` (nz, ny, channels, padded nx)."""
-    cut, one, none = squared(cutoff), np.float32(1), np.float32(0)
-    nz, _, channels, stride = volume.shape
+    cut, one = squared(cutoff), np.float32(1)
+    channels, stride = volume.shape[2:]
+    rows = np.empty(2 * LANES, np.float32)
     for n in range(len(record)):
-        rec = _numbers_of(record, n)
+        rec, (low, high, j0, j1), by = _numbers_of(record, n)
         xc, yc, zc, r11, r12, r13, r22, r23, r33 = rec
-        low, high = _slices(rec, cutoff, nz)
         # A Gaussian of at most one block a row needs no range of columns for every row.
-        j0, j1, narrow, wide = _columns(rec, cutoff, nx)
-        for iz in range(max(low, first), min(high, last)):
+        narrow, wide = j1 - j0 <= HALF, j1 - j0 > LANES
+        begin = max(low, first)
+        for iz in range(begin, min(high, last)):
+            at_slice = (iz - begin) % LANES
+            if at_slice == 0:
+                _rows(rec, by, cut, ny, iz, rows)
             z = np.float32(iz) - zc
             z2 = (r33 * z) * (r33 * z)
-            iy, end = _interval(yc, r23 * z, math.sqrt(max(none, cut - z2)), r22, ny)
+            iy, end = int(rows[at_slice]), int(rows[LANES + at_slice])
             while iy < end:
                 # Two short rows at once, where there are two.
                 two = narrow and iy + 1 < end
@@ -148,23 +166,26 @@ def _fill(first, last, record, weight, cutoff, ny, nx, volume):
 
 
 @njit(inline="always")
-def _gather(n, rec, weight, cutoff, nx, grad_volume, acc):
+def _gather(n, record, weight, cutoff, nx, grad_volume, rows, acc):
     """Write to ``acc``, lane by lane, the sums over the voxels of one Gaussian: of h times (t, u, w, tt, tu, tw, uu, uw,
     ww), with h = dL/d(distance^2) = dL/d(t^2 + u^2 + w^2), and of dL/df f by channel."""
-    cut, half, one, none = squared(cutoff), np.float32(-0.5), np.float32(1), np.float32(0)
+    cut, half, one = squared(cutoff), np.float32(-0.5), np.float32(1)
+    _, ny, channels, stride = grad_volume.shape
+    rec, (low, high, j0, j1), by = _numbers_of(record, 0)
     xc, yc, zc, r11, r12, r13, r22, r23, r33 = rec
-    nz, ny, channels, stride = grad_volume.shape
-    low, high = _slices(rec, cutoff, nz)
-    j0, j1, narrow, wide = _columns(rec, cutoff, nx)
-    zero = halves(none, none)
+    narrow, wide = j1 - j0 <= HALF, j1 - j0 > LANES
+    zero = halves(np.float32(0), np.float32(0))
     m0 = m1 = m2 = m3 = m4 = m5 = m6 = m7 = m8 = zero
     for c in range(channels):
         store(acc, (_MOMENTS + c) * LANES, zero)
     for iz in range(low, high):
+        at_slice = (iz - low) % LANES
+        if at_slice == 0:
+            _rows(rec, by, cut, ny, iz, rows)
         z = np.float32(iz) - zc
         w = r33 * z
         z2 = w * w
-        iy, end = _interval(yc, r23 * z, math.sqrt(max(none, cut - z2)), r22, ny)
+        iy, end = int(rows[at_slice]), int(rows[LANES + at_slice])
         while iy < end:
             two = narrow and iy + 1 < end
             y0 = np.float32(iy) - yc
@@ -222,15 +243,14 @@ def _gather_range(
 ):  # fmt: skip
     """The gradients of the Gaussians start..stop."""
     white, q, rec, grad_white = np.empty((3, 3)), np.empty((3, 3)), np.empty(9), np.empty((3, 3))
-    single = np.empty((1, 9), np.float32)
+    record, rows = np.empty((1, _NUMBERS), np.float32), np.empty(2 * LANES, np.float32)
     # As many sums as `lane_sums` makes at once.
     sums = np.empty(-(-(_MOMENTS + len(weight)) // LANES) * LANES, np.float32)
     acc = np.zeros(len(sums) * LANES, np.float32)
     for n in range(start, stop):
         _triangle(position, scale, rotation, n, first, spacing, white, q, rec)
-        for k in range(9):
-            single[0, k] = rec[k]
-        _gather(n, _numbers_of(single, 0), weight, cutoff, nx, grad_volume, acc)
+        _described(rec, cutoff, len(grad_volume), nx, record, 0)
+        _gather(n, record, weight, cutoff, nx, grad_volume, rows, acc)
         for some in range(0, len(sums), LANES):
             store(sums, some, lane_sums(acc, some * LANES))
         for c in range(len(weight)):
@@ -242,8 +262,8 @@ def _gather_range(
 def forward(position, scale, rotation, weight, box: VoxelBox, cutoff: float) -> np.ndarray:
     """Volume (channels, nz, ny, nx) float32; arguments as for the reference, as float32 numpy arrays."""
     nz, ny, nx = box.shape
-    record = np.empty((len(position), 9), np.float32)
-    scene = (position, scale, rotation, box.first, box.spacing)
+    record = np.empty((len(position), _NUMBERS), np.float32)
+    scene = (position, scale, rotation, box.first, box.spacing, cutoff, nz, nx)
     run_tasks(lambda a, b: _set_up(a, b, *scene, record), shares(len(position), 4, cpu_threads()))
     volume = np.zeros((nz, ny, len(weight), nx + LANES), np.float32)
     tasks = shares(nz, 2, cpu_threads())
