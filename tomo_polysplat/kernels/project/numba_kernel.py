@@ -11,7 +11,16 @@ import math
 import numpy as np
 
 from tomo_polysplat.compiled import njit
-from tomo_polysplat.kernels.gaussian_maths import FAST, gaussian, squared, whitening_adjoint
+from tomo_polysplat.kernels.gaussian_maths import FAST, gaussian, squared
+from tomo_polysplat.kernels.numba_group import (
+    GROUP,
+    SIZE,
+    add_where,
+    gaussian_of,
+    put_group,
+    take_gradients,
+    three,
+)
 from tomo_polysplat.kernels.numba_lanes import (
     HALF,
     LANES,
@@ -33,14 +42,6 @@ from tomo_polysplat.kernels.project.numba_footprint import (
     ray_frame,
     rows_of,
     set_up,
-)
-from tomo_polysplat.kernels.project.numba_group import (
-    GROUP,
-    SIZE,
-    add_where,
-    gaussian_of,
-    moments_of,
-    put_group,
 )
 from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.parallel import cpu_threads, run_tasks, shares, split_range
@@ -173,11 +174,16 @@ def _gather_group(
 
 
 @njit(inline="always")
+def _moments_of(moments, k):
+    return three(moments, 0, k), three(moments, 3, k), three(moments, 6, k), three(moments, 9, k)
+
+
+@njit(inline="always")
 def _take_back(cone, planar, origin, inverse, matrix, group, moments, grads):
     """Add dL/dposition (3) and dL/dW (9) of a view to those of a group."""
     for k in range(GROUP):
         position, _, white = gaussian_of(group, k)
-        m = moments_of(moments, k)
+        m = _moments_of(moments, k)
         frame = ray_frame(position, cone, origin, inverse, matrix, white)
         point, rows = pull_back(cone, planar, frame, inverse, matrix, white, m)
         # A Gaussian that is not seen may have no frame.
@@ -189,7 +195,7 @@ def _take_back_view(cone, planar, origin, inverse, matrix, group, moments, sums)
     """Fill ``sums`` (12) with dL/d(origin, U, V, D) of a view, summed over a group."""
     sums[:] = 0.0
     for k in range(GROUP):
-        m = moments_of(moments, k)
+        m = _moments_of(moments, k)
         if m[3][2] > 0.0:
             point, _, white = gaussian_of(group, k)
             frame = ray_frame(point, cone, origin, inverse, matrix, white)
@@ -208,14 +214,13 @@ def _gather_range(
 ):  # fmt: skip
     """The gradients of the Gaussians start..stop, summed over the views, and where there is room for them
     (groups, views, 12) those of the views, summed over each group: ``start`` begins one."""
-    white, grad_white = np.empty((3, 3)), np.empty((3, 3))
     group, grads = np.zeros(SIZE * GROUP), np.empty(12 * GROUP)
     # The last number says whether there is a footprint.
     of_group, of_weight = np.zeros((MOMENTS + 1) * GROUP), np.empty(len(weight) * GROUP, np.float32)
     acc = np.zeros((MOMENTS + len(weight)) * GROUP * LANES, np.float32)
     for first in range(start, stop, GROUP):
         some = min(GROUP, stop - first)
-        put_group(first, some, position, scale, rotation, white, group)
+        put_group(first, some, position, scale, rotation, group)
         grads[:] = 0.0
         of_weight[:] = np.float32(0)
         for v in range(len(origin)):
@@ -228,16 +233,10 @@ def _gather_range(
             if len(grad_views):
                 of_view = grad_views[first // GROUP, v]
                 _take_back_view(cone, planar, place, inverted, direct, group, of_group, of_view)
+        take_gradients(first, some, group, grads, grad_position, grad_scale, grad_rotation)
         for k in range(some):
-            n = first + k
             for c in range(len(weight)):
-                grad_weight[c, n] = of_weight[c * GROUP + k]
-            for a in range(3):
-                grad_position[n, a] = grads[a * GROUP + k]
-                for b in range(3):
-                    white[a, b] = group[(6 + 3 * a + b) * GROUP + k]
-                    grad_white[a, b] = grads[(3 + 3 * a + b) * GROUP + k]
-            whitening_adjoint(scale, rotation, n, white, grad_white, grad_scale, grad_rotation)
+                grad_weight[c, first + k] = of_weight[c * GROUP + k]
 
 
 def forward(position, scale, rotation, weight, views: DetectorViews, cutoff: float):

@@ -9,8 +9,9 @@ import math
 
 import numpy as np
 
-from tomo_polysplat.compiled import called, njit
-from tomo_polysplat.kernels.gaussian_maths import FAST, gaussian, squared, whitening, whitening_adjoint
+from tomo_polysplat.compiled import njit
+from tomo_polysplat.kernels.gaussian_maths import FAST, gaussian, squared
+from tomo_polysplat.kernels.numba_group import GROUP, SIZE, put_group, take_gradients
 from tomo_polysplat.kernels.numba_lanes import (
     HALF,
     LANES,
@@ -28,65 +29,10 @@ from tomo_polysplat.kernels.numba_lanes import (
     store,
 )
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
+from tomo_polysplat.kernels.voxelise.numba_ellipsoid import MOMENTS, NUMBERS, describe, pull_back, set_up
 from tomo_polysplat.parallel import cpu_threads, run_tasks, shares
 
 __all__ = ["backward", "forward"]
-
-_NUMBERS = 15  # numbers of a Gaussian, in the order of _described
-_MOMENTS = 9  # sums over the voxels of a Gaussian, in the order read by _pull_back
-
-
-@njit(inline="always")
-def _triangle(position, scale, rotation, n, first, spacing, white, q, rec):
-    """Fill ``white`` = W, ``q`` with orthonormal columns and ``rec`` with the centre in voxels and r11, r12, r13,
-    r22, r23, r33, so that W diag(spacing) = q r. The squared distance of the offset (x, y, z) in voxels is
-    (r11 x + r12 y + r13 z)^2 + (r22 y + r23 z)^2 + (r33 z)^2."""
-    whitening(scale, rotation, n, white)
-    for k in range(3):
-        rec[k] = (position[n, k] - first[k]) / spacing[k]
-        for a in range(3):
-            q[a, k] = white[a, k] * spacing[k]
-    at = 3
-    for k in range(3):
-        norm2 = q[0, k] ** 2 + q[1, k] ** 2 + q[2, k] ** 2
-        rec[at] = math.sqrt(norm2)
-        inverse = 1.0 / rec[at] if norm2 > 0.0 else 0.0  # no extent along z in two dimensions
-        for a in range(3):
-            q[a, k] *= inverse
-        for m in range(k + 1, 3):
-            along = q[0, k] * q[0, m] + q[1, k] * q[1, m] + q[2, k] * q[2, m]
-            rec[at + m - k] = along
-            for a in range(3):
-                q[a, m] -= along * q[a, k]
-        at += 3 - k
-
-
-@njit(inline="always")
-def _interval(centre, shift, root, factor, length):
-    """Half-open range of indices i with |factor (i - centre) + shift| <= root, within 0..length."""
-    middle, spread = centre - shift / factor, root / factor
-    low, high = max(0.0, np.ceil(middle - spread)), min(length - 1.0, np.floor(middle + spread))
-    if not low <= high:
-        return 0, 0
-    return int(low), int(high) + 1
-
-
-@njit(inline="always")
-def _described(rec, cutoff, nz, nx, record, at):
-    """Write the numbers of a Gaussian to ``record[at]``: those of `_triangle`; the slices that it reaches, a
-    two-dimensional one (r33 = 0) all; the columns that it reaches in any row; 1 / r22 and r23 / r22."""
-    r11, r12, r13, r22, r23, r33 = rec[3], rec[4], rec[5], rec[6], rec[7], rec[8]
-    # The first row of the inverse of r: its length is the deviation along a row of voxels.
-    second, third, low, high = r12 / r22, 0.0, 0, nz
-    if r33 > 0.0:
-        third = (second * r23 - r13) / r33
-        low, high = _interval(rec[2], 0.0, cutoff, r33, nz)
-    spread = cutoff * math.sqrt(1.0 + second * second + third * third)
-    j0, j1 = _interval(rec[0], 0.0, spread, r11, nx)
-    for k in range(9):
-        record[at, k] = rec[k]
-    record[at, 9], record[at, 10], record[at, 11], record[at, 12] = low, high, j0, j1
-    record[at, 13], record[at, 14] = 1.0 / r22, r23 / r22
 
 
 @njit(inline="always")
@@ -99,8 +45,8 @@ def _numbers_of(record, at):
 
 @njit(inline="always")
 def _rows(rec, by, cut, ny, iz, rows):
-    """Fill ``rows`` with the first row that a Gaussian reaches in each of ``LANES`` slices from ``iz`` on, and then with
-    the one after its last: no more than the first where it reaches none."""
+    """Fill ``rows`` with the first row that a Gaussian reaches in each of ``LANES`` slices from ``iz`` on, and then
+    with the one after its last: no more than the first where it reaches none."""
     (by_r22, slope), z0 = by, np.float32(iz) - rec[2]
     z = halves(z0, z0 + np.float32(HALF)) + ramp()
     left = cut - (rec[8] * z) * (rec[8] * z)
@@ -114,15 +60,9 @@ def _row_columns(rec, y, z, cut, length):
     """The columns a Gaussian reaches in one row."""
     w, u, across = rec[8] * z, rec[6] * y + rec[7] * z, rec[4] * y + rec[5] * z
     root = math.sqrt(max(np.float32(0), cut - w * w - u * u))
-    return _interval(rec[0], across, root, rec[3], length)
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _set_up(start, stop, position, scale, rotation, first, spacing, cutoff, nz, nx, record):
-    white, q, rec = np.empty((3, 3)), np.empty((3, 3)), np.empty(9)
-    for n in range(start, stop):
-        _triangle(position, scale, rotation, n, first, spacing, white, q, rec)
-        _described(rec, cutoff, nz, nx, record, n)
+    middle, spread = rec[0] - across / rec[3], root / rec[3]
+    low, high = max(0.0, np.ceil(middle - spread)), min(length - 1.0, np.floor(middle + spread))
+    return (int(low), int(high) + 1) if low <= high else (0, 0)
 
 
 @njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
@@ -166,18 +106,19 @@ def _fill(first, last, record, weight, cutoff, ny, nx, volume):
 
 
 @njit(inline="always")
-def _gather(n, record, weight, cutoff, nx, grad_volume, rows, acc):
-    """Write to ``acc``, lane by lane, the sums over the voxels of one Gaussian: of h times (t, u, w, tt, tu, tw, uu, uw,
-    ww), with h = dL/d(distance^2) = dL/d(t^2 + u^2 + w^2), and of dL/df f by channel."""
+def _gather(n, k, record, weight, cutoff, nx, grad_volume, rows, acc):
+    """Write to ``acc``, as those of Gaussian ``k`` of a group, the sums over the voxels of Gaussian ``n``, lane by
+    lane: of h times (t, u, w, tt, tu, tw, uu, uw, ww), with h = dL/d(distance^2) = dL/d(t^2 + u^2 + w^2), and of
+    dL/df f by channel."""
     cut, half, one = squared(cutoff), np.float32(-0.5), np.float32(1)
     _, ny, channels, stride = grad_volume.shape
-    rec, (low, high, j0, j1), by = _numbers_of(record, 0)
+    rec, (low, high, j0, j1), by = _numbers_of(record, k)
     xc, yc, zc, r11, r12, r13, r22, r23, r33 = rec
     narrow, wide = j1 - j0 <= HALF, j1 - j0 > LANES
     zero = halves(np.float32(0), np.float32(0))
     m0 = m1 = m2 = m3 = m4 = m5 = m6 = m7 = m8 = zero
     for c in range(channels):
-        store(acc, (_MOMENTS + c) * LANES, zero)
+        store(acc, ((MOMENTS + c) * GROUP + k) * LANES, zero)
     for iz in range(low, high):
         at_slice = (iz - low) % LANES
         if at_slice == 0:
@@ -205,35 +146,17 @@ def _gather(n, record, weight, cutoff, nx, grad_volume, rows, acc):
                 for c in range(channels):
                     slope = load_blocks(grad_volume, at + c * stride, apart)
                     total = total + weight[c, n] * slope
-                    to = (_MOMENTS + c) * LANES
+                    to = ((MOMENTS + c) * GROUP + k) * LANES
                     store(acc, to, load(acc, to) + slope * value)
                 h = half * total * value
                 ht, hu, hw = h * t, h * u, h * w
                 m0, m1, m2, m3, m4 = m0 + ht, m1 + hu, m2 + hw, m3 + ht * t, m4 + ht * u
                 m5, m6, m7, m8 = m5 + ht * w, m6 + hu * u, m7 + hu * w, m8 + hw * w
             iy += 2 if two else 1
-    to = 0
+    to, each = k * LANES, GROUP * LANES
     for m in (m0, m1, m2, m3, m4, m5, m6, m7, m8):
         store(acc, to, m)
-        to += LANES
-
-
-# Inlined by LLVM, which compiles sooner than where Numba does it; the loop along a row would lose its vectors so.
-@called(fastmath=FAST, error_model="numpy", forceinline=True)
-def _pull_back(n, white, q, rec, spacing, m, grad_position, grad_white):
-    """Write dL/dposition, and dL/dW to ``grad_white``, from the moments ``m`` of h with t = r (x, y, z)."""
-    by_r33 = 1.0 / rec[8] if rec[8] > 0.0 else 0.0
-    for b in range(3):
-        grad_position[n, b] = 0.0
-    for a in range(3):
-        # distance^2 = |q t|^2 and dL/dr(x, y, z) = 2 q sum(h t t^T): solve with r, from z up.
-        z = 2 * (q[a, 0] * m[5] + q[a, 1] * m[7] + q[a, 2] * m[8]) * by_r33
-        y = (2 * (q[a, 0] * m[4] + q[a, 1] * m[6] + q[a, 2] * m[7]) - rec[7] * z) / rec[6]
-        x = (2 * (q[a, 0] * m[3] + q[a, 1] * m[4] + q[a, 2] * m[5]) - rec[4] * y - rec[5] * z) / rec[3]
-        grad_white[a, 0], grad_white[a, 1], grad_white[a, 2] = x * spacing[0], y * spacing[1], z * spacing[2]
-        ahead = 2 * (q[a, 0] * m[0] + q[a, 1] * m[1] + q[a, 2] * m[2])
-        for b in range(3):
-            grad_position[n, b] -= ahead * white[a, b]
+        to += each
 
 
 @njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
@@ -242,29 +165,32 @@ def _gather_range(
     grad_position, grad_scale, grad_rotation, grad_weight,
 ):  # fmt: skip
     """The gradients of the Gaussians start..stop."""
-    white, q, rec, grad_white = np.empty((3, 3)), np.empty((3, 3)), np.empty(9), np.empty((3, 3))
-    record, rows = np.empty((1, _NUMBERS), np.float32), np.empty(2 * LANES, np.float32)
-    # As many sums as `lane_sums` makes at once.
-    sums = np.empty(-(-(_MOMENTS + len(weight)) // LANES) * LANES, np.float32)
-    acc = np.zeros(len(sums) * LANES, np.float32)
-    for n in range(start, stop):
-        _triangle(position, scale, rotation, n, first, spacing, white, q, rec)
-        _described(rec, cutoff, len(grad_volume), nx, record, 0)
-        _gather(n, record, weight, cutoff, nx, grad_volume, rows, acc)
-        for some in range(0, len(sums), LANES):
-            store(sums, some, lane_sums(acc, some * LANES))
+    group, out, grads = np.zeros(SIZE * GROUP), np.empty(NUMBERS * GROUP), np.empty(12 * GROUP)
+    record, rows = np.empty((GROUP, NUMBERS), np.float32), np.empty(2 * LANES, np.float32)
+    moments = np.empty((MOMENTS + len(weight)) * GROUP)
+    acc = np.zeros(len(moments) * LANES, np.float32)
+    corner, edges = (first[0], first[1], first[2]), (spacing[0], spacing[1], spacing[2])
+    for n in range(start, stop, GROUP):
+        some = min(GROUP, stop - n)
+        put_group(n, some, position, scale, rotation, group)
+        describe(some, corner, edges, cutoff, len(grad_volume), nx, group, out, record, 0)
+        for k in range(some):
+            _gather(n + k, k, record, weight, cutoff, nx, grad_volume, rows, acc)
+        for m in range(MOMENTS + len(weight)):
+            store(moments, m * GROUP, lane_sums(acc, m * GROUP * LANES))
+        pull_back(edges, group, moments, grads)
+        take_gradients(n, some, group, grads, grad_position, grad_scale, grad_rotation)
         for c in range(len(weight)):
-            grad_weight[c, n] = sums[_MOMENTS + c]
-        _pull_back(n, white, q, rec, spacing, sums, grad_position, grad_white)
-        whitening_adjoint(scale, rotation, n, white, grad_white, grad_scale, grad_rotation)
+            for k in range(some):
+                grad_weight[c, n + k] = moments[(MOMENTS + c) * GROUP + k]
 
 
 def forward(position, scale, rotation, weight, box: VoxelBox, cutoff: float) -> np.ndarray:
     """Volume (channels, nz, ny, nx) float32; arguments as for the reference, as float32 numpy arrays."""
     nz, ny, nx = box.shape
-    record = np.empty((len(position), _NUMBERS), np.float32)
+    record = np.empty((len(position), NUMBERS), np.float32)
     scene = (position, scale, rotation, box.first, box.spacing, cutoff, nz, nx)
-    run_tasks(lambda a, b: _set_up(a, b, *scene, record), shares(len(position), 4, cpu_threads()))
+    run_tasks(lambda a, b: set_up(a, b, *scene, record), shares(len(position), 4, cpu_threads()))
     volume = np.zeros((nz, ny, len(weight), nx + LANES), np.float32)
     tasks = shares(nz, 2, cpu_threads())
     run_tasks(lambda a, b: _fill(a, b, record, weight, cutoff, ny, nx, volume), tasks)
