@@ -162,8 +162,9 @@ def store(typing, array, start, value):
 
     def generate(context, builder, signature, values):
         kind = ir.VectorType(ir.DoubleType(), LANES) if double else _VECTOR
-        value = builder.fpext(values[2], kind) if double else values[2]
-        pointer = _pointer(context, builder, signature.args[0], *values[:2], kind)
+        array, start, value = values
+        value = builder.fpext(value, kind) if double else value
+        pointer = _pointer(context, builder, signature.args[0], array, start, kind)
         builder.store(value, pointer, align=8 if double else 4)
         return context.get_dummy_value()
 
