@@ -57,7 +57,7 @@ def test_the_notebook_runs(path, tmp_path, monkeypatch):
     monkeypatch.chdir(here)
     # As in the five passes of "fast", no question is asked that needs more.
     for quality in ("fast", "balanced"):
-        monkeypatch.setitem(PRESETS, quality, {"passes": 2.0})
+        monkeypatch.setitem(PRESETS, quality, {"passes": 2.0, "views_per_step": 6})
     monkeypatch.setattr("tempfile.tempdir", str(temporary))
     source = "\n\n".join(cells(path, "code"))
     for old, new in SMALL[path.stem].items():

@@ -20,7 +20,7 @@ def test_every_block_of_the_readme_runs_in_order(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     # As printed, in two passes over the views: as in the five of "fast", no question is asked that needs more.
     for quality in ("fast", "balanced"):
-        monkeypatch.setitem(PRESETS, quality, {"passes": 2.0})
+        monkeypatch.setitem(PRESETS, quality, {"passes": 2.0, "views_per_step": 8})
     names: dict = {}
     blocks = [block for block in BLOCK.findall(README) if block[1] != INSTALL]
     assert {language for language, _, _ in blocks} == {"sh", "python"}

@@ -26,7 +26,7 @@ def disc_scan(material):
 @pytest.mark.parametrize("material", ["water", "aluminium"])
 def test_a_disc_of_one_material_is_even(material):
     projections, proj_geom, vol_geom, spectrum, true = disc_scan(material)
-    options = {"spectrum": spectrum, "quality": "fast", "settings": {"views_per_step": 6}}
+    options = {"spectrum": spectrum, "quality": "fast", "settings": {"views_per_step": 10}}
     result = tps.reconstruct(projections, proj_geom, vol_geom, progress=False, **options)
     axis = PIXEL * (np.arange(COLUMNS) + 0.5 - COLUMNS / 2)
     inside = np.hypot(*np.meshgrid(axis, axis)) < RADIUS - 3 * PIXEL

@@ -86,7 +86,7 @@ def bias(result):
 
 def reconstructed(scan, **options):
     # Where the scanner stood is asked in other files.
-    settings = {"passes": 6.0, "views_per_step": 12}
+    settings = {"passes": 6.0, "views_per_step": 20}
     return tps.reconstruct(scan, settings=settings, align=False, **options)
 
 
@@ -186,6 +186,6 @@ def test_fits_find_a_bowtie_of_grains_and_none_where_there_is_none():
         geometry, grid = from_astra(scan.proj_geom, scan.vol_geom)
         values = np.ascontiguousarray(np.moveaxis(scan.projections, 1, 0))
         problem = Problem.of(values, geometry, grid, "cm", SPECTRUM, None)
-        options = RunOptions.of("balanced", None, None, 0, "cpu", [])
+        options = RunOptions.of("balanced", {"views_per_step": 10}, None, 0, "cpu", [])
         answer = find_bowtie(problem, options, lambda *_: None)
         assert least <= answer.evidence["thickest"] <= most, answer

@@ -11,7 +11,7 @@ from tomo_polysplat.fit.surroundings import cut_out, widened_grid
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.scan.geometry import from_astra, projections_from_astra
 
-QUICK = {"passes": 6.0, "views_per_step": 4}
+QUICK = {"passes": 6.0, "views_per_step": 8}
 HOST = torch.device("cpu")
 
 SPECTRUM = tps.Spectrum.from_tube(90, filters={"Al": 0.1})

@@ -100,7 +100,9 @@ SCANS = {"few views": lambda: cone(12, 20), "metal": fan, "calibrated": lambda: 
 def test_the_same_bits_for_any_number_of_threads(name, monkeypatch):
     def bits():
         calibrated = (
-            {"calibrate": "scatter", "settings": QUICK | {"passes": 6.0}} if name == "calibrated" else {}
+            {"calibrate": "scatter", "settings": QUICK | {"passes": 6.0, "views_per_step": 20}}
+            if name == "calibrated"
+            else {}
         )
         result = reconstruct(SCANS[name](), align="auto", **calibrated)
         return hashlib.sha256(result.basis.tobytes() + result.gaussians["position"].tobytes()).hexdigest()

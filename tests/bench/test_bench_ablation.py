@@ -18,7 +18,7 @@ from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.settings import make_settings
 
-PASS = Options(None, {"passes": 1.0})
+PASS = Options(None, {"passes": 1.0, "views_per_step": 4})
 ALL = [variant for variants in GROUPS.values() for variant in variants]
 
 

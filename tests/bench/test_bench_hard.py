@@ -14,6 +14,7 @@ from tomo_polysplat.bench.hard_process import Worker, run_here
 from tomo_polysplat.bench.hard_report import as_markdown, as_text
 from tomo_polysplat.checks import fail
 from tomo_polysplat.cli import main
+from tomo_polysplat.settings import PRESETS
 
 # One or two of every kind, the quick ones.
 SHORT = (
@@ -33,7 +34,9 @@ SHORT = (
 
 
 @pytest.mark.parametrize("name", SHORT)
-def test_case(name):
+def test_case(name, monkeypatch):
+    # A step of one view or two, as the plan would have it, takes as long as one of four.
+    monkeypatch.setitem(PRESETS, "balanced", {"views_per_step": 4})
     outcome = run_here(HARD_CASES[name], "cpu")
     assert outcome.passed, (outcome.error, outcome.findings)
 

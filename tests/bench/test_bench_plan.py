@@ -47,7 +47,7 @@ def test_the_command_leaves_a_record(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(
         "tomo_polysplat.bench.plan.variants", lambda scan, together: [variants(scan, together)[1]]
     )
-    monkeypatch.setitem(PRESETS, "balanced", {"passes": 2.0})
+    monkeypatch.setitem(PRESETS, "balanced", {"passes": 2.0, "views_per_step": 6})
     # All that beats the plan, or is a hundred decibels behind, is tried again.
     monkeypatch.setattr("tomo_polysplat.bench.plan._AHEAD", -100.0)
     chosen = ["--again", "2", "--scans", "narrow spectrum", "--size", "7", "--views", "12", "--device", "cpu"]

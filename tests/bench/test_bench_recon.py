@@ -23,7 +23,7 @@ from tomo_polysplat.fit.optimise import FitState
 from tomo_polysplat.fit.stopping import StopReason
 from tomo_polysplat.result.metrics import compare
 
-QUICK = {"passes": 1.0}
+QUICK = {"passes": 1.0, "views_per_step": 4}
 # "sirt-200" is "sirt", only longer; the rest belongs to packages that need not be here.
 DIFFERENT = [name for name in METHODS if name != "sirt-200" and not name.startswith("mbir")]
 

@@ -59,8 +59,10 @@ def test_what_is_unknown_is_refused():
 
 
 def test_the_command_leaves_a_record(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(PRESETS, "balanced", {"passes": 1.0, "tv_factor": 1.0, "edges": "blurred"})
-    options = ["--sizes", "24", "--kinds", "bone", "--feature", "4", "--views", "30", "--metal", "both"]
+    monkeypatch.setitem(
+        PRESETS, "balanced", {"passes": 1.0, "views_per_step": 8, "tv_factor": 1.0, "edges": "blurred"}
+    )
+    options = ["--sizes", "24", "--kinds", "bone", "--feature", "4", "--views", "24", "--metal", "both"]
     options += ["--methods", "fdk-water", "polysplat", "--record", str(tmp_path), "--device", "cpu"]
     assert main(["bench", "scale", *options]) == 0
     record = json.loads((tmp_path / "scale.json").read_text())

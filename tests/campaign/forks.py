@@ -5,6 +5,7 @@ from __future__ import annotations
 import faulthandler
 import os
 import signal
+import sys
 import time
 import traceback
 from collections.abc import Callable
@@ -44,9 +45,9 @@ def _fork(action: Callable[[], int | None]) -> tuple[int, int]:
     if number:
         os.close(tell)
         return number, begun
-    # One that waits for what it will never get says where.
-    faulthandler.dump_traceback_later(_LONGEST, exit=True)
     try:
+        # One that waits for what it will never get says where; what pytest puts in place of sys.stderr is no file.
+        faulthandler.dump_traceback_later(_LONGEST, exit=True, file=sys.__stderr__)
         os.write(tell, b".")
         os._exit(action() or 0)
     except BaseException:

@@ -9,6 +9,7 @@ import torch
 from tomo_polysplat.fit.loss import (
     away_from_edges,
     misfit,
+    misfit_by_view,
     total_variation,
     variation_of_slab,
     weighted_huber,
@@ -79,6 +80,16 @@ def test_the_settings_choose_the_loss():
     assert misfit(*rays, Settings(loss="huber")) == weighted_huber(*rays, corner)
     assert misfit(*rays, Settings(loss="l1")) == weighted_l1(*rays)
     assert misfit(*rays, Settings(loss="huber")) != misfit(*rays, Settings(loss="l1"))
+
+
+@pytest.mark.parametrize("loss", ["huber", "l1"])
+def test_the_misfit_of_each_view_is_that_of_its_rays_alone(loss):
+    predicted, measured, weight = uneven()
+    weight[1], settings = 0, Settings(loss=loss)
+    by_view = misfit_by_view(predicted, measured, weight, settings)
+    alone = [float(misfit(*of_view, settings)) for of_view in zip(predicted, measured, weight)]
+    assert by_view[[0, 2]].tolist() == pytest.approx([alone[0], alone[2]], rel=1e-12)
+    assert math.isnan(by_view[1]), "no ray tells"
 
 
 def test_total_variation_of_a_ramp_is_its_slopes():

@@ -40,7 +40,7 @@ def test_numbers_stay_once_they_are_fitted_and_where_nothing_tells_them(share, k
 @pytest.mark.parametrize("metal, least, most", [("iron", 0.93, 1.0), ("titanium", 0.7, 0.88)])
 def test_iron_and_titanium_are_told_apart(metal, least, most):
     spectrum = Spectrum.from_tube(160, filters={"Cu": 0.05})
-    settings = {"passes": 10.0, "views_per_step": 6}
+    settings = {"passes": 10.0, "views_per_step": 10}
     options = {"spectrum": spectrum, "unit": "cm", "settings": settings, "align": False}
     result = reconstruct(*disc(metal, spectrum), progress=False, **options)
     numbers = result.gaussians["u"][result.gaussians["density"] > 0.5 * density(metal)]

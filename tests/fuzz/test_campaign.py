@@ -3,7 +3,6 @@
 import json
 import os
 import random
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -15,6 +14,7 @@ sys.path.insert(0, str(ROOT))
 pytest.importorskip("fcntl")
 
 from tests.campaign import files, kills  # noqa: E402
+from tests.campaign.__main__ import main  # noqa: E402
 from tests.campaign.forks import FAILED, child  # noqa: E402
 from tests.campaign.record import Record  # noqa: E402
 from tests.campaign.worker import observed  # noqa: E402
@@ -88,27 +88,18 @@ def test_a_child_s_end_is_told():
     assert child(lambda: (sys.stderr.close(), 1 / 0)[1]) == FAILED
 
 
-def test_a_short_campaign_adds_to_its_record(tmp_path):
+def test_a_short_campaign_adds_to_its_record(tmp_path, monkeypatch, capsys):
     path = tmp_path / "record.json"
-    command = [
-        sys.executable,
-        "-m",
-        "tests.campaign",
-        "--only",
-        "kills,disks",
-        "--kills",
-        "4",
-        "--disks",
-        "4",
-    ]
-    command += ["--kinds", "result h5,result stack/,result nii.gz,scan npz", "--record", str(path)]
+    options = ["--only", "kills,disks", "--kills", "8", "--disks", "4"]
+    options += ["--kinds", "result h5,result stack/,result nii.gz,scan npz", "--record", str(path)]
     path.write_text(
         json.dumps({"rows": {"kill: scan npz": {"tried": 7}}, "slowest": 0, "most": 0, "seconds": 1})
     )
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+    monkeypatch.setattr(sys, "argv", ["campaign", *options])
+    status, told = main(), capsys.readouterr().out
+    assert status == 0, told
     record = Record(path)
-    assert record.total("kill", "tried") == 7 + 4 and record.rows["kill: scan npz"]["tried"] > 7
+    assert record.total("kill", "tried") == 7 + 8 and record.rows["kill: scan npz"]["tried"] > 7
     assert record.total("quota", "tried") + record.total("disk", "tried") == 4
-    assert "| scan npz | " in done.stdout and "| **all** | **11** | " in done.stdout
-    assert "Faults: none." in done.stdout
+    assert "| scan npz | " in told and "| **all** | **15** | " in told
+    assert "Faults: none." in told

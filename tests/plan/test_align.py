@@ -18,7 +18,7 @@ from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.scan.layout import vector_form
 from tomo_polysplat.settings import make_settings
 
-QUICK = {"passes": 5.0, "views_per_step": 6, "pixel_rays": 1}
+QUICK = {"passes": 5.0, "views_per_step": 8, "pixel_rays": 1}
 
 
 @cache

@@ -23,7 +23,7 @@ from tomo_polysplat.plan.short_fit import ShortFit, main_density
 from tomo_polysplat.settings import make_settings
 
 # Enough steps for the density of the main matter to settle.
-STEADY = {"passes": 4.0, "views_per_step": 4}
+STEADY = {"passes": 4.0, "views_per_step": 8}
 SPECTRUM = tps.Spectrum.from_tube(90, filters={"Al": 0.1})
 
 

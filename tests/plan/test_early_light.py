@@ -17,7 +17,7 @@ from tomo_polysplat.scan.geometry import from_astra, projections_from_astra
 from tomo_polysplat.settings import Settings
 
 # Ten passes: one for the look is a tenth.
-SETTINGS = {"passes": 10.0, "views_per_step": 8, "held_out": 0.06}
+SETTINGS = {"passes": 10.0, "views_per_step": 12, "held_out": 0.06}
 
 
 @cache

@@ -26,7 +26,7 @@ from tomo_polysplat.simulate.scenes import scan_phantom, scene_phantom
 
 QUICK = {
     "passes": 10.0,
-    "views_per_step": 6,
+    "views_per_step": 11,
     "edges": "blurred",
     "tv_factor": 1.0,
     "pixel_rays": 1,

@@ -17,7 +17,7 @@ from tomo_polysplat.plan.decisions.pixel_rays import PixelRays
 from tomo_polysplat.plan.lab import Lab
 from tomo_polysplat.plan.order import ask_between
 
-QUICK = {"passes": 10.0, "views_per_step": 2, "edges": "blurred", "tv_factor": 1.0}
+QUICK = {"passes": 10.0, "views_per_step": 4, "edges": "blurred", "tv_factor": 1.0}
 
 
 @cache

@@ -13,7 +13,7 @@ from tomo_polysplat.plan import calibration, solver
 from tomo_polysplat.plan.answer import Status
 from tomo_polysplat.plan.preparation import prepare
 
-QUICK = {"passes": 6.0, "views_per_step": 3, "tv_factor": 1.0, "edges": "blurred", "pixel_rays": 1}
+QUICK = {"passes": 6.0, "views_per_step": 4, "tv_factor": 1.0, "edges": "blurred", "pixel_rays": 1}
 # The volume is nothing to them.
 HASTY = QUICK | {"views_per_step": 60}
 # Only that two runs are the same to the bit, and that the first begins anew.

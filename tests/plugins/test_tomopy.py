@@ -245,7 +245,7 @@ def test_a_broken_tomopy_does_not_keep_astra_from_knowing(monkeypatch, caplog):
 
 def test_the_solver_itself_in_chunks(tomopy):
     tomo, theta, truth = measured(slices=2)
-    options = {"quality": "fast", "settings": {"passes": 8}}
+    options = {"quality": "fast", "settings": {"passes": 8, "views_per_step": 4}}
     first = tomopy.recon(tomo, theta, algorithm=polysplat, options=options, ncore=1)
     second = tomopy.recon(tomo, theta, algorithm="polysplat", options=options, ncore=2)
     np.testing.assert_array_equal(first, second)

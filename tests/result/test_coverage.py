@@ -60,7 +60,7 @@ def test_a_reconstruction_tells_of_it(tmp_path):
     proj_geom, vol_geom = small_view()
     values = np.full((7, 40, 11), 0.2, np.float32) + np.random.default_rng(0).normal(0, 0.01, (7, 40, 11))
     scan = tps.Scan(values.astype(np.float32), proj_geom, vol_geom)
-    result = tps.reconstruct(scan, settings={"passes": 0.1})
+    result = tps.reconstruct(scan, settings={"passes": 0.1, "views_per_step": 8})
     assert result.plan["unseen"].value == pytest.approx((result.coverage == 0).mean(), abs=0.06)
     assert "not air" in result.plan["unseen"].why
     result.report(tmp_path / "page.html")

@@ -72,7 +72,11 @@ def test_the_usual_correction_is_that_of_water(kvp, largest):
 
 def test_a_run_names_rays_that_were_corrected(caplog):
     raw = ellipse()
-    options = {"spectrum": SPECTRUM, "unit": "cm", "settings": {"passes": 1.0, "held_out": 0.0}}
+    options = {
+        "spectrum": SPECTRUM,
+        "unit": "cm",
+        "settings": {"passes": 1.0, "views_per_step": 8, "held_out": 0.0},
+    }
     with caplog.at_level(logging.WARNING):
         good = tps.reconstruct(raw[:, 0].astype(np.float32), PARALLEL, VOLUME, **options)
         assert "spectrum_doubt" not in good.plan

@@ -1,6 +1,5 @@
 """Every kind of scanner's folder gives the volume of the package's own file."""
 
-import subprocess
 import sys
 
 import numpy as np
@@ -81,21 +80,11 @@ def test_a_folder_is_not_written_over(tmp_path):
         write_folder("tiffs", tmp_path, marked())
 
 
-def test_two_commands_from_a_folder_to_a_file(tmp_path):
+def test_two_commands_from_a_folder_to_a_file(tmp_path, monkeypatch, capsys, caplog):
     write_folder("tiffs", tmp_path / "folder", marked())
-    command = [
-        sys.executable,
-        "-m",
-        "tomo_polysplat.cli.main",
-        "import",
-        "folder",
-        "-o",
-        "scan.h5",
-        "--views",
-        "2",
-    ]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=True)
-    assert "wrote scan.h5" in done.stdout and "flat panel" in done.stderr
+    monkeypatch.chdir(tmp_path)
+    assert main(["import", "folder", "-o", "scan.h5", "--views", "2"]) == 0
+    assert "wrote scan.h5" in capsys.readouterr().out and "flat panel" in caplog.text
     scan = tps.load_scan(tmp_path / "scan.h5")
     assert scan.views == 24 and scan.unit == "mm" and scan.notes["scanner"]["keys"] == {"operator": "nobody"}
 

@@ -79,7 +79,8 @@ def test_a_reconstruction_leaves_them_out_and_says_so(caplog):
     values[:, :, 14] = 0.9
     marked = np.ones(values.shape, bool)
     marked[:, :, 14] = False
-    about = {"unit": made.unit, "spectrum": made.spectrum, "progress": False, "settings": {"passes": 2}}
+    about = {"unit": made.unit, "spectrum": made.spectrum, "progress": False}
+    about["settings"] = {"passes": 2, "views_per_step": 8}
     with caplog.at_level(logging.WARNING):
         found = tps.reconstruct(values, made.proj_geom, made.vol_geom, **about)
     assert "same value in every view are left out: 1" in caplog.text

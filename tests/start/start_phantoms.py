@@ -14,8 +14,8 @@ def chords(geometry, spheres, scale=1.0):
         origins, directions = geometry.rays(view)
         for centre, radius, value in spheres:
             to_centre = scale * np.asarray(centre) - origins
-            along = (to_centre * directions).sum(axis=-1)
-            missed = (to_centre**2).sum(axis=-1) - along**2
+            along = np.einsum("...i,...i", to_centre, directions)
+            missed = np.einsum("...i,...i", to_centre, to_centre) - along**2
             projections[view] += 2 * value * np.sqrt(np.maximum((scale * radius) ** 2 - missed, 0))
     return projections.astype(np.float32)
 

@@ -147,8 +147,8 @@ def of_plates(proj_geom):
         for view in range(geometry.views):
             origins, directions = ((part * flat) for part in geometry.rays(view))
             local = origins - centre * flat
-            along, square = (local * directions).sum(-1), (directions**2).sum(-1)
-            inside = along**2 - square * ((local**2).sum(-1) - wide**2)
+            along, square = (np.einsum("...i,...i", part, directions) for part in (local, directions))
+            inside = along**2 - square * (np.einsum("...i,...i", local, local) - wide**2)
             projections[view] += 2 * np.sqrt(np.maximum(inside, 0)) / square
         left = wide**2 - (x - centre[0]) ** 2 - (y[:, None] - centre[1]) ** 2
         ends = np.sqrt(np.maximum(left, 0)) * high / wide

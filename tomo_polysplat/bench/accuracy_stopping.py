@@ -73,9 +73,9 @@ def stopping(history: Sequence[Mapping[str, Any]], settings: Mapping[str, Any]) 
 
 def _rank_correlation(history: Sequence[Mapping[str, Any]]) -> float | None:
     """Spearman's, of the passes whose held-out error is known."""
-    from scipy.stats import spearmanr
-
     pairs = [(p["held_out"], p["rmse"]) for p in history if p["held_out"] is not None]
     if len(pairs) < 3 or np.ptp(pairs, axis=0).min() == 0:
         return None
+    from scipy.stats import spearmanr  # takes a second
+
     return float(spearmanr(*zip(*pairs)).statistic)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.fit.by_views import by_views, views_at_once
-from tomo_polysplat.fit.loss import misfit
+from tomo_polysplat.fit.loss import misfit_by_view
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
@@ -92,9 +92,8 @@ def _of_part(
         left = _clipped(measured - predicted, fitted, allowed)
         parts = torch.stack([torch.ones_like(left), slopes, slopes.square(), left, slopes * left])
         sums += (parts * fitted.square()).double().sum(dim=1)
-        for k in range(len(some)):
-            if bool(aside[k].any()):
-                held_out[first - part.start + k] = misfit(predicted[k], measured[k], aside[k], settings)
+        here = slice(first - part.start, first - part.start + len(some))
+        held_out[here] = misfit_by_view(predicted, measured, aside, settings)
     return [sums, held_out]
 
 

@@ -16,6 +16,7 @@ from tomo_polysplat.settings import Settings
 __all__ = [
     "away_from_edges",
     "misfit",
+    "misfit_by_view",
     "roughness",
     "total_variation",
     "variation_of_slab",
@@ -24,22 +25,47 @@ __all__ = [
 ]
 
 
+# Axes of (views, rows, columns) that a mean is over, where each view has its own.
+_OF_VIEW = (1, 2)
+
+
 def misfit(
+    predicted: torch.Tensor,
+    measured: torch.Tensor,
+    weight: torch.Tensor,
+    settings: Settings,
+    dims: tuple[int, ...] | None = None,
+) -> torch.Tensor:
+    """The loss of the rays that the settings name: the mean over all, or over the axes ``dims``."""
+    if settings.loss == "huber":
+        return weighted_huber(predicted, measured, weight, settings.huber_corner * settings.model_error, dims)
+    return weighted_l1(predicted, measured, weight, dims)
+
+
+def misfit_by_view(
     predicted: torch.Tensor, measured: torch.Tensor, weight: torch.Tensor, settings: Settings
 ) -> torch.Tensor:
-    """The loss of the rays that the settings name."""
-    if settings.loss == "huber":
-        return weighted_huber(predicted, measured, weight, settings.huber_corner * settings.model_error)
-    return weighted_l1(predicted, measured, weight)
+    """(views,) that of each view of (views, rows, columns); NaN where no ray of a view has weight."""
+    means = misfit(predicted, measured, weight, settings, _OF_VIEW)
+    return torch.where(weight.amax(_OF_VIEW) > 0, means, torch.nan)
 
 
-def weighted_l1(predicted: torch.Tensor, measured: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+def weighted_l1(
+    predicted: torch.Tensor,
+    measured: torch.Tensor,
+    weight: torch.Tensor,
+    dims: tuple[int, ...] | None = None,
+) -> torch.Tensor:
     r"""Weighted mean of the absolute residuals, ``sum w |p - m| / sum w``; 0 when every weight is 0."""
-    return ((predicted - measured).abs() * weight).sum() / weight.sum().clamp(min=1e-12)
+    return ((predicted - measured).abs() * weight).sum(dims) / weight.sum(dims).clamp(min=1e-12)
 
 
 def weighted_huber(
-    predicted: torch.Tensor, measured: torch.Tensor, weight: torch.Tensor, width: float
+    predicted: torch.Tensor,
+    measured: torch.Tensor,
+    weight: torch.Tensor,
+    width: float,
+    dims: tuple[int, ...] | None = None,
 ) -> torch.Tensor:
     """Weighted mean of residuals that count squared where noise explains them and absolute beyond.
 
@@ -48,7 +74,7 @@ def weighted_huber(
     """
     scaled = (predicted - measured).abs() * weight
     value = torch.where(scaled < width, scaled.square() / (2 * width), scaled - 0.5 * width)
-    return value.sum() / weight.sum().clamp(min=1e-12)
+    return value.sum(dims) / weight.sum(dims).clamp(min=1e-12)
 
 
 def roughness(

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.fit.by_views import by_views, views_at_once
-from tomo_polysplat.fit.loss import misfit
+from tomo_polysplat.fit.loss import misfit_by_view
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
@@ -18,7 +18,7 @@ from tomo_polysplat.settings import Settings
 __all__ = ["MoveSums", "move_sums"]
 
 # Views looked at together, and rays, beside a step's memory, which a GPU keeps.
-_AT_ONCE, _RAYS = 8, 1 << 23
+_AT_ONCE, _RAYS = 24, 1 << 23
 # Residuals beyond so many usual ones of some views, or of what a model is allowed, count as so many.
 _FAR = 4.0
 _LEAST_ERROR = 1e-3
@@ -86,8 +86,7 @@ def _of_part(
         here = slice(first - part.start, first - part.start + len(some))
         seen, measured, fitted, aside = rays.batch(some)
         predicted, _ = scene.projections(gaussians, seen)
-        for k, view in enumerate(range(here.start, here.stop) if rays.held_out else ()):
-            held_out[view] = misfit(predicted[k], measured[k], aside[k], settings)
+        held_out[here] = misfit_by_view(predicted, measured, aside, settings)
         left = _left(measured - predicted, fitted, max(settings.model_error, _LEAST_ERROR))
         slopes, trust = _slopes(predicted, falls[:, first : first + len(some)]), fitted.square()
         for side, half in enumerate((slice(0, columns // 2), slice(columns // 2, columns))):

@@ -18,7 +18,7 @@ __all__ = ["ResidualSums", "residual_sums"]
 # Blocks of views that differ by chance; ends of depths, -log(I/I0).
 _BLOCKS, _DEPTHS = 8, (0.01, 0.05, 0.15, 0.3, 0.6, 1.0, 1.5, 2.0, 3.0, 4.0)
 # Views looked at together, and rays, beside a step's memory, which a GPU keeps.
-_AT_ONCE, _RAYS = 8, 1 << 24
+_AT_ONCE, _RAYS = 24, 1 << 24
 # Residuals beyond so many allowed deviations count as so many.
 _FAR = 4.0
 _LEAST_ERROR = 1e-3
@@ -96,7 +96,7 @@ def _of_part(
     views, rows, columns = len(numbers), rays.views.rows, rays.views.columns
     blocks = min(_BLOCKS, views)
     double = torch.zeros((), dtype=torch.float64, device=rays.target)
-    block = _blocks(views, blocks).tolist()
+    block = _blocks(views, blocks)
     weight, total = double.new_zeros((2, blocks, rows, columns))
     ends, many = torch.tensor(_DEPTHS, device=rays.target), len(_DEPTHS) + 1
     counts = double.new_zeros((part.stop - part.start, 2, 2, many))
@@ -110,10 +110,12 @@ def _of_part(
         far = _FAR * allowed / fitted.clamp(min=1e-12)
         left = (measured - predicted).maximum(-far).minimum(far)
         trust = fitted.square()
-        # View by view: a GPU would add in any order, and a copy in double precision be made of all.
-        for k, into_block in enumerate(block[now]):
-            weight[into_block] += trust[k]
-            total[into_block] += trust[k] * left[k]
+        # Block by block, in an order that a GPU keeps.
+        for of_block in np.unique(block[now]).tolist():
+            start, stop = np.searchsorted(block[now], (of_block, of_block + 1)).tolist()
+            trusted, missed = trust[start:stop], left[start:stop]
+            weight[of_block] += trusted.sum(dim=0, dtype=torch.float64)
+            total[of_block] += (trusted * missed).sum(dim=0, dtype=torch.float64)
         depth = torch.where(trust > 0, torch.bucketize(predicted, ends) + right, 2 * many)
         depth = depth.flatten(1) + (2 * many + 1) * torch.arange(len(depth), device=depth.device)[:, None]
         for k, values in enumerate((None, left.double().flatten())):
