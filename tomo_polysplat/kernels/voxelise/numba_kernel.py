@@ -47,8 +47,9 @@ def _numbers_of(record, at):
 def _rows(rec, by, cut, ny, iz, rows):
     """Fill ``rows`` with the first row that a Gaussian reaches in each of ``LANES`` slices from ``iz`` on, and then
     with the one after its last: no more than the first where it reaches none."""
-    (by_r22, slope), z0 = by, np.float32(iz) - rec[2]
-    z = halves(z0, z0 + np.float32(HALF)) + ramp()
+    by_r22, slope = by
+    # Rounded once, so that a slice has the same rows wherever a thread begins.
+    z = halves(np.float32(iz), np.float32(iz + HALF)) + ramp() - rec[2]
     left = cut - (rec[8] * z) * (rec[8] * z)
     spread, middle = by_r22 * left * inverse_root(left), rec[1] - slope * z
     store(rows, 0, ceiling(larger(middle - spread, np.float32(0))))
