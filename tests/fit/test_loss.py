@@ -167,6 +167,16 @@ def test_the_pull_on_an_edge_falls_with_its_height():
     assert pulls == pytest.approx([1.0, 0.5, 0.1])
 
 
+@pytest.mark.parametrize("corners", [(0.0, 0.0), (0.3, 0.3), (0.5, 0.05)])
+@pytest.mark.parametrize("depth", [1, 4])
+def test_the_slope_of_the_total_variation_is_that_of_its_values(depth, corners):
+    """By finite differences, in faint matter, at its edges and at dense matter."""
+    volume = 0.3 * torch.rand((depth, 4, 9), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    volume[..., 6:] += 0.7
+    value = lambda v: total_variation(v, 0.95, corners, 0.6)  # noqa: E731
+    assert torch.autograd.gradcheck(value, volume.requires_grad_(), eps=1e-7, atol=1e-6)
+
+
 def test_brightness_above_the_ceiling_is_free():
     volume = torch.zeros((1, 8, 8), dtype=torch.float64)
     volume[0, 2:5, 2:5] = 3.0

@@ -114,7 +114,7 @@ def signatures(*functions):
 
 
 def test_a_fit_has_the_types_that_were_compiled_ahead():
-    kernels = [voxelise_kernel._set_up, voxelise_kernel._fill, voxelise_kernel._gather_range]
+    kernels = [voxelise_kernel.set_up, voxelise_kernel._fill, voxelise_kernel._gather_range]
     kernels += [project_kernel.set_up, project_kernel._splat, project_kernel._gather_range]
     select._self_check.__wrapped__("numba", "cpu")
     compile_voxelise()

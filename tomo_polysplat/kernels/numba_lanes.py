@@ -1,32 +1,113 @@
-"""Steps on blocks of ``LANES`` neighbouring float32 numbers, each one vector instruction or a few.
+"""``LANES`` float32 numbers as one value of a compiled function, which stays in vector registers.
 
-The compiler cannot know that two arrays do not overlap, and so does such loops number by number; these say so.
-No index is checked: the caller keeps every block inside its array.
+The compiler takes a loop over numbers side by side into vectors only where it can prove much of it, and what it took so
+it holds in memory from one loop to the next. These say it, and are compiled sooner than such a loop.
+
+A value knows ``+``, ``-`` and ``*``, with others and with single float32 numbers. Its two halves may lie in different
+places, as two short rows of an image: so the arrays' blocks are halves, too. No index is checked: the caller keeps
+every block inside its array.
 """
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic
+from numba.core.cgutils import get_or_insert_function
+from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
 
-__all__ = ["LANES", "add_product", "add_scaled", "lane_sums"]
+__all__ = [
+    "HALF",
+    "LANES",
+    "add_blocks",
+    "ceiling",
+    "floor",
+    "larger",
+    "smaller",
+    "halves",
+    "inverse_root",
+    "lane_sums",
+    "load",
+    "load_blocks",
+    "power_of_two",
+    "ramp",
+    "store",
+    "within",
+]
 
 LANES = 16
+HALF = LANES // 2
 
-_VECTOR = ir.VectorType(ir.FloatType(), LANES)
-_INDICES = ir.VectorType(ir.IntType(32), LANES)
+_FLOAT, _INT = ir.FloatType(), ir.IntType(32)
+_VECTOR, _BLOCK = ir.VectorType(_FLOAT, LANES), ir.VectorType(_FLOAT, HALF)
+_INTS = ir.VectorType(_INT, LANES)
 _FLAGS = ("contract",)
+# The least number that a root is taken of: rounding might make a sum of squares negative.
+_LEAST = 1e-20
+# Added to a number below 2^22 in size, it leaves the nearest integer in the last bits.
+_SHIFT = 1.5 * 2.0**23
+# 2^f for -1/2 <= f <= 1/2, from f^5 down: of the polynomials that are 1 at 0, the one closest there (9e-8 relative).
+_POWERS = (0.0013264727, 0.0096715126, 0.055507337, 0.24022242, 0.69314698, 1.0)
 
-# Its type hints count the typing context among the arguments of a call.
+# Their type hints count the typing context among the arguments of a call.
 _intrinsic: Any = intrinsic
 
 
-def _pointer(context, builder, array_type, array, start):
+class _Lanes(types.Type):
+    def __init__(self) -> None:
+        super().__init__(name="Lanes")
+
+
+_lanes = _Lanes()
+
+
+@register_model(_Lanes)
+class _Model(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, _VECTOR)
+
+
+def _all(number: float, of: ir.VectorType = _VECTOR) -> ir.Constant:
+    return ir.Constant(of, [number] * of.count)
+
+
+def _spread(builder: Any, value: Any) -> Any:
+    """A single number in all lanes; lanes as they are."""
+    if value.type == _VECTOR:
+        return value
+    one = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), value, _INT(0))
+    return builder.shuffle_vector(one, one, ir.Constant(_INTS, None))
+
+
+def _operator(function: Callable[..., Any], name: str) -> None:
+    """Have the compiler know an operator between lanes, and between lanes and a float32."""
+
+    @type_callable(function)
+    def type_of(context: Any) -> Any:
+        def typer(a: Any, b: Any) -> Any:
+            kinds = {a, b}
+            return _lanes if kinds <= {_lanes, types.float32} and _lanes in kinds else None
+
+        return typer
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        a, b = (_spread(builder, value) for value in values)
+        return getattr(builder, name)(a, b, flags=_FLAGS)
+
+    for pair in ((_Lanes, _Lanes), (_Lanes, types.Float), (types.Float, _Lanes)):
+        lower_builtin(function, *pair)(generate)
+
+
+for _function, _name in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul")):
+    _operator(_function, _name)
+
+
+def _pointer(context, builder, array_type, array, start, kind=_VECTOR):
     data = context.make_array(array_type)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [start]), _VECTOR.as_pointer())
+    return builder.bitcast(builder.gep(data, [start]), kind.as_pointer())
 
 
 def _accumulate(builder, target, a, b):
@@ -34,55 +115,206 @@ def _accumulate(builder, target, a, b):
     builder.store(builder.fadd(builder.load(target, align=4), product, flags=_FLAGS), target, align=4)
 
 
+def _mask(numbers: Any) -> ir.Constant:
+    numbers = list(numbers)
+    return ir.Constant(ir.VectorType(_INT, len(numbers)), numbers)
+
+
+def _joined(builder, low, high):
+    return builder.shuffle_vector(low, high, _mask(range(LANES)))
+
+
 @_intrinsic
-def add_scaled(typing, target, target_start, factor, source, source_start):
-    """``target[t : t + LANES] += factor * source[s : s + LANES]`` of the flattened, C-contiguous arrays."""
+def ramp(typing):
+    """0, 1, 2, ... in either half."""
 
     def generate(context, builder, signature, values):
-        t, s = (_pointer(context, builder, signature.args[k], values[k], values[k + 1]) for k in (0, 3))
-        one = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), values[2], ir.IntType(32)(0))
-        everywhere = builder.shuffle_vector(one, one, ir.Constant(_INDICES, None))
-        _accumulate(builder, t, everywhere, builder.load(s, align=4))
-        return context.get_dummy_value()
+        return ir.Constant(_VECTOR, [float(k % HALF) for k in range(LANES)])
 
-    return types.void(target, types.intp, types.float32, source, types.intp), generate
+    return _lanes(), generate
 
 
 @_intrinsic
-def add_product(typing, target, target_start, a, a_start, b, b_start):
-    """``target[t : t + LANES] += a[i : i + LANES] * b[j : j + LANES]``, likewise."""
+def halves(typing, low, high):
+    """``low`` in the first half of the lanes and ``high`` in the second."""
 
     def generate(context, builder, signature, values):
-        t, i, j = (_pointer(context, builder, signature.args[k], values[k], values[k + 1]) for k in (0, 2, 4))
-        _accumulate(builder, t, builder.load(i, align=4), builder.load(j, align=4))
-        return context.get_dummy_value()
+        low, high = (_spread(builder, value) for value in values)
+        return builder.shuffle_vector(low, high, _mask([k + (k // HALF) * LANES for k in range(LANES)]))
 
-    return types.void(target, types.intp, a, types.intp, b, types.intp), generate
+    return _lanes(types.float32, types.float32), generate
 
 
 @_intrinsic
-def lane_sums(typing, target, target_start, source, source_start):
-    """Sums of ``LANES`` blocks: ``target[t + k] = sum(source[s + k LANES : s + (k + 1) LANES])``, likewise.
+def load(typing, array, start):
+    """``array[start : start + LANES]`` of the flattened, C-contiguous float32 array."""
+
+    def generate(context, builder, signature, values):
+        return builder.load(_pointer(context, builder, signature.args[0], *values), align=4)
+
+    return _lanes(array, types.intp), generate
+
+
+@_intrinsic
+def store(typing, array, start, value):
+    """Write what `load` reads; to an array of float64 as such."""
+    double = array.dtype == types.float64
+
+    def generate(context, builder, signature, values):
+        kind = ir.VectorType(ir.DoubleType(), LANES) if double else _VECTOR
+        array, start, value = values
+        value = builder.fpext(value, kind) if double else value
+        pointer = _pointer(context, builder, signature.args[0], array, start, kind)
+        builder.store(value, pointer, align=8 if double else 4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, _lanes), generate
+
+
+@_intrinsic
+def load_blocks(typing, array, start, apart):
+    """``HALF`` numbers from ``start`` on, and ``HALF`` from ``start + apart`` on, likewise."""
+
+    def generate(context, builder, signature, values):
+        array, start, apart = values
+        parts = [
+            builder.load(_pointer(context, builder, signature.args[0], array, at, _BLOCK), align=4)
+            for at in (start, builder.add(start, apart))
+        ]
+        return _joined(builder, *parts)
+
+    return _lanes(array, types.intp, types.intp), generate
+
+
+@_intrinsic
+def add_blocks(typing, array, start, apart, factor, value):
+    """Add ``factor * value`` to what `load_blocks` reads, where its two blocks do not overlap."""
+
+    def generate(context, builder, signature, values):
+        array, start, apart, factor, value = values
+        factor = _spread(builder, factor)
+        for at, first in ((start, 0), (builder.add(start, apart), HALF)):
+            # The halves are taken apart before they are multiplied: that one is the same for all channels.
+            part = _mask(range(first, first + HALF))
+            a, b = (builder.shuffle_vector(v, v, part) for v in (factor, value))
+            _accumulate(builder, _pointer(context, builder, signature.args[0], array, at, _BLOCK), a, b)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, types.intp, types.float32, _lanes), generate
+
+
+def _called(builder, name, values, **more):
+    """The compiler's own function ``llvm.NAME`` of lanes."""
+    kind = ir.FunctionType(_VECTOR, [_VECTOR] * len(values))
+    function = get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}f32")
+    return builder.call(function, [_spread(builder, value) for value in values], **more)
+
+
+@_intrinsic
+def floor(typing, value):
+    """The largest whole numbers up to these."""
+
+    def generate(context, builder, signature, values):
+        return _called(builder, "floor", values)
+
+    return _lanes(_lanes), generate
+
+
+@_intrinsic
+def ceiling(typing, value):
+    """The smallest whole numbers from these on."""
+
+    def generate(context, builder, signature, values):
+        return _called(builder, "ceil", values)
+
+    return _lanes(_lanes), generate
+
+
+@_intrinsic
+def larger(typing, value, number):
+    """These, or ``number`` where that is larger."""
+
+    def generate(context, builder, signature, values):
+        return _called(builder, "maxnum", values)
+
+    return _lanes(_lanes, types.float32), generate
+
+
+@_intrinsic
+def smaller(typing, value, number):
+    """These, or ``number`` where that is smaller."""
+
+    def generate(context, builder, signature, values):
+        return _called(builder, "minnum", values)
+
+    return _lanes(_lanes, types.float32), generate
+
+
+@_intrinsic
+def inverse_root(typing, value):
+    """``1 / sqrt(value)`` within 2e-7 relative, of at least 1e-20."""
+
+    def generate(context, builder, signature, values):
+        flags = ("afn", "arcp", "contract")
+        root = _called(
+            builder, "sqrt", [_called(builder, "maxnum", [*values, _FLOAT(_LEAST)])], fastmath=flags
+        )
+        return builder.fdiv(_all(1.0), root, flags=flags)
+
+    return _lanes(_lanes), generate
+
+
+@_intrinsic
+def power_of_two(typing, value):
+    """``2^value`` within 2e-7 relative where ``value`` is from -126 to 127, and any number elsewhere.
+
+    An integer is set directly as the float's exponent, and what is left is between -1/2 and 1/2: a polynomial.
+    """
+
+    def generate(context, builder, signature, values):
+        (value,) = values
+        shifted = builder.fadd(value, _all(_SHIFT), flags=_FLAGS)
+        rest = builder.fsub(value, builder.fsub(shifted, _all(_SHIFT), flags=_FLAGS), flags=_FLAGS)
+        power = _all(_POWERS[0])
+        for coefficient in _POWERS[1:]:
+            power = builder.fadd(builder.fmul(power, rest, flags=_FLAGS), _all(coefficient), flags=_FLAGS)
+        exponent = builder.shl(builder.bitcast(shifted, _INTS), _all(23, _INTS))
+        return builder.bitcast(builder.add(builder.bitcast(power, _INTS), exponent), _VECTOR)
+
+    return _lanes(_lanes), generate
+
+
+@_intrinsic
+def within(typing, size, most, value):
+    """``value`` in the lanes where ``size <= most``, and 0 in the others, whatever ``value`` is there."""
+
+    def generate(context, builder, signature, values):
+        inside = builder.fcmp_ordered("<=", values[0], _spread(builder, values[1]))
+        return builder.select(inside, values[2], _all(0.0))
+
+    return _lanes(_lanes, types.float32, _lanes), generate
+
+
+@_intrinsic
+def lane_sums(typing, array, start):
+    """Sums of ``LANES`` blocks: lane k is ``sum(array[start + k LANES : start + (k + 1) LANES])``, likewise.
 
     Two vectors at a time become one that holds sums of half as many lanes of either: 15 steps, where to add up the
     lanes of one vector after the other takes 64.
     """
 
     def generate(context, builder, signature, values):
-        t, s = (_pointer(context, builder, signature.args[k], values[k], values[k + 1]) for k in (0, 2))
-        vectors = [
-            builder.load(builder.gep(s, [ir.Constant(ir.IntType(32), k)]), align=4) for k in range(LANES)
-        ]
+        source = _pointer(context, builder, signature.args[0], *values)
+        vectors = [builder.load(builder.gep(source, [_INT(k)]), align=4) for k in range(LANES)]
         half = LANES // 2
         while half:
             lower = [k for k in range(2 * LANES) if k // half % 2 == 0]
-            parts = [ir.Constant(_INDICES, [k + shift for k in lower]) for shift in (0, half)]
+            parts = [_mask(k + shift for k in lower) for shift in (0, half)]
             vectors = [
                 builder.fadd(*(builder.shuffle_vector(*pair, part) for part in parts))
                 for pair in zip(vectors[::2], vectors[1::2])
             ]
             half //= 2
-        builder.store(vectors[0], t, align=4)
-        return context.get_dummy_value()
+        return vectors[0]
 
-    return types.void(target, types.intp, source, types.intp), generate
+    return _lanes(array, types.intp), generate

@@ -11,47 +11,35 @@ import math
 
 import numpy as np
 
-from tomo_polysplat.compiled import called, njit
-from tomo_polysplat.kernels.project.numba_group import GROUP, SIZE, gaussian_of, put_group
+from tomo_polysplat.compiled import njit
+from tomo_polysplat.kernels.gaussian_maths import dot, mix, step
+from tomo_polysplat.kernels.numba_group import GROUP, SIZE, gaussian_of, put_group
 
-__all__ = ["MOMENTS", "RECORD", "pull_back", "pull_back_view", "ray_frame", "rows_of", "set_up"]
+__all__ = ["MOMENTS", "RECORD", "numbers_of", "pull_back", "pull_back_view", "ray_frame", "rows_of", "set_up"]
 
 RECORD = 12  # numbers of a footprint, in the order of _described
 MOMENTS = 11  # sums over a footprint, in the order read by pull_back
 
 _OUT = RECORD + 5  # what _footprints tells of a Gaussian
 
-# Inlined by LLVM: where Numba does it, compiling takes a third longer.
-_step = called(error_model="numpy", fastmath={"contract"}, forceinline=True)
 
-
-@_step
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@_step
+@step
 def _cross(a, b):
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@_step
-def _mix(a, x, b, y):
-    return a * x[0] + b * y[0], a * x[1] + b * y[1], a * x[2] + b * y[2]
-
-
-@_step
+@step
 def _apply(matrix, x):
-    return _dot(matrix[0], x), _dot(matrix[1], x), _dot(matrix[2], x)
+    return dot(matrix[0], x), dot(matrix[1], x), dot(matrix[2], x)
 
 
-@_step
+@step
 def _columns(matrix):
     (a, b, c), (d, e, f), (g, h, i) = matrix
     return (a, d, g), (b, e, h), (c, f, i)
 
 
-@_step
+@step
 def rows_of(matrix):
     """The rows of a (3, 3) array, as tuples."""
     return (
@@ -61,7 +49,7 @@ def rows_of(matrix):
     )
 
 
-@_step
+@step
 def ray_frame(point, cone, origin, inverse, matrix, white):
     """Column, row and kappa (0 if behind the source) of the centre, the ray r there, W r, W U and W V."""
     r = point[0] - origin[0], point[1] - origin[1], point[2] - origin[2]
@@ -75,20 +63,20 @@ def ray_frame(point, cone, origin, inverse, matrix, white):
     return (a * kappa, b * kappa, kappa), r, _apply(white, r), _apply(white, u), _apply(white, v)
 
 
-@_step
+@step
 def _triangle(nu, nv):
     """Orthonormal q1, q2 and r11, r12, r22 with ``nu = r11 q1`` and ``nv = r12 q1 + r22 q2``."""
-    r11 = math.sqrt(_dot(nu, nu))
+    r11 = math.sqrt(dot(nu, nu))
     by_r11 = 1.0 / r11 if r11 > 0.0 else 0.0
     q1 = nu[0] * by_r11, nu[1] * by_r11, nu[2] * by_r11
-    r12 = _dot(q1, nv)
-    rest = _mix(1.0, nv, -r12, q1)
-    r22 = math.sqrt(_dot(rest, rest))
+    r12 = dot(q1, nv)
+    rest = mix(1.0, nv, -r12, q1)
+    r22 = math.sqrt(dot(rest, rest))
     by_r22 = 1.0 / r22 if r22 > 0.0 else 0.0
     return q1, (rest[0] * by_r22, rest[1] * by_r22, rest[2] * by_r22), r11, r12, r22
 
 
-@_step
+@step
 def _described(cone, planar, cutoff, rows, columns, centre, w, wu, wv):
     """The numbers of a footprint by threes, and its half-open ranges of rows and columns (all 0 if there are none).
 
@@ -97,11 +85,11 @@ def _described(cone, planar, cutoff, rows, columns, centre, w, wu, wv):
     """
     _, _, r11, r12, r22 = _triangle(_cross(w, wu), _cross(w, wv))
     kappa = centre[2]
-    ee = kappa * kappa * _dot(w, w)
+    ee = kappa * kappa * dot(w, w)
     eu = ev = uu = uv = vv = 0.0
     if cone:
-        eu, ev = kappa * _dot(w, wu), kappa * _dot(w, wv)
-        uu, uv, vv = _dot(wu, wu), _dot(wu, wv), _dot(wv, wv)
+        eu, ev = kappa * dot(w, wu), kappa * dot(w, wv)
+        uu, uv, vv = dot(wu, wu), dot(wu, wv), dot(wv, wv)
     row0 = 0.0 if planar else centre[1]
     # (distance^2 - cutoff^2) |e|^2 = a x^2 + 2 b x y + c y^2 + 2 d x + 2 f y + g, not positive within the cut.
     cut = cutoff * cutoff
@@ -118,7 +106,7 @@ def _described(cone, planar, cutoff, rows, columns, centre, w, wu, wv):
     return numbers, (i0 if some else 0.0, i1 if some else 0.0, j0 if some else 0.0, j1 if some else 0.0)
 
 
-@_step
+@step
 def _range(square, half, rest, centre, length):
     """Half-open range of the indices i with ``square x^2 + 2 half x + rest <= 0``, x = i - centre; 0, 0 if none."""
     inside = half * half - square * rest
@@ -128,7 +116,7 @@ def _range(square, half, rest, centre, length):
     return low if some else 0.0, high + 1.0 if some else 0.0
 
 
-@_step
+@step
 def _reach(white, scale, toward):
     """Standard deviation along the axis ``toward``; axes of infinite scale lie across it and do not count."""
     a, b, c = _apply(white, toward)
@@ -138,7 +126,7 @@ def _reach(white, scale, toward):
     return math.sqrt(a * a + b * b + c * c)
 
 
-@_step
+@step
 def _footprints(cone, planar, cutoff, rows, columns, origin, inverse, matrix, group, out):
     """Fill ``out`` with numbers (12) and ranges (4) of a group in a view, and 1 for what lies ahead of the source."""
     for k in range(GROUP):
@@ -161,11 +149,11 @@ def set_up(
     start, stop, position, scale, rotation, cone, planar, origin, inverse, matrix, cutoff, rows, columns, record, span
 ):  # fmt: skip
     """Footprints of the Gaussians start..stop in every view; returns how many reach a source plane."""
-    white, group, out = np.empty((3, 3)), np.zeros(SIZE * GROUP), np.empty(_OUT * GROUP)
+    group, out = np.zeros(SIZE * GROUP), np.empty(_OUT * GROUP)
     skipped = 0
     for first in range(start, stop, GROUP):
         some = min(GROUP, stop - first)
-        put_group(first, some, position, scale, rotation, white, group)
+        put_group(first, some, position, scale, rotation, group)
         for v in range(len(origin)):
             place = origin[v, 0], origin[v, 1], origin[v, 2]
             inverted, direct = rows_of(inverse[v]), rows_of(matrix[v])
@@ -180,7 +168,14 @@ def set_up(
     return skipped
 
 
-@_step
+@njit(inline="always")
+def numbers_of(record, v, n):
+    """The numbers of a footprint as a tuple: an array would be read again after every store to another."""
+    a = record[v, n]
+    return a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], a[8], a[9], a[10], a[11]
+
+
+@step
 def _slopes(cone, planar, frame, m):
     """dL/d(column, row, depth) of the centre and dL/d(W r), dL/d(W U), dL/d(W V), from moments of a footprint.
 
@@ -193,60 +188,60 @@ def _slopes(cone, planar, frame, m):
     # x = by_t t - back u, y = by_u u.
     by_t, by_u = 1.0 / r11, 1.0 / r22 if r22 > 0.0 else 0.0
     back = by_t * r12 * by_u
-    sum_t, sum_u = _mix(m2, q1, m3, q2), _mix(m3, q1, m4, q2)
-    g_nu, g_nv = _mix(2 * by_t, sum_t, -2 * back, sum_u), _mix(2 * by_u, sum_u, 0.0, sum_u)
+    sum_t, sum_u = mix(m2, q1, m3, q2), mix(m3, q1, m4, q2)
+    g_nu, g_nv = mix(2 * by_t, sum_t, -2 * back, sum_u), mix(2 * by_u, sum_u, 0.0, sum_u)
     g_column, g_row = -2 * r11 * m0, -2 * (r12 * m0 + r22 * m1)
     # nu = w x WU and nv = w x WV.
     g_wu, g_wv = _cross(g_nu, w), _cross(g_nv, w)
-    g_w = _mix(1.0, _cross(wu, g_nu), 1.0, _cross(wv, g_nv))
+    g_w = mix(1.0, _cross(wu, g_nu), 1.0, _cross(wv, g_nv))
     if cone:
         # e = e0 + t et + u eu.
-        e0, et, eu = _mix(kappa, w, 0.0, w), _mix(by_t, wu, 0.0, wu), _mix(by_u, wv, -back, wu)
-        g_e = _mix(2.0, _mix(m5, e0, m6, et), 2 * m7, eu)
-        sum_t = _mix(1.0, _mix(m6, e0, m8, et), m9, eu)
-        sum_u = _mix(1.0, _mix(m7, e0, m9, et), m10, eu)
-        g_wu = _mix(1.0, g_wu, 1.0, _mix(2 * by_t, sum_t, -2 * back, sum_u))
-        g_wv = _mix(1.0, g_wv, 2 * by_u, sum_u)
-        g_w = _mix(1.0, g_w, kappa, g_e)
-        g_column -= _dot(g_e, wu)
-        g_row = 0.0 if planar else g_row - _dot(g_e, wv)
-        g_depth = -kappa * (g_column * column0 + g_row * row0 + kappa * _dot(g_e, w))
+        e0, et, eu = mix(kappa, w, 0.0, w), mix(by_t, wu, 0.0, wu), mix(by_u, wv, -back, wu)
+        g_e = mix(2.0, mix(m5, e0, m6, et), 2 * m7, eu)
+        sum_t = mix(1.0, mix(m6, e0, m8, et), m9, eu)
+        sum_u = mix(1.0, mix(m7, e0, m9, et), m10, eu)
+        g_wu = mix(1.0, g_wu, 1.0, mix(2 * by_t, sum_t, -2 * back, sum_u))
+        g_wv = mix(1.0, g_wv, 2 * by_u, sum_u)
+        g_w = mix(1.0, g_w, kappa, g_e)
+        g_column -= dot(g_e, wu)
+        g_row = 0.0 if planar else g_row - dot(g_e, wv)
+        g_depth = -kappa * (g_column * column0 + g_row * row0 + kappa * dot(g_e, w))
     else:
         g_row = 0.0 if planar else g_row
         g_depth = 0.0
-        g_w = _mix(1.0, g_w, 2 * m5, w)
+        g_w = mix(1.0, g_w, 2 * m5, w)
     return (kappa * g_column, kappa * g_row, g_depth), g_w, g_wu, g_wv
 
 
-@_step
+@step
 def pull_back(cone, planar, frame, inverse, matrix, white, m):
     """dL/dposition (3) and dL/dW (9, row by row) of one view, from the moments ``m`` of its footprint."""
     (g_column, g_row, g_depth), g_w, g_wu, g_wv = _slopes(cone, planar, frame, m)
     if cone:
-        point = _mix(g_w[0], white[0], g_w[1], white[1])
-        point = _mix(1.0, point, g_w[2], white[2])
-        point = _mix(1.0, point, g_column, inverse[0])
-        point = _mix(1.0, point, g_row, inverse[1])
-        point = _mix(1.0, point, g_depth, inverse[2])
+        point = mix(g_w[0], white[0], g_w[1], white[1])
+        point = mix(1.0, point, g_w[2], white[2])
+        point = mix(1.0, point, g_column, inverse[0])
+        point = mix(1.0, point, g_row, inverse[1])
+        point = mix(1.0, point, g_depth, inverse[2])
     else:
-        point = _mix(g_column, inverse[0], g_row, inverse[1])
+        point = mix(g_column, inverse[0], g_row, inverse[1])
     u, v, _ = _columns(matrix)
     r = frame[1]
     rows = (
-        _mix(1.0, _mix(g_w[0], r, g_wu[0], u), g_wv[0], v),
-        _mix(1.0, _mix(g_w[1], r, g_wu[1], u), g_wv[1], v),
-        _mix(1.0, _mix(g_w[2], r, g_wu[2], u), g_wv[2], v),
+        mix(1.0, mix(g_w[0], r, g_wu[0], u), g_wv[0], v),
+        mix(1.0, mix(g_w[1], r, g_wu[1], u), g_wv[1], v),
+        mix(1.0, mix(g_w[2], r, g_wu[2], u), g_wv[2], v),
     )
     return point, rows
 
 
-@_step
+@step
 def _back(white, x):
     """W^T x."""
-    return _mix(1.0, _mix(x[0], white[0], x[1], white[1]), x[2], white[2])
+    return mix(1.0, mix(x[0], white[0], x[1], white[1]), x[2], white[2])
 
 
-@_step
+@step
 def pull_back_view(cone, planar, point, frame, origin, inverse, white, m):
     """dL/d(origin, U, V, D) of a view, as far as the Gaussian at ``point`` makes it, from its moments ``m``.
 
@@ -254,9 +249,9 @@ def pull_back_view(cone, planar, point, frame, origin, inverse, white, m):
     then the inverse's part of dL/d(U, V, D) is -(a, b, c) t.
     """
     (g_column, g_row, g_depth), g_w, g_wu, g_wv = _slopes(cone, planar, frame, m)
-    t = _mix(1.0, _mix(g_column, inverse[0], g_row, inverse[1]), g_depth, inverse[2])
+    t = mix(1.0, mix(g_column, inverse[0], g_row, inverse[1]), g_depth, inverse[2])
     a, b, c = _apply(inverse, (point[0] - origin[0], point[1] - origin[1], point[2] - origin[2]))
     along, by_u, by_v = _back(white, g_w), _back(white, g_wu), _back(white, g_wv)
     # w is W (p - o) in a cone, and W D where rays are parallel.
-    by_origin = _mix(-1.0, t, -1.0 if cone else 0.0, along)
-    return by_origin, _mix(1.0, by_u, -a, t), _mix(1.0, by_v, -b, t), _mix(0.0 if cone else 1.0, along, -c, t)
+    by_origin = mix(-1.0, t, -1.0 if cone else 0.0, along)
+    return by_origin, mix(1.0, by_u, -a, t), mix(1.0, by_v, -b, t), mix(0.0 if cone else 1.0, along, -c, t)

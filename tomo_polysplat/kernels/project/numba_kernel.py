@@ -11,24 +11,37 @@ import math
 import numpy as np
 
 from tomo_polysplat.compiled import njit
-from tomo_polysplat.kernels.gaussian_maths import FAST, gaussian, whitening_adjoint
-from tomo_polysplat.kernels.numba_lanes import LANES, add_product, add_scaled, lane_sums
+from tomo_polysplat.kernels.gaussian_maths import FAST, gaussian, squared
+from tomo_polysplat.kernels.numba_group import (
+    GROUP,
+    SIZE,
+    add_where,
+    gaussian_of,
+    put_group,
+    take_gradients,
+    three,
+)
+from tomo_polysplat.kernels.numba_lanes import (
+    HALF,
+    LANES,
+    add_blocks,
+    halves,
+    inverse_root,
+    lane_sums,
+    load,
+    load_blocks,
+    ramp,
+    store,
+)
 from tomo_polysplat.kernels.project.numba_footprint import (
     MOMENTS,
     RECORD,
+    numbers_of,
     pull_back,
     pull_back_view,
     ray_frame,
     rows_of,
     set_up,
-)
-from tomo_polysplat.kernels.project.numba_group import (
-    GROUP,
-    SIZE,
-    add_where,
-    gaussian_of,
-    moments_of,
-    put_group,
 )
 from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.parallel import cpu_threads, run_tasks, shares, split_range
@@ -37,20 +50,14 @@ __all__ = ["backward", "forward"]
 
 
 @njit(inline="always")
-def _row(rec, y):
-    """What is constant on the row ``y`` below the centre: r12 y, (r22 y)^2, and |e|^2 as e0 + e1 x + rec[8] x^2."""
-    two = np.float32(2)
-    e0, e1 = rec[5] + y * (two * rec[7] + y * rec[10]), two * (rec[6] + rec[9] * y)
-    return rec[3] * y, (rec[4] * y) * (rec[4] * y), e0, e1
-
-
-@njit(inline="always")
-def _columns(rec, y, up2, e0, e1, cut, columns):
+def _columns(rec, y, cut, columns):
     """Half-open range of the columns inside the cut on the row ``y`` below the centre.
 
     Solved about the point where r11 x + r12 y = 0, so that nothing cancels however thin the Gaussian is.
     """
-    one = np.float32(1)
+    one, two = np.float32(1), np.float32(2)
+    up2 = (rec[4] * y) * (rec[4] * y)
+    e0, e1 = rec[5] + y * (two * rec[7] + y * rec[10]), two * (rec[6] + rec[9] * y)
     shift = rec[11] * y
     square = rec[2] * rec[2] - cut * rec[8]
     half = cut * (np.float32(0.5) * e1 - shift * rec[8])
@@ -64,104 +71,111 @@ def _columns(rec, y, up2, e0, e1, cut, columns):
 
 
 @njit(inline="always")
-def _inverse(x, e0, e1, e2):
-    """1 / |e|^2; the bound is for pixels outside the cut, where rounding might make the sum negative."""
-    length2 = e0 + x * (e1 + x * e2)
-    return np.float32(1) / (length2 if length2 > np.float32(1e-20) else np.float32(1e-20))
-
-
-@njit(inline="always")
-def _block(x0, r11, across, up2, e0, e1, e2, cut, value):
-    """``exp(-distance^2 / 2) / |e|`` of the pixels x0, x0 + 1, ... of one row, zero beyond the cut."""
-    for k in range(LANES):
-        x = np.float32(k) + x0
-        t = r11 * x + across
-        inverse = _inverse(x, e0, e1, e2)
-        q = (t * t + up2) * inverse
-        value[k] = gaussian(q, cut) * np.sqrt(inverse)
+def _block(rec, x, y, cut):
+    """t, u, 1 / |e|^2, the distance q and ``exp(-q / 2) / |e|``, zero beyond the cut, of lanes at the offset x, y."""
+    two = np.float32(2)
+    t, u = rec[2] * x + rec[3] * y, rec[4] * y
+    e0, e1 = rec[5] + y * (two * rec[7] + y * rec[10]), two * rec[6] + two * rec[9] * y
+    root = inverse_root(e0 + x * (e1 + x * rec[8]))
+    inverse = root * root
+    q = (t * t + u * u) * inverse
+    return t, u, inverse, q, gaussian(q, cut, root)
 
 
 @njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def _splat(v, first, last, record, span, weight, cutoff, columns, image):
     """Add every footprint to the rows first..last of view ``v`` of ``image`` (views, rows, channels, padded)."""
-    cut = np.float32(cutoff * cutoff)
+    cut = squared(cutoff)
     rows, channels, stride = image.shape[1:]
-    value = np.empty(LANES, np.float32)
     for n in range(record.shape[1]):
         low, high = max(first, span[v, n, 0]), min(last, span[v, n, 1])
-        if low >= high:
-            continue
-        rec = record[v, n]
-        # Locals, not array reads, inside the row: only then does the compiler vectorise it.
-        x0, r11, exx = rec[0], rec[2], rec[8]
-        # A footprint of at most one block a row needs no range of columns for every row.
+        rec = numbers_of(record, v, n)
         j0, j1 = span[v, n, 2], span[v, n, 3]
-        wide = j1 - j0 > LANES
-        for i in range(low, high):
-            y = np.float32(i) - rec[1]
-            across, up2, e0, e1 = _row(rec, y)
+        narrow, wide = j1 - j0 <= HALF, j1 - j0 > LANES
+        i = low
+        while i < high:
+            # Two short rows at once, where there are two.
+            two = narrow and i + 1 < high
+            y0 = np.float32(i) - rec[1]
+            y = halves(y0, np.float32(i + 1) - rec[1] if two else y0)
+            apart = channels * stride if two else HALF
             if wide:
-                j0, j1 = _columns(rec, y, up2, e0, e1, cut, columns)
+                j0, j1 = _columns(rec, y0, cut, columns)
             for j in range(j0, j1, LANES):
-                _block(np.float32(j) - x0, r11, across, up2, e0, e1, exx, cut, value)
+                x0 = np.float32(j) - rec[0]
+                x = halves(x0, x0 + np.float32(0 if two else HALF)) + ramp()
+                value = _block(rec, x, y, cut)[4]
+                at = ((v * rows + i) * channels) * stride + j
                 for c in range(channels):
-                    add_scaled(image, ((v * rows + i) * channels + c) * stride + j, weight[c, n], value, 0)
+                    add_blocks(image, at + c * stride, apart, weight[c, n], value)
+            i += 2 if two else 1
 
 
 @njit(inline="always")
-def _add_moments(x0, r11, across, u, e0, e1, e2, value, total, acc):
-    """Add the moments of one block, lane by lane and in the order of ``pull_back``, to ``acc``."""
-    half, one = np.float32(0.5), np.float32(1)
-    for k in range(LANES):
-        x = np.float32(k) + x0
-        t = r11 * x + across
-        inverse = _inverse(x, e0, e1, e2)
-        h = -half * total[k] * value[k] * inverse
-        s = h * (one - (t * t + u * u) * inverse)
-        acc[0 * LANES + k] += h * t
-        acc[1 * LANES + k] += h * u
-        acc[2 * LANES + k] += h * t * t
-        acc[3 * LANES + k] += h * t * u
-        acc[4 * LANES + k] += h * u * u
-        acc[5 * LANES + k] += s
-        acc[6 * LANES + k] += s * t
-        acc[7 * LANES + k] += s * u
-        acc[8 * LANES + k] += s * t * t
-        acc[9 * LANES + k] += s * t * u
-        acc[10 * LANES + k] += s * u * u
-
-
-@njit(inline="always")
-def _gather(
-    v, n, record, span, weight, cutoff, columns, grad_image, value, total, acc, sums, grad_weight
-):  # fmt: skip
-    """Fill ``sums`` over the footprint of Gaussian ``n`` in view ``v``: the moments that ``pull_back`` takes, then the
-    gradient of its weight in every channel, which is added to ``grad_weight``, too."""
-    cut = np.float32(cutoff * cutoff)
-    rec = record[v, n]
-    x0, r11, exx = rec[0], rec[2], rec[8]
+def _gather(v, n, k, record, span, weight, cutoff, columns, grad_image, acc):
+    """Write to ``acc``, as those of Gaussian ``k`` of a group, the sums over the footprint of Gaussian ``n`` in view
+    ``v``, lane by lane: the moments in the order of ``pull_back``, then the gradient of its weight in every channel."""
+    cut, half, one = squared(cutoff), np.float32(-0.5), np.float32(1)
     rows, channels, stride = grad_image.shape[1:]
-    acc[:] = np.float32(0)
+    rec = numbers_of(record, v, n)
     j0, j1 = span[v, n, 2], span[v, n, 3]
-    wide = j1 - j0 > LANES
-    for i in range(span[v, n, 0], span[v, n, 1]):
-        y = np.float32(i) - rec[1]
-        across, up2, e0, e1 = _row(rec, y)
-        if wide:
-            j0, j1 = _columns(rec, y, up2, e0, e1, cut, columns)
-        for j in range(j0, j1, LANES):
-            _block(np.float32(j) - x0, r11, across, up2, e0, e1, exx, cut, value)
-            for k in range(LANES):
-                total[k] = np.float32(0)
-            for c in range(channels):
-                at = ((v * rows + i) * channels + c) * stride + j
-                add_product(acc, (MOMENTS + c) * LANES, grad_image, at, value, 0)
-                add_scaled(total, 0, weight[c, n], grad_image, at)
-            _add_moments(np.float32(j) - x0, r11, across, rec[4] * y, e0, e1, exx, value, total, acc)
-    for some in range(0, len(sums), LANES):
-        lane_sums(sums, some, acc, some * LANES)
+    narrow, wide = j1 - j0 <= HALF, j1 - j0 > LANES
+    zero = halves(np.float32(0), np.float32(0))
+    m0 = m1 = m2 = m3 = m4 = m5 = m6 = m7 = m8 = m9 = m10 = zero
     for c in range(channels):
-        grad_weight[c, n] += sums[MOMENTS + c]
+        store(acc, ((MOMENTS + c) * GROUP + k) * LANES, zero)
+    i, high = span[v, n, 0], span[v, n, 1]
+    while i < high:
+        two = narrow and i + 1 < high
+        y0 = np.float32(i) - rec[1]
+        y = halves(y0, np.float32(i + 1) - rec[1] if two else y0)
+        apart = channels * stride if two else HALF
+        if wide:
+            j0, j1 = _columns(rec, y0, cut, columns)
+        for j in range(j0, j1, LANES):
+            x0 = np.float32(j) - rec[0]
+            x = halves(x0, x0 + np.float32(0 if two else HALF)) + ramp()
+            t, u, inverse, q, value = _block(rec, x, y, cut)
+            at = ((v * rows + i) * channels) * stride + j
+            total = zero
+            for c in range(channels):
+                slope = load_blocks(grad_image, at + c * stride, apart)
+                total = total + weight[c, n] * slope
+                to = ((MOMENTS + c) * GROUP + k) * LANES
+                store(acc, to, load(acc, to) + slope * value)
+            h = half * total * value * inverse
+            s = h * (one - q)
+            ht, hu, st, su = h * t, h * u, s * t, s * u
+            m0, m1, m2, m3, m4 = m0 + ht, m1 + hu, m2 + ht * t, m3 + ht * u, m4 + hu * u
+            m5, m6, m7, m8, m9, m10 = m5 + s, m6 + st, m7 + su, m8 + st * t, m9 + st * u, m10 + su * u
+        i += 2 if two else 1
+    to, each = k * LANES, GROUP * LANES
+    for m in (m0, m1, m2, m3, m4, m5, m6, m7, m8, m9, m10):
+        store(acc, to, m)
+        to += each
+
+
+@njit(inline="always")
+def _gather_group(
+    v, first, some, record, span, weight, cutoff, columns, grad_image, acc, of_group, of_weight
+):
+    """Fill ``of_group`` with the moments of a group in view ``v``, and with whether there is a footprint; add the
+    gradients of the weights to ``of_weight``."""
+    of_group[MOMENTS * GROUP :] = 0.0
+    for k in range(some):
+        if span[v, first + k, 0] < span[v, first + k, 1]:
+            of_group[MOMENTS * GROUP + k] = 1.0
+        _gather(v, first + k, k, record, span, weight, cutoff, columns, grad_image, acc)
+    for m in range(MOMENTS):
+        store(of_group, m * GROUP, lane_sums(acc, m * GROUP * LANES))
+    for c in range(len(weight)):
+        sums = lane_sums(acc, (MOMENTS + c) * GROUP * LANES)
+        store(of_weight, c * GROUP, load(of_weight, c * GROUP) + sums)
+
+
+@njit(inline="always")
+def _moments_of(moments, k):
+    return three(moments, 0, k), three(moments, 3, k), three(moments, 6, k), three(moments, 9, k)
 
 
 @njit(inline="always")
@@ -169,7 +183,7 @@ def _take_back(cone, planar, origin, inverse, matrix, group, moments, grads):
     """Add dL/dposition (3) and dL/dW (9) of a view to those of a group."""
     for k in range(GROUP):
         position, _, white = gaussian_of(group, k)
-        m = moments_of(moments, k)
+        m = _moments_of(moments, k)
         frame = ray_frame(position, cone, origin, inverse, matrix, white)
         point, rows = pull_back(cone, planar, frame, inverse, matrix, white, m)
         # A Gaussian that is not seen may have no frame.
@@ -181,7 +195,7 @@ def _take_back_view(cone, planar, origin, inverse, matrix, group, moments, sums)
     """Fill ``sums`` (12) with dL/d(origin, U, V, D) of a view, summed over a group."""
     sums[:] = 0.0
     for k in range(GROUP):
-        m = moments_of(moments, k)
+        m = _moments_of(moments, k)
         if m[3][2] > 0.0:
             point, _, white = gaussian_of(group, k)
             frame = ray_frame(point, cone, origin, inverse, matrix, white)
@@ -200,44 +214,29 @@ def _gather_range(
 ):  # fmt: skip
     """The gradients of the Gaussians start..stop, summed over the views, and where there is room for them
     (groups, views, 12) those of the views, summed over each group: ``start`` begins one."""
-    white, grad_white = np.empty((3, 3)), np.empty((3, 3))
-    value, total = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
-    # As many sums as `lane_sums` makes at once.
-    sums = np.empty(-(-(MOMENTS + len(weight)) // LANES) * LANES, np.float32)
-    acc = np.empty(len(sums) * LANES, np.float32)
     group, grads = np.zeros(SIZE * GROUP), np.empty(12 * GROUP)
     # The last number says whether there is a footprint.
-    of_group = np.empty((MOMENTS + 1) * GROUP)
+    of_group, of_weight = np.zeros((MOMENTS + 1) * GROUP), np.empty(len(weight) * GROUP, np.float32)
+    acc = np.zeros((MOMENTS + len(weight)) * GROUP * LANES, np.float32)
     for first in range(start, stop, GROUP):
         some = min(GROUP, stop - first)
-        put_group(first, some, position, scale, rotation, white, group)
+        put_group(first, some, position, scale, rotation, group)
         grads[:] = 0.0
+        of_weight[:] = np.float32(0)
         for v in range(len(origin)):
-            of_group[:] = 0.0
-            for k in range(some):
-                n = first + k
-                if span[v, n, 0] < span[v, n, 1]:
-                    _gather(
-                        v, n, record, span, weight, cutoff, columns, grad_image, value, total, acc, sums,
-                        grad_weight,
-                    )  # fmt: skip
-                    for m in range(MOMENTS):
-                        of_group[m * GROUP + k] = sums[m]
-                    of_group[MOMENTS * GROUP + k] = 1.0
+            _gather_group(
+                v, first, some, record, span, weight, cutoff, columns, grad_image, acc, of_group, of_weight
+            )  # fmt: skip
             place = origin[v, 0], origin[v, 1], origin[v, 2]
             inverted, direct = rows_of(inverse[v]), rows_of(matrix[v])
             _take_back(cone, planar, place, inverted, direct, group, of_group, grads)
             if len(grad_views):
                 of_view = grad_views[first // GROUP, v]
                 _take_back_view(cone, planar, place, inverted, direct, group, of_group, of_view)
+        take_gradients(first, some, group, grads, grad_position, grad_scale, grad_rotation)
         for k in range(some):
-            n = first + k
-            for a in range(3):
-                grad_position[n, a] = grads[a * GROUP + k]
-                for b in range(3):
-                    white[a, b] = group[(6 + 3 * a + b) * GROUP + k]
-                    grad_white[a, b] = grads[(3 + 3 * a + b) * GROUP + k]
-            whitening_adjoint(scale, rotation, n, white, grad_white, grad_scale, grad_rotation)
+            for c in range(len(weight)):
+                grad_weight[c, first + k] = of_weight[c * GROUP + k]
 
 
 def forward(position, scale, rotation, weight, views: DetectorViews, cutoff: float):

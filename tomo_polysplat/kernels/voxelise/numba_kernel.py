@@ -9,180 +9,155 @@ import math
 
 import numpy as np
 
-from tomo_polysplat.compiled import called, njit
-from tomo_polysplat.kernels.gaussian_maths import FAST, gaussian, whitening, whitening_adjoint
-from tomo_polysplat.kernels.numba_lanes import LANES, add_product, add_scaled, lane_sums
+from tomo_polysplat.compiled import njit
+from tomo_polysplat.kernels.gaussian_maths import FAST, gaussian, squared
+from tomo_polysplat.kernels.numba_group import GROUP, SIZE, put_group, take_gradients
+from tomo_polysplat.kernels.numba_lanes import (
+    HALF,
+    LANES,
+    add_blocks,
+    ceiling,
+    floor,
+    halves,
+    inverse_root,
+    lane_sums,
+    larger,
+    load,
+    load_blocks,
+    ramp,
+    smaller,
+    store,
+)
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
+from tomo_polysplat.kernels.voxelise.numba_ellipsoid import MOMENTS, NUMBERS, describe, pull_back, set_up
 from tomo_polysplat.parallel import cpu_threads, run_tasks, shares
 
 __all__ = ["backward", "forward"]
 
-_MOMENTS = 9  # sums over the voxels of a Gaussian, in the order read by _pull_back
+
+@njit(inline="always")
+def _numbers_of(record, at):
+    """The numbers of a Gaussian as tuples: an array would be read again after every store to another."""
+    a = record[at]
+    ranges = int(a[9]), int(a[10]), int(a[11]), int(a[12])
+    return (a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], a[8]), ranges, (a[13], a[14])
 
 
 @njit(inline="always")
-def _triangle(position, scale, rotation, n, first, spacing, white, q, rec):
-    """Fill ``white`` = W, ``q`` with orthonormal columns and ``rec`` with the centre in voxels and r11, r12, r13,
-    r22, r23, r33, so that W diag(spacing) = q r. The squared distance of the offset (x, y, z) in voxels is
-    (r11 x + r12 y + r13 z)^2 + (r22 y + r23 z)^2 + (r33 z)^2."""
-    whitening(scale, rotation, n, white)
-    for k in range(3):
-        rec[k] = (position[n, k] - first[k]) / spacing[k]
-        for a in range(3):
-            q[a, k] = white[a, k] * spacing[k]
-    at = 3
-    for k in range(3):
-        norm2 = q[0, k] ** 2 + q[1, k] ** 2 + q[2, k] ** 2
-        rec[at] = math.sqrt(norm2)
-        inverse = 1.0 / rec[at] if norm2 > 0.0 else 0.0  # no extent along z in two dimensions
-        for a in range(3):
-            q[a, k] *= inverse
-        for m in range(k + 1, 3):
-            along = q[0, k] * q[0, m] + q[1, k] * q[1, m] + q[2, k] * q[2, m]
-            rec[at + m - k] = along
-            for a in range(3):
-                q[a, m] -= along * q[a, k]
-        at += 3 - k
+def _rows(rec, by, cut, ny, iz, rows):
+    """Fill ``rows`` with the first row that a Gaussian reaches in each of ``LANES`` slices from ``iz`` on, and then
+    with the one after its last: no more than the first where it reaches none."""
+    by_r22, slope = by
+    # Rounded once, so that a slice has the same rows wherever a thread begins.
+    z = halves(np.float32(iz), np.float32(iz + HALF)) + ramp() - rec[2]
+    left = cut - (rec[8] * z) * (rec[8] * z)
+    spread, middle = by_r22 * left * inverse_root(left), rec[1] - slope * z
+    store(rows, 0, ceiling(larger(middle - spread, np.float32(0))))
+    store(rows, LANES, floor(smaller(middle + spread, np.float32(ny - 1))) + np.float32(1))
 
 
 @njit(inline="always")
-def _interval(centre, shift, root, factor, length):
-    """Half-open range of indices i with |factor (i - centre) + shift| <= root, within 0..length."""
-    middle, spread = centre - shift / factor, root / factor
+def _row_columns(rec, y, z, cut, length):
+    """The columns a Gaussian reaches in one row."""
+    w, u, across = rec[8] * z, rec[6] * y + rec[7] * z, rec[4] * y + rec[5] * z
+    root = math.sqrt(max(np.float32(0), cut - w * w - u * u))
+    middle, spread = rec[0] - across / rec[3], root / rec[3]
     low, high = max(0.0, np.ceil(middle - spread)), min(length - 1.0, np.floor(middle + spread))
-    if not low <= high:
-        return 0, 0
-    return int(low), int(high) + 1
-
-
-@njit(inline="always")
-def _slices(rec, cutoff, length):
-    """The slices a Gaussian reaches; a two-dimensional one (r33 = 0) reaches all."""
-    if rec[8] == 0.0:
-        return 0, length
-    return _interval(rec[2], 0.0, cutoff, rec[8], length)
-
-
-@njit(inline="always")
-def _columns(rec, cutoff, length):
-    """The columns a Gaussian reaches in any row, and whether they are more than one block."""
-    r11, r12, r13, r22, r23, r33 = rec[3:]
-    # The first row of the inverse of r: its length is the deviation along a row of voxels.
-    by_r11, by_r22 = np.float32(1) / r11, np.float32(1) / r22
-    second, third = r12 * by_r22, np.float32(0)
-    if r33 > np.float32(0):
-        third = (second * r23 - r13) / r33
-    spread = cutoff * by_r11 * math.sqrt(np.float32(1) + second * second + third * third)
-    j0, j1 = _interval(rec[0], np.float32(0), spread, np.float32(1), length)
-    return j0, j1, j1 - j0 > LANES
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _set_up(start, stop, position, scale, rotation, first, spacing, record):
-    white, q, rec = np.empty((3, 3)), np.empty((3, 3)), np.empty(9)
-    for n in range(start, stop):
-        _triangle(position, scale, rotation, n, first, spacing, white, q, rec)
-        for k in range(9):
-            record[n, k] = rec[k]
-
-
-@njit(inline="always")
-def _block(x0, r11, across, rest, cut, value):
-    """``exp(-distance^2 / 2)`` of the voxels x0, x0 + 1, ... of one row, zero beyond the cut."""
-    for k in range(LANES):
-        t = r11 * (np.float32(k) + x0) + across
-        value[k] = gaussian(t * t + rest, cut)
+    return (int(low), int(high) + 1) if low <= high else (0, 0)
 
 
 @njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def _fill(first, last, record, weight, cutoff, ny, nx, volume):
     """Add every Gaussian to the slices first..last of ``volume`` (nz, ny, channels, padded nx)."""
-    cut = np.float32(cutoff * cutoff)
-    value = np.empty(LANES, np.float32)
-    nz, _, channels, stride = volume.shape
+    cut, one = squared(cutoff), np.float32(1)
+    channels, stride = volume.shape[2:]
+    rows = np.empty(2 * LANES, np.float32)
     for n in range(len(record)):
-        rec = record[n]
+        rec, (low, high, j0, j1), by = _numbers_of(record, n)
         xc, yc, zc, r11, r12, r13, r22, r23, r33 = rec
-        low, high = _slices(rec, cutoff, nz)
         # A Gaussian of at most one block a row needs no range of columns for every row.
-        j0, j1, wide = _columns(rec, cutoff, nx)
-        for iz in range(max(low, first), min(high, last)):
+        narrow, wide = j1 - j0 <= HALF, j1 - j0 > LANES
+        begin = max(low, first)
+        for iz in range(begin, min(high, last)):
+            at_slice = (iz - begin) % LANES
+            if at_slice == 0:
+                _rows(rec, by, cut, ny, iz, rows)
             z = np.float32(iz) - zc
             z2 = (r33 * z) * (r33 * z)
-            y0, y1 = _interval(yc, r23 * z, math.sqrt(max(np.float32(0), cut - z2)), r22, ny)
-            for iy in range(y0, y1):
-                y = np.float32(iy) - yc
-                up = r22 * y + r23 * z
-                rest, across = z2 + up * up, r12 * y + r13 * z
+            iy, end = int(rows[at_slice]), int(rows[LANES + at_slice])
+            while iy < end:
+                # Two short rows at once, where there are two.
+                two = narrow and iy + 1 < end
+                y0 = np.float32(iy) - yc
+                y = halves(y0, np.float32(iy + 1) - yc if two else y0)
+                apart = channels * stride if two else HALF
                 if wide:
-                    j0, j1 = _interval(xc, across, math.sqrt(max(np.float32(0), cut - rest)), r11, nx)
+                    j0, j1 = _row_columns(rec, y0, z, cut, nx)
+                u = r22 * y + r23 * z
+                rest, across = u * u + z2, r12 * y + r13 * z
                 for j in range(j0, j1, LANES):
-                    _block(np.float32(j) - xc, r11, across, rest, cut, value)
+                    x0 = np.float32(j) - xc
+                    x = halves(x0, x0 + np.float32(0 if two else HALF)) + ramp()
+                    t = r11 * x + across
+                    value = gaussian(t * t + rest, cut, one)
+                    at = ((iz * ny + iy) * channels) * stride + j
                     for c in range(channels):
-                        at = ((iz * ny + iy) * channels + c) * stride + j
-                        add_scaled(volume, at, weight[c, n], value, 0)
+                        add_blocks(volume, at + c * stride, apart, weight[c, n], value)
+                iy += 2 if two else 1
 
 
 @njit(inline="always")
-def _gather(n, rec, weight, cutoff, nx, grad_volume, value, total, acc):
-    """Lane sums over the voxels of one Gaussian: of h times (t, u, w, tt, tu, tw, uu, uw, ww), with
-    h = dL/d(distance^2) = dL/d(t^2 + u^2 + w^2), and of dL/df f by channel."""
-    cut = np.float32(cutoff * cutoff)
-    half = np.float32(-0.5)
+def _gather(n, k, record, weight, cutoff, nx, grad_volume, rows, acc):
+    """Write to ``acc``, as those of Gaussian ``k`` of a group, the sums over the voxels of Gaussian ``n``, lane by
+    lane: of h times (t, u, w, tt, tu, tw, uu, uw, ww), with h = dL/d(distance^2) = dL/d(t^2 + u^2 + w^2), and of
+    dL/df f by channel."""
+    cut, half, one = squared(cutoff), np.float32(-0.5), np.float32(1)
+    _, ny, channels, stride = grad_volume.shape
+    rec, (low, high, j0, j1), by = _numbers_of(record, k)
     xc, yc, zc, r11, r12, r13, r22, r23, r33 = rec
-    nz, ny, channels, stride = grad_volume.shape
-    low, high = _slices(rec, cutoff, nz)
-    j0, j1, wide = _columns(rec, cutoff, nx)
+    narrow, wide = j1 - j0 <= HALF, j1 - j0 > LANES
+    zero = halves(np.float32(0), np.float32(0))
+    m0 = m1 = m2 = m3 = m4 = m5 = m6 = m7 = m8 = zero
+    for c in range(channels):
+        store(acc, ((MOMENTS + c) * GROUP + k) * LANES, zero)
     for iz in range(low, high):
+        at_slice = (iz - low) % LANES
+        if at_slice == 0:
+            _rows(rec, by, cut, ny, iz, rows)
         z = np.float32(iz) - zc
-        deep = r33 * z
-        z2 = deep * deep
-        y0, y1 = _interval(yc, r23 * z, math.sqrt(max(np.float32(0), cut - z2)), r22, ny)
-        for iy in range(y0, y1):
-            y = np.float32(iy) - yc
-            up = r22 * y + r23 * z
-            rest, across = z2 + up * up, r12 * y + r13 * z
+        w = r33 * z
+        z2 = w * w
+        iy, end = int(rows[at_slice]), int(rows[LANES + at_slice])
+        while iy < end:
+            two = narrow and iy + 1 < end
+            y0 = np.float32(iy) - yc
+            y = halves(y0, np.float32(iy + 1) - yc if two else y0)
+            apart = channels * stride if two else HALF
             if wide:
-                j0, j1 = _interval(xc, across, math.sqrt(max(np.float32(0), cut - rest)), r11, nx)
+                j0, j1 = _row_columns(rec, y0, z, cut, nx)
+            u = r22 * y + r23 * z
+            rest, across = u * u + z2, r12 * y + r13 * z
             for j in range(j0, j1, LANES):
                 x0 = np.float32(j) - xc
-                _block(x0, r11, across, rest, cut, value)
-                for k in range(LANES):
-                    total[k] = np.float32(0)
+                x = halves(x0, x0 + np.float32(0 if two else HALF)) + ramp()
+                t = r11 * x + across
+                value = gaussian(t * t + rest, cut, one)
+                at = ((iz * ny + iy) * channels) * stride + j
+                total = zero
                 for c in range(channels):
-                    at = ((iz * ny + iy) * channels + c) * stride + j
-                    add_product(acc, (_MOMENTS + c) * LANES, grad_volume, at, value, 0)
-                    add_scaled(total, 0, weight[c, n], grad_volume, at)
-                for k in range(LANES):
-                    t = r11 * (np.float32(k) + x0) + across
-                    h = half * total[k] * value[k]
-                    acc[0 * LANES + k] += h * t
-                    acc[1 * LANES + k] += h * up
-                    acc[2 * LANES + k] += h * deep
-                    acc[3 * LANES + k] += h * t * t
-                    acc[4 * LANES + k] += h * t * up
-                    acc[5 * LANES + k] += h * t * deep
-                    acc[6 * LANES + k] += h * up * up
-                    acc[7 * LANES + k] += h * up * deep
-                    acc[8 * LANES + k] += h * deep * deep
-
-
-# Inlined by LLVM, which compiles sooner than where Numba does it; the loop along a row would lose its vectors so.
-@called(fastmath=FAST, error_model="numpy", forceinline=True)
-def _pull_back(n, white, q, rec, spacing, m, grad_position, grad_white):
-    """Write dL/dposition, and dL/dW to ``grad_white``, from the moments ``m`` of h with t = r (x, y, z)."""
-    by_r33 = 1.0 / rec[8] if rec[8] > 0.0 else 0.0
-    for b in range(3):
-        grad_position[n, b] = 0.0
-    for a in range(3):
-        # distance^2 = |q t|^2 and dL/dr(x, y, z) = 2 q sum(h t t^T): solve with r, from z up.
-        z = 2 * (q[a, 0] * m[5] + q[a, 1] * m[7] + q[a, 2] * m[8]) * by_r33
-        y = (2 * (q[a, 0] * m[4] + q[a, 1] * m[6] + q[a, 2] * m[7]) - rec[7] * z) / rec[6]
-        x = (2 * (q[a, 0] * m[3] + q[a, 1] * m[4] + q[a, 2] * m[5]) - rec[4] * y - rec[5] * z) / rec[3]
-        grad_white[a, 0], grad_white[a, 1], grad_white[a, 2] = x * spacing[0], y * spacing[1], z * spacing[2]
-        ahead = 2 * (q[a, 0] * m[0] + q[a, 1] * m[1] + q[a, 2] * m[2])
-        for b in range(3):
-            grad_position[n, b] -= ahead * white[a, b]
+                    slope = load_blocks(grad_volume, at + c * stride, apart)
+                    total = total + weight[c, n] * slope
+                    to = ((MOMENTS + c) * GROUP + k) * LANES
+                    store(acc, to, load(acc, to) + slope * value)
+                h = half * total * value
+                ht, hu, hw = h * t, h * u, h * w
+                m0, m1, m2, m3, m4 = m0 + ht, m1 + hu, m2 + hw, m3 + ht * t, m4 + ht * u
+                m5, m6, m7, m8 = m5 + ht * w, m6 + hu * u, m7 + hu * w, m8 + hw * w
+            iy += 2 if two else 1
+    to, each = k * LANES, GROUP * LANES
+    for m in (m0, m1, m2, m3, m4, m5, m6, m7, m8):
+        store(acc, to, m)
+        to += each
 
 
 @njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
@@ -191,32 +166,32 @@ def _gather_range(
     grad_position, grad_scale, grad_rotation, grad_weight,
 ):  # fmt: skip
     """The gradients of the Gaussians start..stop."""
-    white, q, rec, grad_white = np.empty((3, 3)), np.empty((3, 3)), np.empty(9), np.empty((3, 3))
-    single = np.empty(9, np.float32)
-    value, total = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
-    # As many sums as `lane_sums` makes at once.
-    sums = np.empty(-(-(_MOMENTS + len(weight)) // LANES) * LANES, np.float32)
-    acc = np.empty(len(sums) * LANES, np.float32)
-    for n in range(start, stop):
-        _triangle(position, scale, rotation, n, first, spacing, white, q, rec)
-        for k in range(9):
-            single[k] = rec[k]
-        acc[:] = np.float32(0)
-        _gather(n, single, weight, cutoff, nx, grad_volume, value, total, acc)
-        for some in range(0, len(sums), LANES):
-            lane_sums(sums, some, acc, some * LANES)
+    group, out, grads = np.zeros(SIZE * GROUP), np.empty(NUMBERS * GROUP), np.empty(12 * GROUP)
+    record, rows = np.empty((GROUP, NUMBERS), np.float32), np.empty(2 * LANES, np.float32)
+    moments = np.empty((MOMENTS + len(weight)) * GROUP)
+    acc = np.zeros(len(moments) * LANES, np.float32)
+    corner, edges = (first[0], first[1], first[2]), (spacing[0], spacing[1], spacing[2])
+    for n in range(start, stop, GROUP):
+        some = min(GROUP, stop - n)
+        put_group(n, some, position, scale, rotation, group)
+        describe(some, corner, edges, cutoff, len(grad_volume), nx, group, out, record, 0)
+        for k in range(some):
+            _gather(n + k, k, record, weight, cutoff, nx, grad_volume, rows, acc)
+        for m in range(MOMENTS + len(weight)):
+            store(moments, m * GROUP, lane_sums(acc, m * GROUP * LANES))
+        pull_back(edges, group, moments, grads)
+        take_gradients(n, some, group, grads, grad_position, grad_scale, grad_rotation)
         for c in range(len(weight)):
-            grad_weight[c, n] = sums[_MOMENTS + c]
-        _pull_back(n, white, q, rec, spacing, sums, grad_position, grad_white)
-        whitening_adjoint(scale, rotation, n, white, grad_white, grad_scale, grad_rotation)
+            for k in range(some):
+                grad_weight[c, n + k] = moments[(MOMENTS + c) * GROUP + k]
 
 
 def forward(position, scale, rotation, weight, box: VoxelBox, cutoff: float) -> np.ndarray:
     """Volume (channels, nz, ny, nx) float32; arguments as for the reference, as float32 numpy arrays."""
     nz, ny, nx = box.shape
-    record = np.empty((len(position), 9), np.float32)
-    scene = (position, scale, rotation, box.first, box.spacing)
-    run_tasks(lambda a, b: _set_up(a, b, *scene, record), shares(len(position), 4, cpu_threads()))
+    record = np.empty((len(position), NUMBERS), np.float32)
+    scene = (position, scale, rotation, box.first, box.spacing, cutoff, nz, nx)
+    run_tasks(lambda a, b: set_up(a, b, *scene, record), shares(len(position), 4, cpu_threads()))
     volume = np.zeros((nz, ny, len(weight), nx + LANES), np.float32)
     tasks = shares(nz, 2, cpu_threads())
     run_tasks(lambda a, b: _fill(a, b, record, weight, cutoff, ny, nx, volume), tasks)
