@@ -106,8 +106,8 @@ class Settings:
     relocate_until: float = 0.5
     """Share of the run after which no Gaussian is moved: the new ones need time to settle."""
     surroundings: float = 0.5
-    """Where the object reaches beyond both the detector and the volume, the volume is widened during the fit, on every
-    side by this share of its edge at most; 0: never."""
+    """Where the object reaches beyond both the detector and the volume, or is longer than that of a cone beam, the
+    volume is larger during the fit, on every side by this share of its edge at most; 0: never."""
 
     # Smoothing.
     tv_weight: float = 0.04

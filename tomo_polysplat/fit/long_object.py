@@ -79,7 +79,7 @@ def long_object(
         outward = np.argsort(middle[at_rows])
         outer = [row for row in outward[::-1] if seen[row].any()][:_OUTER]
         wide = seen[outer].any(axis=0)
-        offsets = np.abs(ray_offsets(geometry, orbit, at_columns[wide], float(at_rows[outer[0]])))
+        offsets = np.abs(ray_offsets(geometry, orbit, at_columns[wide].tolist(), float(at_rows[outer[0]])))
         near = _near(max(radius, float(offsets.mean(axis=0).max())), orbit)
         cut = outer[0] == [row for row in outward if told[row]][-1]
         sides = middle[at_rows[outer[0]]] * np.array([near, 2 - near])
