@@ -135,6 +135,11 @@ class Plan:
         return self.answers["detector_blur"].value
 
     @property
+    def metal(self) -> bool:
+        """Whether the start holds metal; True where nobody looked."""
+        return bool(self.answers["detector_blur"].evidence.get("metal", 1.0))
+
+    @property
     def pixel_rays(self) -> int:
         """Rays a pixel and axis over which the light is averaged; 0 until that is decided."""
         return self.value("pixel_rays", 0)

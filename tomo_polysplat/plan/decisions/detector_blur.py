@@ -7,7 +7,9 @@ from typing import Any
 from tomo_polysplat.nuisances.detector_blur import BlurOfDetector
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.decision import Decision, Known
+from tomo_polysplat.plan.decisions.passes import Passes
 from tomo_polysplat.plan.decisions.soft_reference import SoftReference
+from tomo_polysplat.plan.edge_rise import edge_rise
 from tomo_polysplat.plan.lab import Lab
 from tomo_polysplat.settings import Settings
 
@@ -17,11 +19,11 @@ __all__ = ["DetectorBlur"]
 class DetectorBlur(Decision):
     """Are rays seen through a blur of the detector?
 
-    Where the blur is to be fitted, metal must show that edges are sharp; see `nuisances.detector_blur`.
+    Where the blur is to be fitted, edges must be sharp, as those of metal are; see `nuisances.detector_blur`.
     """
 
     name = "detector_blur"
-    needs = (SoftReference,)
+    needs = (Passes, SoftReference)
 
     def given(self, settings: Settings) -> Any | None:
         """The settings say how much it is and whether it is fitted; see `ask`."""
@@ -32,12 +34,13 @@ class DetectorBlur(Decision):
         return isinstance(value, bool)
 
     def ask(self, known: Known, lab: Lab) -> Answer:
-        """Where the start has metal."""
+        """Where the start has metal, or other sharp edges."""
         settings = lab.settings
         if not settings.learning_rate_blur:
             words = BlurOfDetector.describe(settings.blur, fitted=False)
             return Answer(settings.blur > 0, words, Status.GIVEN)
         soft = known[SoftReference]["first"] * lab.problem.depth
         metal = bool((lab.start > settings.metal_level * soft).any())
-        verdict = BlurOfDetector.gate({"metal": float(metal), "blur": settings.blur})
-        return Answer(verdict.kept, verdict.why, Status.ASKED)
+        evidence = {"metal": float(metal), "rise": 0.0 if metal else edge_rise(lab.relative)}
+        verdict = BlurOfDetector.gate(evidence | {"blur": settings.blur, "passes": known[Passes]})
+        return Answer(verdict.kept, verdict.why, Status.ASKED, evidence)

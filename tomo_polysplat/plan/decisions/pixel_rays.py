@@ -89,7 +89,7 @@ class PixelRays(Decision):
 
     def alternative(self, lab: Lab) -> str:
         """Saying it saves the fork."""
-        if lab.settings.pixel_rays or not lab.plan.blurred:
+        if lab.settings.pixel_rays or not lab.plan.metal:
             return ""
         rays = "twice" if lab.problem.planar else "four times"
         return f"1 or 2: not asked in the middle of the run; with 2 {rays} the pairs"
