@@ -151,7 +151,7 @@ def test_voxels_keep_to_a_unit_and_a_budget(scan, data):
         projections, geometry.scaled(10), grid.scaled(10), scan.spectrum, unit="mm", settings=settings
     )
     # A voxel at an edge may follow a rounding; a wrong unit would change all of them.
-    assert np.linalg.norm(10 * in_mm - in_cm) < 1e-3 * np.linalg.norm(in_cm)
+    assert np.linalg.norm(10 * in_mm - in_cm) < 3e-3 * np.linalg.norm(in_cm)
     seen = []
     voxel_poly(*data, scan.spectrum, time_budget=1e-3, callbacks=[seen.append])
     assert not seen
