@@ -52,6 +52,16 @@ def test_what_lies_around_is_fitted_and_cut_off(region):
     assert np.abs(both.gaussians["position"][:, :2]).max() > region[2]["option"]["WindowMaxX"]
 
 
+def test_a_larger_volume_that_memory_does_not_hold_is_refused_with_what_to_do(region, monkeypatch):
+    def no_room(rays, voxels, *_):
+        if voxels > 27 * 27:
+            raise MemoryError("too many voxels")
+
+    monkeypatch.setattr("tomo_polysplat.reconstruction.require_machine", no_room)
+    with pytest.raises(MemoryError, match="too many voxels.*more on every side.*'surroundings': 0"):
+        fitted(region)
+
+
 def test_callbacks_see_what_was_asked_for(region):
     shapes = []
     tps.reconstruct(

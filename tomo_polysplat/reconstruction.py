@@ -297,8 +297,14 @@ def _problem(
         widest = options.settings.surroundings
         problem = Problem.of(values, geometry, grid, unit, spectrum, materials, widest, on, own=True)
         problem = filtered(problem, measured.filter_map, unit, proj_geom["type"] == "cyl_cone_vec")
-    # Made wider where the object is, it may have many times the voxels.
-    require_machine(0, math.prod(problem.grid.shape), energies, on)
+    # Made larger where the object is, it may have many times the voxels.
+    try:
+        require_machine(0, math.prod(problem.grid.shape), energies, on)
+    except MemoryError as full:
+        if not problem.surroundings:
+            raise
+        remedy = "settings={'surroundings': 0} leaves that out"
+        raise MemoryError(f"{full}. The volume is {problem.surroundings}: {remedy}") from full
     return problem, counts
 
 
