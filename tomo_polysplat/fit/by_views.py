@@ -6,7 +6,7 @@ already: beside the images of all views that is little.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -20,7 +20,7 @@ from tomo_polysplat.rank_work import gathered, helpers
 from tomo_polysplat.ranks import Ranks, part_of
 from tomo_polysplat.settings import Settings
 
-__all__ = ["by_views", "views_at_once"]
+__all__ = ["by_views", "portions_of", "views_at_once"]
 
 # Gets the part of the views, how many are looked at together, and all that a sum over them is made of.
 _Work = Callable[..., list[torch.Tensor]]
@@ -29,6 +29,13 @@ _Work = Callable[..., list[torch.Tensor]]
 def views_at_once(rays: Rays, most: int, most_rays: int, images: int = 1) -> int:
     """How many views are looked at together: so many at most, and no more rays, of which there are some images."""
     return max(1, min(most, most_rays // (rays.views.rows * rays.views.columns * images)))
+
+
+def portions_of(part: slice, at_once: int) -> Iterator[tuple[slice, slice]]:
+    """So many views of a part of them after the other: which they are, and where in the part."""
+    for first in range(part.start, part.stop, at_once):
+        last = min(first + at_once, part.stop)
+        yield slice(first, last), slice(first - part.start, last - part.start)
 
 
 # What is done, with what of a fit, and how the views go together: nothing else holds these.

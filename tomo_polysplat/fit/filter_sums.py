@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.by_views import by_views, views_at_once
+from tomo_polysplat.fit.by_views import by_views, portions_of, views_at_once
 from tomo_polysplat.fit.loss import misfit_by_view
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
@@ -84,15 +84,13 @@ def _of_part(
     sums = torch.zeros((5, *shape), dtype=torch.float64, device=rays.target)
     held_out = torch.full((part.stop - part.start,), torch.nan, dtype=torch.float64, device=rays.target)
     allowed = max(settings.model_error, _LEAST_ERROR)
-    for first in range(part.start, part.stop, at_once):
-        some = np.arange(first, min(first + at_once, part.stop))
-        seen, measured, fitted, aside = rays.batch(some)
+    for now, here in portions_of(part, at_once):
+        seen, measured, fitted, aside = rays.batch(np.arange(now.start, now.stop))
         predicted, _ = scene.projections(gaussians, seen)
         slopes = scene.filter_slopes(gaussians, seen, quadrature) * grams
         left = _clipped(measured - predicted, fitted, allowed)
         parts = torch.stack([torch.ones_like(left), slopes, slopes.square(), left, slopes * left])
         sums += (parts * fitted.square()).double().sum(dim=1)
-        here = slice(first - part.start, first - part.start + len(some))
         held_out[here] = misfit_by_view(predicted, measured, aside, settings)
     return [sums, held_out]
 

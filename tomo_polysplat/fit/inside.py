@@ -10,7 +10,7 @@ import torch
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.continued import cut_rows
 
-__all__ = ["matter_is_inside"]
+__all__ = ["NOTHING", "matter_is_inside", "typical_ray"]
 
 logger = logging.getLogger(__name__)
 
@@ -19,8 +19,10 @@ _VIEWS, _LINES = 24, 64
 _RAYS_AT_ONCE = 1 << 17
 # Fewer rays beside the volume than this share of all say nothing.
 _FEWEST = 0.01
-# Rays beside the volume see nothing when all but this share of them stay below this part of a typical ray.
-_SHARE, _NOTHING = 0.01, 0.1
+# A ray that stays below this part of a typical one sees nothing.
+NOTHING = 0.1
+# Rays beside the volume see nothing when all but this share of them do.
+_SHARE = 0.01
 # Of the views and rows, the share in which matter is seen next to the volume if that is too small.
 _MOST = 0.5
 
@@ -41,7 +43,7 @@ def matter_is_inside(projections: torch.Tensor, geometry: Geometry, grid: Volume
     values = projections[tuple(chosen)].cpu().numpy()
     beside = ~_crosses(geometry.select(some), grid, rows, columns, device) & np.isfinite(values)
     through = values[~beside & np.isfinite(values)]
-    typical = _typical(through)
+    typical = typical_ray(through)
     if beside.sum() < max(_FEWEST * values.size, 1) or not len(through):
         if cut_rows(projections[some.tolist()][:, rows.tolist()]) is not None:
             logger.warning(
@@ -57,7 +59,7 @@ def matter_is_inside(projections: torch.Tensor, geometry: Geometry, grid: Volume
             )
             return False, "not kept within the volume: no ray meets it"
         return False, "not kept within the volume: too few rays pass beside it to say what lies there"
-    if float(np.quantile(values[beside], 1 - _SHARE)) > _NOTHING * typical:
+    if float(np.quantile(values[beside], 1 - _SHARE)) > NOTHING * typical:
         if _cut(values, beside, typical):
             logger.warning(
                 "The object reaches beyond the volume: rays next to it see matter, which ends up in the volume, too"
@@ -71,7 +73,7 @@ def matter_is_inside(projections: torch.Tensor, geometry: Geometry, grid: Volume
     return True, "kept within the volume: rays beside it see nothing"
 
 
-def _typical(values: np.ndarray) -> float:
+def typical_ray(values: np.ndarray) -> float:
     """The median of rays that see something."""
     top = values.max(initial=0.0)
     return float(np.median(values[values >= 0.1 * top])) if top > 0 else 0.0
@@ -94,7 +96,7 @@ def _cut(values: np.ndarray, beside: np.ndarray, typical: float) -> bool:
     near[..., :-1] |= crossing[..., 1:]
     near &= beside
     told = near.any(axis=-1)
-    seen = (near & (np.nan_to_num(values) > _NOTHING * typical)).any(axis=-1)
+    seen = (near & (np.nan_to_num(values) > NOTHING * typical)).any(axis=-1)
     return bool(told.any() and seen[told].mean() > _MOST)
 
 

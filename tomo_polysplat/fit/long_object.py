@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tomo_polysplat.fit.inside import NOTHING, typical_ray
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.orbit import Orbit
 from tomo_polysplat.start.weights import ray_offsets
@@ -20,8 +21,6 @@ __all__ = ["LongObject", "long_object"]
 
 # Views, rows and columns that tell.
 _VIEWS, _LINES = 48, 256
-# A row sees matter where its largest ray, in the mean of the views, has this part of a typical one.
-_NOTHING = 0.1
 # Of the outermost rows that see matter, so many say how wide it is there.
 _OUTER = 3
 # The object is no wider than this share of the way to the source.
@@ -104,12 +103,8 @@ def _profile(projections: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
     some = np.stack([view[np.ix_(*at)] for view in projections[:: max(1, views // _VIEWS)]])
     good = np.isfinite(some)
     values = np.where(good, some, 0.0)
-    top = float(values.max(initial=0.0))
-    if top <= 0:
-        return np.zeros(values.shape[1:], bool), *at, good.any(axis=(0, 2))
-    typical = float(np.median(values[values > _NOTHING * top]))
     mean = values.sum(axis=0) / np.maximum(good.sum(axis=0), 1)
-    return mean > _NOTHING * typical, *at, good.any(axis=(0, 2))
+    return mean > NOTHING * typical_ray(values), *at, good.any(axis=(0, 2))
 
 
 def _heights(geometry: Geometry, orbit: Orbit) -> tuple[np.ndarray, float]:

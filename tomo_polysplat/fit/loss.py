@@ -115,14 +115,7 @@ def total_variation(
     dense : float
         Below ``ceiling``, for the second corner to matter.
     """
-    clipped = volume.clamp(max=ceiling)
-    away = _away(clipped, len(volume), corners, dense)
-    total = volume.new_zeros(())
-    for axis in range(volume.ndim):
-        if volume.shape[axis] > 1:
-            count = volume.numel() // volume.shape[axis] * (volume.shape[axis] - 1)
-            total = total + _Heights.apply(clipped, away, axis, corners, dense) / count
-    return total
+    return variation_of_slab(volume, len(volume), ceiling, corners, dense)
 
 
 def variation_of_slab(

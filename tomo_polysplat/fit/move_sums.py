@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.by_views import by_views, views_at_once
+from tomo_polysplat.fit.by_views import by_views, portions_of, views_at_once
 from tomo_polysplat.fit.loss import misfit_by_view
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
@@ -81,14 +81,12 @@ def _of_part(
     normal = torch.zeros((views, 2, many, many), dtype=torch.float64, device=device)
     told = torch.zeros((views, 2, many), dtype=torch.float64, device=device)
     held_out = torch.full((views,), torch.nan, dtype=torch.float64, device=device)
-    for first in range(part.start, part.stop, at_once):
-        some = np.arange(first, min(first + at_once, part.stop))
-        here = slice(first - part.start, first - part.start + len(some))
-        seen, measured, fitted, aside = rays.batch(some)
+    for now, here in portions_of(part, at_once):
+        seen, measured, fitted, aside = rays.batch(np.arange(now.start, now.stop))
         predicted, _ = scene.projections(gaussians, seen)
         held_out[here] = misfit_by_view(predicted, measured, aside, settings)
         left = _left(measured - predicted, fitted, max(settings.model_error, _LEAST_ERROR))
-        slopes, trust = _slopes(predicted, falls[:, first : first + len(some)]), fitted.square()
+        slopes, trust = _slopes(predicted, falls[:, now]), fitted.square()
         for side, half in enumerate((slice(0, columns // 2), slice(columns // 2, columns))):
             # Row by row: a GPU would make the products of a whole view on a single multiprocessor.
             one = slopes[..., half].double().transpose(1, 2)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.by_views import by_views, views_at_once
+from tomo_polysplat.fit.by_views import by_views, portions_of, views_at_once
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
@@ -103,8 +103,7 @@ def _of_part(
     # The right half's depths come after the left one's, and what is not fitted after both.
     right = many * (torch.arange(columns, device=rays.target) >= columns // 2)
     held: list[list[torch.Tensor]] = [[torch.empty(0, dtype=kind) for kind in _OF_ASIDE]]
-    for first in range(part.start, part.stop, at_once):
-        now = slice(first, min(first + at_once, part.stop))
+    for now, here in portions_of(part, at_once):
         seen, measured, fitted, aside = rays.batch(numbers[now])
         predicted, _ = scene.projections(gaussians, seen)
         far = _FAR * allowed / fitted.clamp(min=1e-12)
@@ -121,10 +120,10 @@ def _of_part(
         for k, values in enumerate((None, left.double().flatten())):
             found = torch.bincount(depth.flatten(), values, minlength=len(measured) * (2 * many + 1))
             found = found.reshape(len(measured), -1)[:, :-1].reshape(-1, 2, many)
-            counts[now.start - part.start : now.stop - part.start, k] = found
+            counts[here, k] = found
         where = (aside > 0).nonzero(as_tuple=True)
         parts = (
-            where[0] + first,
+            where[0] + now.start,
             where[1] * columns + where[2],
             (measured - predicted)[where],
             allowed / aside[where],

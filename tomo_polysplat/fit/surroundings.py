@@ -130,9 +130,9 @@ def cut_out(volume: np.ndarray, margin: Margin) -> np.ndarray:
 def go_on(volume: torch.Tensor, margin: Margin) -> None:
     """Let slices (z, y, x) in the margin that are empty, as no ray tells of them, go on as the next ones, in place."""
     below, above, _, _ = margin
-    last = len(volume) - 1
-    for inner, outer in ((below, -1), (last - above, last + 1)):
-        step = 1 if outer > inner else -1
-        for k in range(inner + step, outer, step):
-            if not bool(volume[k].any()):
-                volume[k] = volume[k - step]
+    slices = len(volume)
+    outward = [(k, k + 1) for k in reversed(range(below))]
+    outward += [(k, k - 1) for k in range(slices - above, slices)]
+    for outer, inner in outward:
+        if not bool(volume[outer].any()):
+            volume[outer] = volume[inner]
