@@ -11,7 +11,7 @@ _FEWEST_VIEWS = 8
 # A value that so many rays of working pixels show, or so many of all pixels, is what the scan holds for air without
 # noise, or for no light.
 _COMMON, _MANY = 1e-3, 0.4
-# Beside a stuck pixel values change by so much of the largest where it changes most, or are as far from its own; real
+# Beside a stuck pixel values change by so much of the largest that works where it changes most, or are as far from its own; real
 # ones of few different counts may be constant where hardly anything changes. So many of the pixels around must work:
 # what lies on the axis looks the same from all around, and so does all that is round about it, where there is no noise.
 _CHANGES, _WORKING = 0.1, 0.6
@@ -43,8 +43,7 @@ def stuck_pixels(values: np.ndarray) -> np.ndarray:
     told[place] = (values[:, place[0], place[1]] == first[place]).all(axis=0)
     if not told.any():
         return stuck
-    largest = float(np.max(values, where=np.isfinite(values), initial=0.0))
-    return _among_working(values, told, same, largest)
+    return _among_working(values, told, same)
 
 
 def _common(first: np.ndarray, working: np.ndarray, same: np.ndarray) -> np.ndarray:
@@ -57,10 +56,14 @@ def _common(first: np.ndarray, working: np.ndarray, same: np.ndarray) -> np.ndar
     return np.isin(first, often) | ~same
 
 
-def _among_working(values: np.ndarray, told: np.ndarray, same: np.ndarray, largest: float) -> np.ndarray:
+def _among_working(values: np.ndarray, told: np.ndarray, same: np.ndarray) -> np.ndarray:
     """The areas of pixels told of that have the same value, and around which pixels work."""
     from scipy import ndimage
 
+    finite = np.isfinite(values)
+    largest = float(np.max(values, where=finite, initial=0.0))
+    # That of a pixel without light has nothing to do with how much others change.
+    working = float(np.max(values, where=finite & ~told, initial=0.0))
     stuck = np.zeros(told.shape, bool)
     for value in np.unique(values[0][told]):
         areas, count = ndimage.label(told & (values[0] == value), _AROUND)
@@ -81,5 +84,5 @@ def _among_working(values: np.ndarray, told: np.ndarray, same: np.ndarray, large
                 apart = max(apart, abs(float(value) - usual))
             elif usual > _DARK_AROUND * value:
                 continue
-            stuck[wider] |= area & (apart > _CHANGES * largest)
+            stuck[wider] |= area & (apart > _CHANGES * working)
     return stuck
