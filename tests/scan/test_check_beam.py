@@ -100,7 +100,7 @@ def saturated_to(limit, views, photons):
 def test_pictures_without_noise_are_not_called_saturated(views):
     """All rays beside the object hold zero: that is no evidence where the object shows no noise either."""
     found = saturated_to(1.0, views, None)
-    assert found.verdict == UNKNOWN and "no noise" in found.text and found.remedy
+    assert found.verdict == UNKNOWN and found.remedy
 
 
 @pytest.mark.parametrize("limit", [0.95, 0.7])

@@ -46,7 +46,8 @@ def bad_rays(measured: Measured) -> dict[str, np.ndarray]:
     zero = dropped_rays(np.where(valid, projections, np.nan))
     # Few photons make few values, and that of air is one of them.
     zero &= _stands_out_as_value(projections[valid], 0.0)
-    pixels = stuck_pixels(np.where(valid, projections, np.nan).transpose(1, 0, 2))
+    column = float(np.median(measured.geometry.project_points(measured.axis[None])[:, 0, 0]))
+    pixels = stuck_pixels(np.where(valid, projections, np.nan).transpose(1, 0, 2), column)
     pixels |= _dead_pixels(projections, valid & ~pixels[:, None], measured.level)
     pixels |= (~valid & ~starved).mean(axis=1) > _MOSTLY
     dead = np.broadcast_to(pixels[:, None], valid.shape)
