@@ -1,4 +1,4 @@
-"""A beam that is not as bright as its open field, as a nuisance: a brighter one looks like scatter in the air."""
+"""A beam that is brighter than its open field, as a nuisance: beside the object it looks like scatter."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class OpenBeam(Nuisance):
     parameters = {"beam": Parameter("open fields", 1.0, 0.5, 2.0)}
     found_by = Found.RESIDUALS
     gauge = "scatter, which adds to dark rays as well: each is asked whether it explains the rays better"
-    cost = "one short fit, where rays beside the object are not as bright as the open field"
+    cost = "one short fit, where rays beside the object are brighter than the open field"
 
     @classmethod
     def gate(cls, evidence: Mapping[str, float]) -> Verdict:

@@ -55,15 +55,10 @@ class ScatteredLight(Nuisance):
         Parameters
         ----------
         evidence : mapping of str to float
-            ``most``, the most scatter in any ray, as a fraction of the open beam; ``beam``, the light beside the
-            object as such a fraction, 1 if missing; ``drift``, by how much the views' light there differs, missing
-            where too few rays tell it.
+            ``most``, the most scatter in any ray, as a fraction of the open beam; ``drift``, by how much the views'
+            light beside the object differs, missing where too few rays tell it.
         """
-        most, drift, dimmer = evidence["most"], evidence.get("drift"), 1.0 - evidence.get("beam", 1.0)
-        if most < _SHOWN and dimmer >= _SHOWN:
-            if drift is not None and drift <= _DRIFT * dimmer:
-                return Verdict(True, f"the beam may be {dimmer:.2g} dimmer than its open field")
-            return Verdict(False, f"the beam may be {dimmer:.2g} dimmer than its open field, or drift")
+        most, drift = evidence["most"], evidence.get("drift")
         if most < _SHOWN:
             return Verdict(False, f"the rays show {most:.1g} of the open beam at most")
         if drift is None:

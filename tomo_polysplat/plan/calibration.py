@@ -232,7 +232,7 @@ def _stage(
             break
         made.append(trial({k: v for k, v in last.fitted.items() if not k.startswith(name)} | moved))
     beam = begin.rays.beam()
-    if wanted.suspected and abs(beam - 1.0) > LEAST_SCATTER:
+    if wanted.suspected and beam - 1.0 > LEAST_SCATTER:
         made.append(trial({**begin.fitted, "beam": beam}))
     return made
 

@@ -2,8 +2,7 @@
 
 It shows in rays that pass beside the object, which are brighter than the open beam, and behind metal. Where there is
 some, short fits tell how much (`plan.calibration`), and the run begins anew with it. A beam that drifts shows
-beside the object as well: it differs from view to view. So does one that is dimmer than its open field, which no
-scatter explains.
+beside the object as well: it differs from view to view.
 """
 
 from __future__ import annotations
@@ -75,11 +74,9 @@ class Scattering(Decision):
         fitter = run.fitter
         rays = sample_rays(fitter.gaussians, fitter.scene, fitter.rays, 0, _RAYS)
         most, drift = _most(rays, lab.problem, straight=fitter.scene.quadrature is None), _drift(rays)
-        evidence = {"most": most, "beam": rays.beam()} | ({} if drift is None else {"drift": drift})
+        evidence = {"most": most} | ({} if drift is None else {"drift": drift})
         suspected = ScatteredLight.suspected(evidence)
-        return (
-            _by_short_fits(lab, suspected.why, evidence) if suspected.kept else _none(suspected.why, evidence)
-        )
+        return _by_short_fits(lab, most, evidence) if suspected.kept else _none(suspected.why, evidence)
 
 
 def _none(why: str, evidence: dict[str, float]) -> Answer:
@@ -87,7 +84,7 @@ def _none(why: str, evidence: dict[str, float]) -> Answer:
     return Answer({}, why, Status.ASKED, evidence)
 
 
-def _by_short_fits(lab: Lab, suspicion: str, evidence: dict[str, float]) -> Answer:
+def _by_short_fits(lab: Lab, most: float, evidence: dict[str, float]) -> Answer:
     """What short fits tell; what ends these does not end the run."""
     assert lab.calibrate is not None and lab.run is not None
     try:
@@ -100,7 +97,7 @@ def _by_short_fits(lab: Lab, suspicion: str, evidence: dict[str, float]) -> Answ
     if found["accepted"]["scatter"]:
         lab.run.restart = found
         return Answer(found["fitted"], found["why"], Status.ASKED, evidence)
-    return _none(f"{suspicion}; {found['why']}", evidence)
+    return _none(f"the rays may show {most:.2g} of the open beam; {found['why']}", evidence)
 
 
 def _most(rays: RaySample, problem: Problem, *, straight: bool) -> float:
