@@ -69,5 +69,7 @@ def more_likely(scatter: Mapping[str, float], beam: Mapping[str, float]) -> str:
     scatter, beam : mapping of str to float
         See `light_gate`.
     """
-    surely = scatter["held_out_after"] < (1 - _MARGIN) * beam["held_out_after"]
-    return "scatter" if surely and scatter["darkest_after"] < beam["darkest_after"] else "beam"
+    held_out = scatter["held_out_after"] / beam["held_out_after"]
+    darkest = 1 + _MARGIN if held_out < _FAR_BETTER else 1.0
+    surely = held_out < 1 - _MARGIN and scatter["darkest_after"] < darkest * beam["darkest_after"]
+    return "scatter" if surely else "beam"
