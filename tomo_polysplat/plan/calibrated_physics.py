@@ -97,13 +97,20 @@ def judge_scatter(
         not_taken.append(f"{words}: {_in_words(before, fit)}")
         if not ScatteredLight.possible(evidence):
             rivals.remove(fit)
-    alone = [(fit, _evidence(before, fit, suspected, [])) for fit in rivals]
-    confirmed = [(fit, evidence) for fit, evidence in alone if _kind(fit).gate(evidence).kept]
-    if suspected and confirmed:
-        likely = more_likely(*(evidence for _, evidence in confirmed)) if len(confirmed) == 2 else None
-        fit = next(fit for fit, _ in confirmed if likely is None or likely in fit.fitted)
-        return fit, f"{describe_scatter(fit.fitted)}, the likelier: {_in_words(before, fit)}"
+    likelier = _likelier(before, rivals) if suspected else None
+    if likelier is not None:
+        return likelier, f"{describe_scatter(likelier.fitted)}, the likelier: {_in_words(before, likelier)}"
     return None, "; ".join(not_taken)
+
+
+def _likelier(before: ShortFit, fits: Sequence[ShortFit]) -> ShortFit | None:
+    """What is taken of scatter and a brighter beam where neither beats the other; None where none beats neither."""
+    alone = [_evidence(before, fit, True, []) for fit in fits]
+    kept = [fit for fit, evidence in zip(fits, alone) if _kind(fit).gate(evidence).kept]
+    if len(fits) == 2 and any("beam" in fit.fitted for fit in kept):
+        likely = more_likely(*alone)
+        return next(fit for fit in fits if likely in fit.fitted)
+    return kept[0] if kept else None
 
 
 def _kind(fit: ShortFit) -> type[Nuisance]:
