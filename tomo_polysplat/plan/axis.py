@@ -29,6 +29,8 @@ logger = logging.getLogger(__name__)
 _TOLERATED, _SURE, _SURE_ALONE = 0.03, 4.0, 8.0
 # An error below this is as good as none: it costs less than a tenth of a decibel.
 _KNOWN = 0.05
+# An axis known to this has opposite rays that agree: which way the angles go need not be asked, which saves its time.
+_AGREED = 0.02
 # Columns of the two fits at least, and their steps.
 _FEWEST_COLUMNS, _STEPS = 24, 60
 
@@ -54,7 +56,7 @@ def find_axis(problem: Problem, means: Means, report: Callable[[float, str], Any
     found = _told_by_rays(problem)
     evidence = {} if found.doubt else {"offset": found.columns, "error": found.error}
     moves: dict[str, Any] = {}
-    if found.doubt or found.error > _KNOWN:
+    if found.doubt or found.error > _AGREED:
         _warn_of_angles(problem, found)
     needed = _SURE if means.time_budget is None else _SURE_ALONE
     words = _in_words(found)
