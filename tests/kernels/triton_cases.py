@@ -139,7 +139,8 @@ def know_numbers() -> None:
             first = kinds[0] is tl.tensor
             tensor, number = (one, other) if first else (other, one)
             # Minus zero is equal to zero, and one to 1.0.
-            key = first, number or str(number), kinds, tensor.dtype.name, id(tensor.shape), rest, *named.items()
+            value, like = number or str(number), (tensor.dtype.name, id(tensor.shape))
+            key = kinds, value, like, rest, *named.items()
             if key not in made:
                 both = promote(self, one, other, *rest, **named)
                 if both[not first] is not tensor:
