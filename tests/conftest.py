@@ -1,11 +1,19 @@
-"""What every test folder shares: which devices there are, and GPU tests that cannot vanish unnoticed."""
+"""What every test folder shares: which devices there are, and GPU tests that cannot vanish unnoticed.
+
+Torch is imported where it is used: the process that hands tests to others, which wait for it, needs none.
+"""
+
+from __future__ import annotations
 
 import gc
 import os
 import signal
+from typing import TYPE_CHECKING
 
 import pytest
-import torch
+
+if TYPE_CHECKING:
+    import torch
 
 
 def pytest_configure(config):
@@ -32,6 +40,16 @@ def pytest_collection_modifyitems(config, items):
         begin_with_the_longest(items)
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_collection(session):
+    # Nearly all that is imported stays: to look through it again and again takes a tenth of the time.
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
+
+
 def pytest_collection_finish(session):
     # What is loaded by now stays. The garbage collector would look through all of it a hundred times, for 0.2 s each.
     gc.collect()
@@ -43,7 +61,11 @@ def pytest_unconfigure(config):
 
 
 def pytest_runtest_setup(item):
-    if item.get_closest_marker("gpu") is None or torch.cuda.is_available():
+    if item.get_closest_marker("gpu") is None:
+        return
+    import torch
+
+    if torch.cuda.is_available():
         return
     if os.environ.get("POLYSPLAT_REQUIRE_GPU") == "1":
         pytest.fail("POLYSPLAT_REQUIRE_GPU=1, but torch finds no CUDA device", pytrace=False)
@@ -53,6 +75,8 @@ def pytest_runtest_setup(item):
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item):
     """Fail a test that leaves torch with other threads: the tests after it took up to six times as long."""
+    import torch
+
     before = torch.get_num_threads()
     result = yield
     if (left := torch.get_num_threads()) != before:
@@ -64,6 +88,8 @@ def pytest_runtest_call(item):
 @pytest.fixture(scope="session")
 def devices() -> list[torch.device]:
     """Every device of this machine, CPU first."""
+    import torch
+
     return [torch.device("cpu"), *(torch.device("cuda", k) for k in range(torch.cuda.device_count()))]
 
 

@@ -6,6 +6,7 @@ machine has: a container, or a queue's job, has a control group with a limit.
 
 from __future__ import annotations
 
+import functools
 import os
 import re
 import threading
@@ -38,6 +39,8 @@ _VERSIONS = {
     "": ("memory.max", "memory.current", "inactive_file "),
     "memory": ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file "),
 }
+# The older version writes a number near 2**63 where there is no limit.
+_NO_LIMIT = 2**60
 _STATM = Path("/proc/self/statm")
 _UNITS = {"": 1.0} | {
     f"{prefix}{binary}b": (1024.0 if binary else 1000.0) ** power
@@ -124,7 +127,9 @@ def available_memory() -> int | None:
         for line in _MEMINFO.read_text(encoding="ascii").splitlines():
             if line.startswith("MemAvailable:"):
                 free.append(int(line.split()[1]) * 1024)
-    free += _left_in_groups()
+    with suppress(OSError):
+        for folder, names in _groups(_OWN_GROUPS.read_text(encoding="utf-8"), _GROUPS):
+            free += _left_in(folder, *names, min(free, default=_NO_LIMIT))
     return min(free, default=None)
 
 
@@ -176,25 +181,31 @@ def _held() -> int:
     return 0
 
 
-def _left_in_groups() -> list[int]:
-    """Bytes left in the control groups of this process, and in those around them, that have a limit."""
-    left = []
-    with suppress(OSError):
-        for line in _OWN_GROUPS.read_text(encoding="utf-8").splitlines():
-            _, controllers, path = line.split(":", 2)
-            if controllers in ("", "memory"):
-                root = _GROUPS / controllers
-                own = root / path.lstrip("/")
-                # Inside a container the path may be that outside of it, and its own group is the root.
-                for folder in (own, *own.parents):
-                    if folder == root or root in folder.parents:
-                        left += _left_in(folder, *_VERSIONS[controllers])
-    return left
+# Asked for every picture of a folder.
+@functools.lru_cache(maxsize=4)
+def _groups(own_groups: str, groups: Path) -> list[tuple[Path, tuple[str, str, str]]]:
+    """Folders of the control groups of a process that may limit its memory, and of those around them."""
+    found = []
+    for line in own_groups.splitlines():
+        _, controllers, path = line.split(":", 2)
+        if controllers in ("", "memory"):
+            root = groups / controllers
+            own = root / path.lstrip("/")
+            # Inside a container the path may be that outside of it, and its own group is the root.
+            around = [folder for folder in (own, *own.parents) if folder == root or root in folder.parents]
+            found += [(folder, _VERSIONS[controllers]) for folder in around]
+    return found
 
 
-def _left_in(folder: Path, limit: str, usage: str, files: str) -> list[int]:
+def _left_in(folder: Path, limit: str, usage: str, files: str, least: float) -> list[int]:
+    """Bytes left in a group that has a limit, where they may be less than the ``least`` found so far."""
     with suppress(OSError, ValueError):  # "max" is no number, and no limit
-        most, taken = (int((folder / name).read_text(encoding="ascii")) for name in (limit, usage))
+        most = int((folder / limit).read_text(encoding="ascii"))
+        if most >= _NO_LIMIT:
+            return []
+        taken = int((folder / usage).read_text(encoding="ascii"))
+        if most - taken >= least:
+            return []
         stat = (folder / "memory.stat").read_text(encoding="ascii").splitlines()
         spare = sum(int(line.split()[1]) for line in stat if line.startswith(files))
         return [max(most - taken + spare, 0)]

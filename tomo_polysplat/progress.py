@@ -111,9 +111,10 @@ def _bars() -> tuple[Any, bool]:
         # Of a notebook without ipywidgets, where bars are plain text.
         warnings.simplefilter("ignore")
         from tqdm.auto import tqdm
-        from tqdm.notebook import tqdm_notebook
 
-    return tqdm, issubclass(tqdm, tqdm_notebook)
+    # Loaded by now if it was chosen; elsewhere it would load ipywidgets in vain.
+    notebook = sys.modules.get("tqdm.notebook")
+    return tqdm, notebook is not None and issubclass(tqdm, notebook.tqdm_notebook)
 
 
 def _is_terminal(stream: Any) -> bool:

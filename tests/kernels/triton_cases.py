@@ -5,6 +5,7 @@ wrong, as JSON.
 """
 
 import gc
+import inspect
 import json
 import math
 import sys
@@ -115,7 +116,7 @@ def know_types() -> None:
 
 
 def know_numbers() -> None:
-    """Let the interpreter promote no types where two agree, and make a tensor of a number once: a third of its time.
+    """Let the interpreter promote no types where two agree, and make a tensor of a number once: half of its time.
 
     What it makes of a number is read only, so that nothing could change it for another.
     """
@@ -125,25 +126,55 @@ def know_numbers() -> None:
     if not hasattr(semantic, "TritonSemantic"):  # before Triton 3.4
         return
     promote, made = semantic.TritonSemantic.binary_op_type_checking_impl, {}
-    usual = {"fp32", "fp64", "int1", "int32", "int64"}
+    usual, numbers = {"fp32", "fp64", "int1", "int32", "int64"}, {int, float}
 
     def promoted(self, one, other, *rest, **named):
-        if type(one) is tl.tensor and one.dtype.name in usual:
-            if type(other) is tl.tensor:
-                if one.type is other.type or (
-                    one.dtype.name == other.dtype.name and one.shape is other.shape
-                ):
-                    return one, other
-            elif one.dtype.name == "fp32" and type(other) in (int, float):
-                # Minus zero is equal to zero.
-                key = other or str(other), one.dtype.name, id(one.shape)
-                if key not in made:
-                    made[key] = promote(self, one, other, *rest, **named)[1]
-                    made[key].handle.data.setflags(write=False)
-                return one, made[key]
+        kinds = type(one), type(other)
+        if kinds == (tl.tensor, tl.tensor):
+            if one.dtype.name in usual and (
+                one.type is other.type or (one.dtype.name == other.dtype.name and one.shape is other.shape)
+            ):
+                return one, other
+        elif tl.tensor in kinds and (kinds[0] in numbers or kinds[1] in numbers):
+            first = kinds[0] is tl.tensor
+            tensor, number = (one, other) if first else (other, one)
+            # Minus zero is equal to zero, and one to 1.0.
+            value, like = number or str(number), (tensor.dtype.name, id(tensor.shape))
+            key = kinds, value, like, rest, *named.items()
+            if key not in made:
+                both = promote(self, one, other, *rest, **named)
+                if both[not first] is not tensor:
+                    return both
+                made[key] = both[first]
+                made[key].handle.data.setflags(write=False)
+            return (one, made[key]) if first else (made[key], other)
         return promote(self, one, other, *rest, **named)
 
     semantic.TritonSemantic.binary_op_type_checking_impl = promoted
+
+
+def call_at_once() -> None:
+    """Let the interpreter call functions of the language without copying names, and unwrap only what is wrapped."""
+    import triton.language as tl
+    from triton.runtime import interpreter
+
+    # An older Triton patches otherwise.
+    if [*inspect.signature(interpreter._patch_attr).parameters][2:] != ["member", "builder", "scope"]:
+        return
+    unwrap, plain = tl.core._unwrap_if_constexpr, {tl.tensor, int, float, bool, type(None)}
+
+    def patch(of, name, member, builder, scope):
+        # Most wrap the function itself, to check that `_semantic` is given.
+        function, given = getattr(member, "__wrapped__", member), interpreter.interpreter_semantic
+
+        def call(*args, **named):
+            named["_semantic"] = given
+            return function(*args, **named)
+
+        scope.set_attr(of, name, call)
+
+    interpreter._patch_attr = patch
+    tl.core._unwrap_if_constexpr = lambda of: of if type(of) in plain else unwrap(of)
 
 
 def skip_unread_sums() -> None:
@@ -166,6 +197,7 @@ def main() -> None:
     hurry()
     know_types()
     know_numbers()
+    call_at_once()
     skip_unread_sums()
     np.seterr(all="ignore")  # the interpreter computes masked lanes too
     problems = {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import sys
 import threading
 import time
 from typing import Any
@@ -11,7 +12,7 @@ __all__ = ["compiled_seconds", "track_compiling", "working_time"]
 
 _now = time.perf_counter
 _lock = threading.Lock()
-_tracked = False
+_tracked = _tracked_triton = False
 _seconds = 0.0
 
 
@@ -39,14 +40,21 @@ def add_waited(seconds: float) -> None:
 
 
 def track_compiling() -> None:
-    """Listen to numba's and triton's compilers from now on; a compiler that does not tell is not counted."""
-    global _tracked
+    """Listen to numba's and triton's compilers from now on; a compiler that does not tell is not counted.
+
+    Triton is left alone where it is not loaded and torch finds no GPU that would need it: importing it takes 0.3 s.
+    """
+    global _tracked, _tracked_triton
+    import torch
+
     with _lock:
-        if _tracked:
-            return
-        _tracked = True
-    _listen_to_numba()
-    _listen_to_triton()
+        numba_too, _tracked = not _tracked, True
+        triton_too = not _tracked_triton and ("triton" in sys.modules or torch.cuda.is_available())
+        _tracked_triton = _tracked_triton or triton_too
+    if numba_too:
+        _listen_to_numba()
+    if triton_too:
+        _listen_to_triton()
 
 
 def _listen_to_numba() -> None:

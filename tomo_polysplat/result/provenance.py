@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable
 
 import numpy as np
@@ -59,6 +60,7 @@ def _lengths(lengths: Iterable[float], unit: str) -> str:
     return " x ".join(f"{length:.4g}" for length in lengths) + f" {unit}"
 
 
+@functools.cache
 def _versions() -> list[str]:
     found = ((name, installed_version(name)) for name in _PACKAGES)
     return [f"{name} {version}" for name, version in found if version]

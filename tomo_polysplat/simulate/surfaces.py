@@ -32,7 +32,7 @@ def crossed_voxels(labels: np.ndarray, per_voxel: tuple[int, int]) -> np.ndarray
 
 # Compiled: it takes arrays and numbers, and no objects that hold them.
 @njit(nogil=True, cache=True)
-def sample_voxels(corners, size, closed, counts, parts, values, marks, mean, marked):
+def sample_voxels(corners, size, closed, counts, parts, values, marks, means, mean, marked):
     """Mean value of the sample points of each voxel, and whether any of them is of a marked part.
 
     Parameters
@@ -47,14 +47,18 @@ def sample_voxels(corners, size, closed, counts, parts, values, marks, mean, mar
         Solids; where several hold a point, the last of them counts.
     values, marks : (parts + 1,) arrays
         By label: 0 is empty space, n part n - 1.
+    means : bool
+        Whether mean values are asked for; if not, voxels that nothing marked comes near are passed over.
     mean, marked : (n,) arrays
         Written to.
     """
     round_axes, centre, _, half_extent = parts
     near = np.empty(len(round_axes), np.int64)
-    point = np.empty(3)
+    labels = np.empty((counts[2], counts[1], counts[0]), np.int64)
+    points = np.empty((3, counts.max()))
+    turned = np.empty((3, 3, counts.max()))
     for voxel in range(len(corners)):
-        count = np.intp(0)  # a plain 0 is a type of its own, for which `_label` would be compiled as well
+        count, may_be_marked = 0, marks[0]
         for part in range(len(round_axes) - 1, -1, -1):
             apart = False
             for a in range(3):
@@ -63,16 +67,22 @@ def sample_voxels(corners, size, closed, counts, parts, values, marks, mean, mar
             if not apart:
                 near[count] = part
                 count += 1
+                may_be_marked = may_be_marked or marks[part + 1]
+        marked[voxel] = False
+        if not (means or may_be_marked):
+            continue
+        for a in range(3):
+            for i in range(counts[a]):
+                points[a, i] = corners[voxel, a] + _place(i, counts[a], closed[a]) * size[a]
+        labels[:] = 0
+        for n in range(count):
+            _label(labels, near[n], points, turned, parts)
         total, found = 0.0, False
         for k in range(counts[2]):
-            point[2] = corners[voxel, 2] + _place(k, counts[2], closed[2]) * size[2]
             for j in range(counts[1]):
-                point[1] = corners[voxel, 1] + _place(j, counts[1], closed[1]) * size[1]
                 for i in range(counts[0]):
-                    point[0] = corners[voxel, 0] + _place(i, counts[0], closed[0]) * size[0]
-                    label = _label(point, near, count, parts)
-                    total += values[label]
-                    found = found or marks[label]
+                    total += values[labels[k, j, i]]
+                    found = found or marks[labels[k, j, i]]
         mean[voxel] = total / (counts[0] * counts[1] * counts[2])
         marked[voxel] = found
 
@@ -86,20 +96,24 @@ def _place(index, count, closed):
 
 
 @called()
-def _label(point, near, count, parts):
-    """Label of the first of the parts ``near`` that holds a point, or 0."""
+def _label(labels, part, points, turned, parts):
+    """Label the points (nz, ny, nx) that a part holds and that no other part has; ``turned`` is room to work in."""
     round_axes, centre, to_local, _ = parts
-    for n in range(count):
-        part = near[n]
-        around, inside = 0.0, True
-        for a in range(3):
-            value = 0.0
-            for b in range(3):
-                value += to_local[part, a, b] * (point[b] - centre[part, b])
-            if a < round_axes[part]:
-                around += value * value
-            else:
-                inside = inside and abs(value) <= 1.0
-        if inside and around <= 1.0:
-            return part + 1
-    return 0
+    nz, ny, nx = labels.shape
+    for a in range(3):
+        for b in range(3):
+            for i in range(points.shape[1]):
+                turned[a, b, i] = to_local[part, b, a] * (points[a, i] - centre[part, a])
+    rounds = round_axes[part]
+    for k in range(nz):
+        for j in range(ny):
+            for i in range(nx):
+                reach = 0.0  # more than 1 outside
+                for b in range(3):
+                    value = turned[0, b, i] + turned[1, b, j] + turned[2, b, k]
+                    if b < rounds:
+                        reach += value * value
+                    elif abs(value) > 1.0:
+                        reach += 2.0
+                if labels[k, j, i] == 0 and reach <= 1.0:
+                    labels[k, j, i] = part + 1

@@ -62,8 +62,9 @@ def voxelise_truth(
     mu = np.array([0.0, *(p.density * values[phantom.materials.index(p.material)] for p in phantom.parts)])
     metal = np.array([False, *(p.metal and p.density > 0 for p in phantom.parts)])
     grid = _Grid(shape, lower, (upper - lower) / np.array(shape[::-1]), planar)
+    solids = (*phantom.solids()[:3], np.array([part.shape.half_extent for part in phantom.parts]))
     slices = run_tasks(
-        lambda k: _truth_slice(phantom, mu, metal, grid, samples, k), [(k,) for k in range(shape[0])]
+        lambda k: _truth_slice(solids, mu, metal, grid, samples, k), [(k,) for k in range(shape[0])]
     )
     return np.stack([s[0] for s in slices]), np.stack([s[1] for s in slices])
 
@@ -82,26 +83,25 @@ class _Grid:
         return np.array([samples, samples, 1 if self.planar else samples])
 
 
-def _truth_slice(phantom, mu, metal, grid, samples, index):
+def _truth_slice(solids, mu, metal, grid, samples, index):
     """Attenuation and mask (ny, nx) of one slice."""
-    labels = _labels(phantom, grid, index)
+    labels = _labels(solids, grid, index)
     middle = labels[len(labels) // 2, _COARSE // 2 + 1 :: _COARSE, _COARSE // 2 + 1 :: _COARSE]
     middle = middle[: grid.shape[1], : grid.shape[2]]
     values, marks = mu[middle], metal[middle]
     crossed = np.argwhere(crossed_voxels(labels, (_COARSE, _COARSE)))
     corners = grid.lower + np.insert(crossed[:, ::-1], 2, index, axis=1) * grid.voxel
     mean, (within, touching) = np.empty(len(crossed)), np.empty((2, len(crossed)), bool)
-    half_extent = np.array([part.shape.half_extent for part in phantom.parts])
-    fixed = (grid.points(samples), (*phantom.solids()[:3], half_extent), mu, metal)
+    fixed = (grid.points(samples), solids, mu, metal)
     to_faces = np.array([True, True, not grid.planar])
-    sample_voxels(corners, grid.voxel, to_faces, *fixed, np.empty_like(mean), touching)
+    sample_voxels(corners, grid.voxel, to_faces, *fixed, False, np.empty_like(mean), touching)
     # The means of equal cells are the voxel's; its faces would count twice as much.
-    sample_voxels(corners, grid.voxel, np.zeros(3, bool), *fixed, mean, within)
+    sample_voxels(corners, grid.voxel, np.zeros(3, bool), *fixed, True, mean, within)
     values[tuple(crossed.T)], marks[tuple(crossed.T)] = mean, touching | within
     return values.astype(np.float32), marks
 
 
-def _labels(phantom, grid, index):
+def _labels(solids, grid, index):
     """Labels of the coarse points of a slice, and of one more on every side."""
     per_voxel = grid.points(_COARSE)
     beside = np.array([1, 1, 0 if grid.planar else 1])
@@ -109,16 +109,11 @@ def _labels(phantom, grid, index):
     start = grid.lower + np.array([0.0, 0.0, index]) * grid.voxel + (0.5 - beside) * step
     counts = np.array([grid.shape[2], grid.shape[1], 1]) * per_voxel + 2 * beside
     labels = np.zeros(counts[::-1], np.int32)
-    solids = [part.shape for part in phantom.parts]
-    centres, halves = (
-        np.array([getattr(solid, name) for solid in solids]).reshape(-1, 3)
-        for name in ("centre", "half_extent")
-    )
+    round_axes, centres, to_local, halves = solids
     first = np.ceil((centres - halves - start) / step - 1e-6).astype(np.int64)
     last = np.floor((centres + halves - start) / step + 1e-6).astype(np.int64) + 1
     first, last = np.maximum(first, 0), np.minimum(last, counts)
     for k in np.flatnonzero((first < last).all(axis=1)):
-        solid, label = solids[k], int(k) + 1
-        ends = first[k], last[k]
-        paint_labels(labels, start, step, *ends, label, solid.round_axes, solid.centre, solid.to_local)
+        solid = round_axes[k], centres[k], to_local[k]
+        paint_labels(labels, start, step, first[k], last[k], int(k) + 1, *solid)
     return labels
