@@ -22,6 +22,7 @@ from numba.extending import intrinsic, lower_builtin, models, register_model, ty
 __all__ = [
     "HALF",
     "LANES",
+    "QUARTER",
     "add_blocks",
     "ceiling",
     "floor",
@@ -35,11 +36,13 @@ __all__ = [
     "power_of_two",
     "ramp",
     "store",
+    "store_quarters",
     "within",
 ]
 
 LANES = 16
 HALF = LANES // 2
+QUARTER = LANES // 4
 
 _FLOAT, _INT = ir.FloatType(), ir.IntType(32)
 _VECTOR, _BLOCK = ir.VectorType(_FLOAT, LANES), ir.VectorType(_FLOAT, HALF)
@@ -285,28 +288,48 @@ def power_of_two(typing, value):
 
 
 @_intrinsic
-def within(typing, size, most, value):
-    """``value`` in the lanes where ``size <= most``, and 0 in the others, whatever ``value`` is there."""
+def within(typing, size, most, place, end, value):
+    """``value`` in the lanes where ``size <= most`` and ``place <= end``, and 0 in the others, whatever it is there."""
 
     def generate(context, builder, signature, values):
-        inside = builder.fcmp_ordered("<=", values[0], _spread(builder, values[1]))
-        return builder.select(inside, values[2], _all(0.0))
+        size, most, place, end, value = values
+        inside, before = (
+            builder.fcmp_ordered("<=", a, _spread(builder, b)) for a, b in ((size, most), (place, end))
+        )
+        # Two choices, one after the other, would cost the compiler's fast root.
+        return builder.select(builder.and_(inside, before), value, _all(0.0))
 
-    return _lanes(_lanes, types.float32, _lanes), generate
+    return _lanes(_lanes, types.float32, _lanes, types.float32, _lanes), generate
+
+
+@_intrinsic
+def store_quarters(typing, array, start, value):
+    """Write sums of a value's lanes, of every fourth, to ``array[start : start + QUARTER]``, for `lane_sums`."""
+
+    def generate(context, builder, signature, values):
+        array, start, value = values
+        for count in (HALF, QUARTER):
+            parts = (builder.shuffle_vector(value, value, _mask(range(k, k + count))) for k in (0, count))
+            value = builder.fadd(*parts, flags=_FLAGS)
+        kind = ir.VectorType(_FLOAT, QUARTER)
+        pointer = _pointer(context, builder, signature.args[0], array, start, kind)
+        builder.store(value, pointer, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, _lanes), generate
 
 
 @_intrinsic
 def lane_sums(typing, array, start):
-    """Sums of ``LANES`` blocks: lane k is ``sum(array[start + k LANES : start + (k + 1) LANES])``, likewise.
+    """Sums of ``LANES`` parts: lane k is ``sum(array[start + k QUARTER : start + (k + 1) QUARTER])``, likewise.
 
-    Two vectors at a time become one that holds sums of half as many lanes of either: 15 steps, where to add up the
-    lanes of one vector after the other takes 64.
+    Two vectors at a time become one that holds sums of half as many numbers of either.
     """
 
     def generate(context, builder, signature, values):
         source = _pointer(context, builder, signature.args[0], *values)
-        vectors = [builder.load(builder.gep(source, [_INT(k)]), align=4) for k in range(LANES)]
-        half = LANES // 2
+        vectors = [builder.load(builder.gep(source, [_INT(k)]), align=4) for k in range(QUARTER)]
+        half = QUARTER // 2
         while half:
             lower = [k for k in range(2 * LANES) if k // half % 2 == 0]
             parts = [_mask(k + shift for k in lower) for shift in (0, half)]

@@ -169,7 +169,7 @@ def _gather_range(
     group, out, grads = np.zeros(SIZE * GROUP), np.empty(NUMBERS * GROUP), np.empty(12 * GROUP)
     record, rows = np.empty((GROUP, NUMBERS), np.float32), np.empty(2 * LANES, np.float32)
     moments = np.empty((MOMENTS + len(weight)) * GROUP)
-    acc = np.zeros(len(moments) * LANES, np.float32)
+    acc = np.zeros(len(moments) * QUARTER, np.float32)
     corner, edges = (first[0], first[1], first[2]), (spacing[0], spacing[1], spacing[2])
     for n in range(start, stop, GROUP):
         some = min(GROUP, stop - n)
@@ -178,7 +178,7 @@ def _gather_range(
         for k in range(some):
             _gather(n + k, k, record, weight, cutoff, nx, grad_volume, rows, acc)
         for m in range(MOMENTS + len(weight)):
-            store(moments, m * GROUP, lane_sums(acc, m * GROUP * LANES))
+            store(moments, m * GROUP, lane_sums(acc, m * GROUP * QUARTER))
         pull_back(edges, group, moments, grads)
         take_gradients(n, some, group, grads, grad_position, grad_scale, grad_rotation)
         for c in range(len(weight)):
