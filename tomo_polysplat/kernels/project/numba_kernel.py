@@ -15,6 +15,7 @@ from tomo_polysplat.kernels.numba_group import (
     SIZE,
     add_where,
     gaussian_of,
+    in_threes,
     put_group,
     take_gradients,
     three,
@@ -36,6 +37,7 @@ from tomo_polysplat.kernels.numba_lanes import (
 from tomo_polysplat.kernels.project.numba_footprint import (
     MOMENTS,
     RECORD,
+    ends_of,
     numbers_of,
     pull_back,
     pull_back_view,
@@ -55,9 +57,9 @@ def _across(rec, j, two):
 
     They are the same in all rows. With ``two`` the columns of either half are the same.
     """
-    x0, both = np.float32(j) - rec[0], np.float32(2)
+    x0 = np.float32(j) - rec[0]
     x = halves(x0, x0 + np.float32(0 if two else HALF)) + ramp()
-    return rec[2] * x, rec[5] + x * (both * rec[6] + x * rec[8]), both * rec[7] + both * rec[9] * x
+    return rec[2] * x, rec[5] + x * (rec[6] + x * rec[8]), rec[7] + rec[9] * x
 
 
 @njit(inline="always")
@@ -86,17 +88,19 @@ def _splat(v, first, last, record, span, weight, cutoff, image):
     cut, zero = squared(cutoff), np.float32(0)
     rows, channels, stride = image.shape[1:]
     three = channels > 1
-    for n in range(record.shape[1]):
-        low, high = max(first, span[v, n, 0]), min(last, span[v, n, 1])
+    for n in range(weight.shape[1]):
+        numbers, k = record[v, n // GROUP], n % GROUP
+        i0, i1, j0, j1 = ends_of(span[v, n // GROUP], k)
+        low, high = max(first, i0), min(last, i1)
         if low >= high:
             continue
-        rec = numbers_of(record, v, n)
+        rec = numbers_of(numbers, k)
         # Two short rows at once.
-        two = span[v, n, 3] - span[v, n, 2] <= HALF
+        two = j1 - j0 <= HALF
         each, bottom = 2 if two else 1, np.float32(high) - np.float32(0.5) - rec[1]
         for c in range(0, channels, 3):
             w0, w1, w2 = weight[c, n], weight[c + 1, n] if three else zero, weight[c + 2, n] if three else zero
-            for j in range(span[v, n, 2], span[v, n, 3], LANES):
+            for j in range(j0, j1, LANES):
                 across, y = _across(rec, j, two), _down(rec, low, two)
                 at = ((v * rows + low) * channels + c) * stride + j
                 for i in range(low, high, each):
@@ -110,21 +114,21 @@ def _splat(v, first, last, record, span, weight, cutoff, image):
 
 
 @njit(inline="always")
-def _gather(v, n, k, record, span, weight, cutoff, grad_image, acc):
+def _gather(v, n, k, numbers, ends, weight, cutoff, grad_image, acc):
     """Write to ``acc``, as those of Gaussian ``k`` of a group, the sums over the footprint of Gaussian ``n`` in view
     ``v``, by quarters: the moments in the order of ``pull_back``, then the gradient of its weight in every channel."""
     cut, half, one, none = squared(cutoff), np.float32(-0.5), np.float32(1), np.float32(0)
     rows, channels, stride = grad_image.shape[1:]
     three = channels > 1
-    rec, low, high = numbers_of(record, v, n), span[v, n, 0], span[v, n, 1]
-    two = span[v, n, 3] - span[v, n, 2] <= HALF
+    rec, (low, high, j0, j1) = numbers_of(numbers, k), ends_of(ends, k)
+    two = j1 - j0 <= HALF
     each, bottom = 2 if two else 1, np.float32(high) - np.float32(0.5) - rec[1]
     zero = halves(none, none)
     m0 = m1 = m2 = m3 = m4 = m5 = m6 = m7 = m8 = m9 = m10 = zero
     for c in range(0, channels, 3):
         w0, w1, w2 = weight[c, n], weight[c + 1, n] if three else none, weight[c + 2, n] if three else none
         s0 = s1 = s2 = zero
-        for j in range(span[v, n, 2], span[v, n, 3], LANES):
+        for j in range(j0, j1, LANES):
             across, y = _across(rec, j, two), _down(rec, low, two)
             at = ((v * rows + low) * channels + c) * stride + j
             for i in range(low, high, each):
@@ -166,11 +170,12 @@ def _gather_group(
 ):
     """Fill ``of_group`` with the moments of a group in view ``v``, and with whether there is a footprint; add the
     gradients of the weights to ``of_weight``."""
-    of_group[MOMENTS * GROUP :] = 0.0
+    of_group[MOMENTS * GROUP :] = np.float32(0)
+    numbers, ends = record[v, first // GROUP], span[v, first // GROUP]
     for k in range(some):
-        if span[v, first + k, 0] < span[v, first + k, 1]:
-            of_group[MOMENTS * GROUP + k] = 1.0
-        _gather(v, first + k, k, record, span, weight, cutoff, grad_image, acc)
+        if ends[k] < ends[GROUP + k]:
+            of_group[MOMENTS * GROUP + k] = np.float32(1)
+        _gather(v, first + k, k, numbers, ends, weight, cutoff, grad_image, acc)
     for m in range(MOMENTS):
         store(of_group, m * GROUP, lane_sums(acc, m * GROUP * QUARTER))
     for c in range(len(weight)):
@@ -221,7 +226,8 @@ def _gather_range(
     (groups, views, 12) those of the views, summed over each group: ``start`` begins one."""
     group, grads = np.zeros(SIZE * GROUP), np.empty(12 * GROUP)
     # The last number says whether there is a footprint.
-    of_group, of_weight = np.zeros((MOMENTS + 1) * GROUP), np.empty(len(weight) * GROUP, np.float32)
+    of_group = np.zeros((MOMENTS + 1) * GROUP, np.float32)
+    of_weight = np.empty(len(weight) * GROUP, np.float32)
     acc = np.zeros((MOMENTS + len(weight)) * GROUP * QUARTER, np.float32)
     for first in range(start, stop, GROUP):
         some = min(GROUP, stop - first)
@@ -244,21 +250,16 @@ def _gather_range(
                 grad_weight[c, first + k] = of_weight[c * GROUP + k]
 
 
-def _in_threes(weight):
-    """The same, with zeros for channels that are missing to a multiple of three, as the kernels want them."""
-    missing = 0 if len(weight) == 1 else -len(weight) % 3
-    return np.concatenate([weight, np.zeros((missing, weight.shape[1]), np.float32)]) if missing else weight
-
-
 def forward(position, scale, rotation, weight, views: DetectorViews, cutoff: float):
     """Images (channels, views, rows, columns) float32 without the pixel factor, skipped pairs, and the state
     that :func:`backward` takes. Arguments as for the reference, as float32 numpy arrays."""
-    count, channels, weight = len(position), len(weight), _in_threes(weight)
-    record = np.empty((len(views), count, RECORD), np.float32)
-    span = np.empty((len(views), count, 4), np.int32)
+    count, channels, weight = len(position), len(weight), in_threes(weight)
+    groups = -(-count // GROUP)
+    record = np.empty((len(views), groups, RECORD * GROUP), np.float32)
+    span = np.empty((len(views), groups, 4 * GROUP), np.int32)
     inverse = views.inverse
     scene = (position, scale, rotation, views.cone, views.planar, views.origin, inverse, views.matrix)
-    parts = shares(count, 4, cpu_threads())
+    parts = shares(groups, 4, cpu_threads())
     skipped = sum(
         run_tasks(lambda a, b: set_up(a, b, *scene, cutoff, views.rows, views.columns, record, span), parts)
     )
@@ -277,7 +278,7 @@ def backward(
     With ``of_views`` that of ``views.vectors`` comes fifth, (views, 4, 3) float64, without what the pixel factor adds.
     """
     record, span, inverse = state
-    channels, weight = len(weight), _in_threes(weight)
+    channels, weight = len(weight), in_threes(weight)
     padded = np.zeros((len(views), views.rows, len(weight), views.columns + LANES), np.float32)
     padded[..., :channels, : views.columns] = grad_image.transpose(1, 2, 0, 3)
     grads = tuple(np.zeros_like(a) for a in (position, scale, rotation, weight))
