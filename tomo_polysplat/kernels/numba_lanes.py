@@ -16,7 +16,7 @@ from typing import Any
 
 from llvmlite import ir
 from numba import types
-from numba.core.cgutils import get_or_insert_function
+from numba.core.cgutils import for_range_slice, get_or_insert_function
 from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
 
 __all__ = [
@@ -25,6 +25,7 @@ __all__ = [
     "QUARTER",
     "add_blocks",
     "ceiling",
+    "fetch",
     "floor",
     "larger",
     "smaller",
@@ -45,6 +46,7 @@ HALF = LANES // 2
 QUARTER = LANES // 4
 
 _FLOAT, _INT = ir.FloatType(), ir.IntType(32)
+_BYTE, _LINE = ir.IntType(8), 64  # bytes of a line of a cache
 _VECTOR, _BLOCK = ir.VectorType(_FLOAT, LANES), ir.VectorType(_FLOAT, HALF)
 _INTS = ir.VectorType(_INT, LANES)
 _FLAGS = ("contract",)
@@ -187,6 +189,24 @@ def load_blocks(typing, array, start, apart):
         return _joined(builder, *parts)
 
     return _lanes(array, types.intp, types.intp), generate
+
+
+@_intrinsic
+def fetch(typing, array):
+    """Have the C-contiguous array brought near, to be read soon."""
+
+    def generate(context, builder, signature, values):
+        whole = context.make_array(signature.args[0])(context, builder, values[0])
+        start = builder.bitcast(whole.data, _BYTE.as_pointer())
+        kind = ir.FunctionType(ir.VoidType(), [_BYTE.as_pointer(), _INT, _INT, _INT])
+        function = get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        length = builder.mul(whole.nitems, whole.itemsize)
+        with for_range_slice(builder, length.type(0), length, length.type(_LINE)) as (at, _):
+            # To be read, into the nearest cache, as data.
+            builder.call(function, [builder.gep(start, [at]), _INT(0), _INT(3), _INT(1)])
+        return context.get_dummy_value()
+
+    return types.void(array), generate
 
 
 @_intrinsic

@@ -25,6 +25,7 @@ from tomo_polysplat.kernels.numba_lanes import (
     LANES,
     QUARTER,
     add_blocks,
+    fetch,
     halves,
     inverse_root,
     lane_sums,
@@ -171,7 +172,12 @@ def _gather_group(
     """Fill ``of_group`` with the moments of a group in view ``v``, and with whether there is a footprint; add the
     gradients of the weights to ``of_weight``."""
     of_group[MOMENTS * GROUP :] = np.float32(0)
-    numbers, ends = record[v, first // GROUP], span[v, first // GROUP]
+    g, last = first // GROUP, v + 1 == len(record)
+    numbers, ends = record[v, g], span[v, g]
+    # Of the next view, or of the next group: they lie far apart in memory.
+    to, of = 0 if last else v + 1, min(g + 1, record.shape[1] - 1) if last else g
+    fetch(record[to, of])
+    fetch(span[to, of])
     for k in range(some):
         if ends[k] < ends[GROUP + k]:
             of_group[MOMENTS * GROUP + k] = np.float32(1)
