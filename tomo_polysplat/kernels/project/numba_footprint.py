@@ -1,9 +1,9 @@
 """Where a Gaussian falls on the detector, and the way back from there to its gradients.
 
 Differences and cross products, which cancel, are in float64; what is made of them is in float32, as are the sums over
-pixels. Both are long chains of operations that wait for each other, once a Gaussian and view, and so they run for a group of
-Gaussians at once (``numba_group``). Vectors are tuples, which the compiler keeps in registers. README.md derives the
-formulas.
+pixels. Both are long chains of operations that wait for each other, once a Gaussian and view, and so they run for a
+group of Gaussians at once (``numba_group``). Vectors are tuples, which the compiler keeps in registers. README.md
+derives the formulas.
 """
 
 from __future__ import annotations
@@ -16,7 +16,17 @@ from tomo_polysplat.compiled import njit
 from tomo_polysplat.kernels.gaussian_maths import dot, mix, step
 from tomo_polysplat.kernels.numba_group import GROUP, SIZE, gaussian_of, put_group, three
 
-__all__ = ["MOMENTS", "RECORD", "ends_of", "numbers_of", "pull_back", "pull_back_view", "ray_frame", "rows_of", "set_up"]
+__all__ = [
+    "MOMENTS",
+    "RECORD",
+    "ends_of",
+    "numbers_of",
+    "pull_back",
+    "pull_back_view",
+    "ray_frame",
+    "rows_of",
+    "set_up",
+]
 
 RECORD = 12  # numbers of a footprint, in the order of _described
 MOMENTS = 11  # sums over a footprint, in the order read by pull_back
@@ -118,7 +128,12 @@ def _described(cone, planar, cutoff, rows, columns, centre, w, wu, wv):
         j0, j1 = _range(a - b * b * by_c, d - b * f * by_c, g - f * f * by_c, column0, columns)
     numbers = (column0, row0, r11), (r12, r22, ee), (_TWO * eu, _TWO * ev, uu), (_TWO * uv, vv, _NONE)
     some = i1 > _NONE and j1 > _NONE
-    return numbers, (i0 if some else _NONE, i1 if some else _NONE, j0 if some else _NONE, j1 if some else _NONE)
+    return numbers, (
+        i0 if some else _NONE,
+        i1 if some else _NONE,
+        j0 if some else _NONE,
+        j1 if some else _NONE,
+    )
 
 
 @step

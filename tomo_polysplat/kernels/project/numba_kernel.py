@@ -100,7 +100,11 @@ def _splat(v, first, last, record, span, weight, cutoff, image):
         two = j1 - j0 <= HALF
         each, bottom = 2 if two else 1, np.float32(high) - np.float32(0.5) - rec[1]
         for c in range(0, channels, 3):
-            w0, w1, w2 = weight[c, n], weight[c + 1, n] if three else zero, weight[c + 2, n] if three else zero
+            w0, w1, w2 = (
+                weight[c, n],
+                weight[c + 1, n] if three else zero,
+                weight[c + 2, n] if three else zero,
+            )
             for j in range(j0, j1, LANES):
                 across, y = _across(rec, j, two), _down(rec, low, two)
                 at = ((v * rows + low) * channels + c) * stride + j
@@ -166,9 +170,7 @@ def _store_sums(acc, first, k, sums, three):
 
 
 @njit(inline="always")
-def _gather_group(
-    v, first, some, record, span, weight, cutoff, grad_image, acc, of_group, of_weight
-):
+def _gather_group(v, first, some, record, span, weight, cutoff, grad_image, acc, of_group, of_weight):
     """Fill ``of_group`` with the moments of a group in view ``v``, and with whether there is a footprint; add the
     gradients of the weights to ``of_weight``."""
     of_group[MOMENTS * GROUP :] = np.float32(0)

@@ -21,7 +21,6 @@ from tomo_polysplat.kernels.numba_lanes import (
     inverse_root,
     lane_sums,
     larger,
-    load,
     load_blocks,
     ramp,
     smaller,
@@ -93,7 +92,11 @@ def _fill(first, last, record, weight, cutoff, ny, volume):
         two = j1 - j0 <= HALF
         each = 2 if two else 1
         for c in range(0, channels, 3):
-            w0, w1, w2 = weight[c, n], weight[c + 1, n] if three else none, weight[c + 2, n] if three else none
+            w0, w1, w2 = (
+                weight[c, n],
+                weight[c + 1, n] if three else none,
+                weight[c + 2, n] if three else none,
+            )
             for j in range(j0, j1, LANES):
                 across = _across(rec, j, two)
                 for iz in range(begin, end):
@@ -157,7 +160,14 @@ def _gather(n, k, record, weight, cutoff, grad_volume, rows, acc):
                     y, at = y + np.float32(each), at + each * channels * stride
                 w = begun[2]
                 hw = w * by_h
-                m0, m1, m2, m5, m7, m8 = m0 + by_t, m1 + by_u, m2 + hw, m5 + w * by_t, m7 + w * by_u, m8 + w * hw
+                m0, m1, m2, m5, m7, m8 = (
+                    m0 + by_t,
+                    m1 + by_u,
+                    m2 + hw,
+                    m5 + w * by_t,
+                    m7 + w * by_u,
+                    m8 + w * hw,
+                )
         to = ((MOMENTS + c) * GROUP + k) * QUARTER
         store_quarters(acc, to, s0)
         if three:
