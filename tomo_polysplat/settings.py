@@ -192,7 +192,7 @@ class Settings:
     learning_rate_shared: float = 5e-3
     """Of each piece of metal's one number."""
     learning_rate_blur: float = 1e-2
-    """The blur is fitted where there is metal; 0 holds it, and with ``blur`` 0 rays are infinitely thin."""
+    """Of the detector's blur, where it is fitted; 0 holds it, and with ``blur`` 0 rays are infinitely thin."""
     final_rate: float = 0.1
     """All rates fall exponentially to this share of their start."""
 

@@ -5,18 +5,18 @@ import pytest
 
 from tomo_polysplat.fit.long_object import long_object
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
-from tomo_polysplat.start.orbit import find_orbit
+from tomo_polysplat.start.orbit import find_turns
 
 RADIUS = 0.6
 GRID = VolumeGrid((8, 11, 11), [-1.0, -1.0, -0.5], [1.0, 1.0, 0.5])
 
 
-def scanner(beam, height, source=0.0, views=9, rows=41, columns=21):
-    """Sources at a distance of 3 that see ``height`` above and below their plane at the axis."""
+def scanner(beam, height, source=0.0, views=9, rows=41, columns=21, rise=0.0):
+    """Sources at a distance of 3, on a helix that rises so far, and see ``height`` above and below themselves."""
     angle = 2 * np.pi * np.arange(views) / views
     across = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
     out = np.stack([np.sin(angle), -np.cos(angle), 0 * angle], 1)
-    at = np.array([0.0, 0.0, source])
+    at = np.array([0.0, 0.0, source]) + rise * np.linspace(-0.5, 0.5, views)[:, None] * [0.0, 0.0, 1.0]
     times = 2.0 if beam == "cone" else 1.0
     u, v = 0.12 * times * across, times * 2 * height / (rows - 1) * np.tile([0.0, 0.0, 1.0], (views, 1))
     corner = at - 3.0 * out - 0.5 * (columns - 1) * u - 0.5 * (rows - 1) * v
@@ -44,7 +44,7 @@ def found(geometry, lower, upper, grid=GRID):
     where = points(geometry)
     inside = of_cylinder(where, lower, upper)
     values = 0.01 * inside.sum(axis=0).astype(np.float32)
-    return long_object(values, geometry, grid, find_orbit(geometry)[0]), where, inside
+    return long_object(values, geometry, grid, find_turns(geometry)[0]), where, inside
 
 
 @pytest.mark.parametrize("source", [0.0, 0.2, -0.7])
@@ -53,8 +53,8 @@ def test_all_that_rays_through_the_volume_meet_of_a_long_rod_is_held(height, sou
     geometry = scanner("cone", height, source)
     long, where, inside = found(geometry, -9.0, 9.0)
     crossed = (inside & (np.abs(where[..., 2]) < 0.5)).any(axis=0)
-    assert crossed.any() and not crossed[:, long.missed].any()
-    z = where[..., 2][inside & (crossed & ~long.missed[:, None])[None]]
+    assert crossed.any() and not crossed[long.missed].any()
+    z = where[..., 2][inside & (crossed & ~long.missed[..., None])[None]]
     assert long.lower <= z.min() + 0.02 and long.upper >= z.max() - 0.02
     # And no more than that by much: the columns tell the radius, and the rows the height, to a pixel or two.
     assert long.lower > min(z.min(), -0.5) - 0.12 and long.upper < max(z.max(), 0.5) + 0.12
@@ -63,9 +63,29 @@ def test_all_that_rays_through_the_volume_meet_of_a_long_rod_is_held(height, sou
 def test_rows_that_see_the_rod_beside_the_volume_alone_are_left_out():
     geometry = scanner("cone", 0.9)
     long, where, inside = found(geometry, -9.0, 9.0)
-    crossed = (inside & (np.abs(where[..., 2]) < 0.5)).any(axis=(0, 1, 3))
-    assert long.missed.any() and long.missed[0] and long.missed[-1]
+    crossed = (inside & (np.abs(where[..., 2]) < 0.5)).any(axis=(0, 3))
+    assert long.missed.any() and long.missed[:, 0].all() and long.missed[:, -1].all()
     assert (~crossed == long.missed).mean() > 0.9 and not (crossed & long.missed).any()
+
+
+@pytest.mark.parametrize("rise, height", [(1.6, 0.3), (2.4, 0.5), (-1.0, 0.6)])
+def test_each_view_of_a_helix_misses_rows_of_its_own(rise, height):
+    geometry = scanner("cone", height, views=23, rise=rise)
+    long, where, inside = found(geometry, -9.0, 9.0)
+    # More than graze it.
+    crossed = (inside & (np.abs(where[..., 2]) < 0.5)).sum(axis=0) > 2
+    of_row = crossed.any(axis=2)
+    assert not (of_row & long.missed).any() and (~of_row == long.missed).mean() > 0.9
+    z = where[..., 2][inside & (crossed & ~long.missed[..., None])[None]]
+    assert z.min() - 0.15 < long.lower <= z.min() + 0.02 and z.max() - 0.02 <= long.upper < z.max() + 0.15
+
+
+@pytest.mark.parametrize("lower, upper", [(-0.45, 0.45), (-0.3, 0.58), (-9.0, 0.45)])
+def test_ends_that_a_helix_sees_are_found(lower, upper):
+    long, _, _ = found(scanner("cone", 0.3, views=41, rise=2.4), lower, upper)
+    assert long.upper == pytest.approx(max(upper, 0.5), abs=0.03)
+    assert long.lower == (-0.5 if lower > -0.5 else pytest.approx(-0.61, abs=0.02))
+    assert long.missed.any() == (lower < -0.5 or upper > 0.5)
 
 
 def test_an_object_that_ends_within_the_volume_changes_nothing():
@@ -83,11 +103,11 @@ def test_parallel_rays_meet_nothing_above_or_below():
     long, _, _ = found(geometry, -9.0, 9.0)
     assert (long.lower, long.upper) == (-0.5, 0.5)
     z = geometry.corner[0, 2] + np.arange(geometry.rows) * geometry.v[0, 2]
-    assert np.array_equal(long.missed, np.abs(z) > 0.5)
+    assert (long.missed == (np.abs(z) > 0.5)).all()
 
 
 def test_nothing_at_all_is_no_long_object():
     geometry = scanner("cone", 0.9)
     values = np.full((geometry.views, geometry.rows, geometry.columns), np.nan, np.float32)
-    long = long_object(values, geometry, GRID, find_orbit(geometry)[0])
+    long = long_object(values, geometry, GRID, find_turns(geometry)[0])
     assert (long.lower, long.upper) == (-0.5, 0.5) and not long.missed.any()

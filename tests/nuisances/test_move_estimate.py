@@ -77,6 +77,22 @@ def test_a_half_that_sees_little_hides_no_shift():
     assert np.sqrt(np.mean((found - true) ** 2)) < 0.1
 
 
+def test_views_that_see_little_are_shifted_by_little():
+    """Their noise is a hundred times that of the others, and is not taken for a shift."""
+    rng = np.random.default_rng(4)
+    true = rng.normal(0, 0.1, (VIEWS, 2))
+    true -= true.mean(axis=0)
+    normal, told = halves(rng, true, 0.3)
+    normal[:, ::5, :2, :2] *= 1e-4
+    normal[:, ::5, :2, 2] *= 1e-2
+    normal[:, ::5, 2, :2] *= 1e-2
+    told[:, ::5, :2] = 1e-2 * rng.normal(0, np.sqrt(PIXELS), (2, VIEWS // 5, 2))
+    found = shifts_of_views(normal, told, np.zeros((2 * VIEWS, 0)))
+    others = np.arange(VIEWS) % 5 > 0
+    assert np.sqrt(np.mean(found[~others] ** 2)) < 0.02
+    assert np.sqrt(np.mean((found - true)[others] ** 2)) < 0.04
+
+
 def test_noise_shifts_no_view():
     for seed in range(20):
         rng = np.random.default_rng(seed)

@@ -15,6 +15,7 @@ from tomo_polysplat.nuisances.drift import Drift
 from tomo_polysplat.nuisances.filters import Filters
 from tomo_polysplat.nuisances.gains import Gains
 from tomo_polysplat.nuisances.known import NUISANCES
+from tomo_polysplat.nuisances.light_gate import more_likely
 from tomo_polysplat.nuisances.nuisance import Nuisance
 from tomo_polysplat.nuisances.open_beam import OpenBeam
 from tomo_polysplat.nuisances.pixel_light import PixelLight
@@ -62,6 +63,21 @@ DARKEST = {"darkest_before": 1.0, "darkest_after": 0.9}
 def test_more_light_has_to_explain_the_rays_better_than_what_looks_alike(evidence, scatter, beam):
     assert ScatteredLight.gate(evidence).kept is scatter
     assert OpenBeam.gate(evidence).kept is beam
+
+
+def test_what_explains_far_more_of_the_rays_is_not_left_out_for_its_likeness():
+    """Both leave half of the misfit: neither would be worse than either. Alike, it is the beam."""
+    both = ERRORS | DARKEST | {"held_out_after": 0.5}
+    assert more_likely(both, both) == more_likely(both | {"held_out_after": 0.49}, both) == "beam"
+    assert more_likely(both | {"held_out_after": 0.47, "darkest_after": 0.89}, both) == "scatter"
+    assert more_likely(both | {"held_out_after": 0.47, "darkest_after": 0.91}, both) == "beam"
+    assert more_likely(both | {"held_out_after": 0.3, "darkest_after": 0.91}, both) == "scatter"
+
+
+def test_few_dark_rays_do_not_outweigh_all_others_where_the_beam_explains_these():
+    far = ERRORS | DARKEST | {"held_out_after": 0.69, "darkest_after": 1.06}
+    assert OpenBeam.gate(far).kept and not ScatteredLight.gate(far).kept
+    assert not OpenBeam.gate(far | {"held_out_after": 0.75}).kept
 
 
 def test_rays_darker_than_scatter_exclude_it():

@@ -103,6 +103,18 @@ def test_a_probe_that_fails_moves_nothing_and_ends_no_run(monkeypatch, caplog, p
     assert "broken" in caplog.text
 
 
+def test_angles_that_run_backwards_are_said(caplog):
+    """Opposite rays of a fan agree one way round only; of a scan that is right nothing is said."""
+    scan = tps.simulate_scan("lung", size=24, views=60, geometry="fan")
+    _, *rest = problem_off(0.0)
+    for order, said in ((slice(None), False), (slice(None, None, -1), True)):
+        caplog.clear()
+        projections = np.ascontiguousarray(scan.projections.transpose(1, 0, 2)[order])
+        geometry = from_astra(scan.proj_geom, scan.vol_geom)
+        answer = axis.find_axis(Problem.of(projections, *geometry, "cm", None, None), *rest)
+        assert answer.value == {} and ("angles times -1" in caplog.text) is said
+
+
 def test_a_user_who_interrupts_the_probe_is_heard(monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt

@@ -274,11 +274,18 @@ def test_walls_do_not_tell_their_density():
             (
                 ((0.4, 0.9), (0.9, 0.91), "scatter"),
                 ((0.9, 0.9), (0.4, 0.89), "beam"),
-                ((0.4, 0.9), (0.9, 0.89), None),
+                ((0.4, 0.9), (0.9, 0.89), "scatter"),
             )
         ),
-        # Not the darkest rays as well; not better than the other; neither better than before.
-        *((((0.5, 1.1), None, None), ((0.5, 0.9), (0.6, 0.8), None), ((0.99, 0.9), (1.1, 0.95), None))),
+        # Not the darkest rays as well; both better than before, but for each other; neither better than before.
+        *(
+            (
+                ((0.5, 1.1), None, None),
+                ((0.6, 1.05), (0.65, 1.06), "scatter"),
+                ((0.65, 1.05), (0.66, 1.06), "beam"),
+            )
+        ),
+        *((((0.5, 0.9), (0.6, 0.8), "beam"), ((0.99, 0.9), (1.1, 0.95), None))),
     ],
 )
 def test_scatter_that_only_the_rays_ask_for_has_to_explain_the_darkest_and_beat_a_brighter_beam(

@@ -15,6 +15,7 @@ from tomo_polysplat.plan.lab import Lab
 from tomo_polysplat.plan.means import Means
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.preparation import lab_of
+from tomo_polysplat.ranks import Ranks, current_ranks, led_by
 from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.scan.moves import Scanner, moved_geometry
 from tomo_polysplat.settings import make_settings
@@ -74,6 +75,19 @@ def test_joined_pixels_tell_moves_in_pixels_of_the_detector(monkeypatch):
     order = np.arange(VIEWS) if true.order is None else np.argsort(true.order)
     shifts = np.array(found.value["views"])[order]
     assert np.std(shifts[:, 1] - wobble()[:, 1]) < 0.3 and np.std(shifts[:, 0] - wobble()[:, 0]) < 0.4
+
+
+@pytest.mark.parametrize("columns, together", [(1000, 2), (1, 1)])
+def test_a_small_detector_of_joined_pixels_waits_for_no_other_process(columns, together, monkeypatch):
+    seen = []
+    monkeypatch.setattr(realignment, "_COLUMNS", columns)
+    monkeypatch.setattr(realignment._Realignment, "is_clear", lambda *_: True)
+    monkeypatch.setattr(
+        realignment._Realignment, "_fitted", lambda *_: seen.append(current_ranks().count) or 1 / 0
+    )
+    with led_by(Ranks(0, 2)), pytest.raises(ZeroDivisionError):
+        ask(False)
+    assert seen == [together]
 
 
 @pytest.mark.parametrize(

@@ -85,3 +85,57 @@ def test_few_photons_are_no_bad_rays_and_an_object_in_all_columns_leaves_the_bea
     scan = cone_scan(noisy(chords(vectors, 15, 31), photons), vectors)
     found = {finding.probe: finding.verdict for finding in check_scan(scan)}
     assert found["bad rays"] == OK and found["open beam"] == UNKNOWN
+
+
+def saturated_to(limit, views, photons):
+    """A cone's open beam finding where the camera ends at this share of the open beam, of flats too."""
+    vectors = orbit(whole_turn(views))
+    lines = chords(vectors, 19, 47)
+    lines = lines if photons is None else noisy(lines, photons)
+    lines = np.maximum(lines + np.log(limit), 0).astype(np.float32)
+    return next(one for one in check_scan(cone_scan(lines, vectors)) if one.probe == "open beam")
+
+
+@pytest.mark.parametrize("views", [20, 90])
+def test_pictures_without_noise_are_not_called_saturated(views):
+    """All rays beside the object hold zero: that is no evidence where the object shows no noise either."""
+    found = saturated_to(1.0, views, None)
+    assert found.verdict == UNKNOWN and found.remedy
+
+
+@pytest.mark.parametrize("limit", [0.95, 0.7])
+@pytest.mark.parametrize("photons", [1e3, 1e5])
+def test_a_saturated_open_beam_is_never_ok(limit, photons):
+    found = saturated_to(limit, 64, photons)
+    assert found.verdict != OK
+
+
+def test_one_photon_behind_metal_is_a_measurement():
+    """Counts of Poisson's law, clipped at one: rays through a rod have one photon or none, and are no bad rays."""
+    vectors = orbit(whole_turn(40))
+    rod = [(1.0, (0, 0, 0), (1.5, 1.2, 0.9)), (20.0, (0.3, 0.2, 0.0), (0.25, 0.25, 0.9))]
+    lines = chords(vectors, 19, 47, rod)
+    counts = np.maximum(np.random.default_rng(0).poisson(3000 * np.exp(-lines)), 1)
+    scan = cone_scan(-np.log(counts / 3000).astype(np.float32), vectors)
+    assert np.mean(counts == 1) > 0.005
+    assert next(one for one in check_scan(scan) if one.probe == "bad rays").verdict == OK
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_detector_that_sees_the_other_half_from_the_other_side_is_no_truncation(side):
+    """Off by two columns, some 6 %: what one end cuts off, the other one sees half a turn later, up to the air."""
+    vectors = orbit(whole_turn(60))
+    vectors[:, 3:6] += 2 * side * vectors[:, 6:9]
+    columns = next(n for n in range(31, 61) if _ends(vectors, n).count(False) == 1)
+    scan = cone_scan(noisy(chords(vectors, 19, columns)), vectors)
+    assert next(one for one in check_scan(scan) if one.probe == "truncation").verdict == OK
+    # A short scan does not see it from the other side.
+    part = vectors[:32]
+    scan = cone_scan(noisy(chords(part, 19, columns)), part)
+    assert next(one for one in check_scan(scan) if one.probe == "truncation").verdict == DEFECT
+
+
+def _ends(vectors, columns):
+    """Whether the first and the last column show air in all views."""
+    lines = chords(vectors, 19, columns)
+    return [bool((lines[..., end] == 0).all()) for end in (0, -1)]

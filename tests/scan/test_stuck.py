@@ -51,9 +51,21 @@ def test_what_may_be_constant_is_left():
     opaque, missing = scan(), scan()
     opaque[:, :, 11] = 9.0
     assert not stuck_pixels(opaque).any(), "a wire on the axis through which no light passes"
+    assert not stuck_pixels(opaque, axis=11.0).any() and not stuck_pixels(opaque, axis=12.5).any()
     missing[:, :, 11] = np.nan
     assert not stuck_pixels(missing).any()
     assert not stuck_pixels(np.repeat(scan()[:1], 7, axis=0)).any(), "few views"
+
+
+def test_a_column_without_light_beside_the_axis_is_dead():
+    """Its logarithm is far above all that works: one photon of a million. A dark ring shows on both sides."""
+    values = scan()
+    values[:, :, 3] = 14.0
+    wanted = np.zeros((ROWS, COLUMNS), bool)
+    wanted[:, 3] = True
+    np.testing.assert_array_equal(stuck_pixels(values, axis=11.0), wanted)
+    values[:, :, 19] = 14.0
+    assert not stuck_pixels(values, axis=11.0).any()
 
 
 def test_what_lies_between_air_and_where_things_change_is_left():

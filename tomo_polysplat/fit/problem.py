@@ -134,7 +134,7 @@ class Problem:
         grid = around.grid
         if around.missed.any():
             projections = projections if own else projections.copy()
-            projections[:, around.missed] = np.nan
+            projections[around.missed] = np.nan
             own = True
         planar = geometry.planar and grid.planar
         # A plane beside the slice is another plane.

@@ -16,7 +16,7 @@ import torch
 from tomo_polysplat.fit.long_object import long_object
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.continued import few_rows, half_width
-from tomo_polysplat.start.orbit import find_orbit
+from tomo_polysplat.start.orbit import find_turns
 from tomo_polysplat.start.weights import ray_offsets
 
 __all__ = ["NO_MARGIN", "Margin", "Surroundings", "cut_out", "go_on", "surroundings_of"]
@@ -39,7 +39,7 @@ class Surroundings:
         Voxels that it has more: below, above, on either side in y, and in x.
     why : str
         Words that say so; empty if it is the one that is asked for.
-    missed : (rows,) bool array
+    missed : (views, rows) bool array
         Rows of the detector that see none of the volume, but matter above or below it.
     """
 
@@ -64,8 +64,8 @@ def surroundings_of(
     device : torch.device
         Where the width is asked: on the host of a GPU it took 3 ms or, until its threads had woken up, 80.
     """
-    as_it_is = Surroundings(grid, NO_MARGIN, "", np.zeros(geometry.rows, bool))
-    orbit = find_orbit(geometry)[0] if most else None
+    as_it_is = Surroundings(grid, NO_MARGIN, "", np.zeros((geometry.views, geometry.rows), bool))
+    orbit = find_turns(geometry)[0] if most else None
     if orbit is None:
         return as_it_is
     few = torch.from_numpy(np.ascontiguousarray(few_rows(projections)))
@@ -88,9 +88,7 @@ def surroundings_of(
     if below or above:
         words.append(f"{below} slices more below and {above} above: the object is longer than the volume")
     if long.missed.any():
-        words.append(
-            f"{long.missed.sum()} rows of the detector left out, which see it beside the volume alone"
-        )
+        words.append(f"{long.missed.mean():.0%} of the rays left out, which see it beside the volume alone")
     margin = (below, above, aside[1], aside[0])
     if not words:
         return as_it_is

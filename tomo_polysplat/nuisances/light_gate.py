@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from tomo_polysplat.nuisances.nuisance import Verdict
 
-__all__ = ["light_gate"]
+__all__ = ["light_gate", "more_likely"]
 
 # Held-out errors of two fits of the same scan under nearly the same physics, with one seed, differ by up to 2 %.
 _MARGIN = 0.03
@@ -30,11 +30,11 @@ def light_gate(evidence: Mapping[str, float], rival: str, *, darkest_margin: boo
     rival : str
         What looks alike, in words.
     darkest_margin : bool
-        Whether the darkest rays may fit as well as before.
+        Whether the darkest rays may fit as well as before, and need not tell where all rays fit far better.
     """
     if not evidence["held_out_after"] < (1 - _MARGIN) * evidence["held_out_before"]:
         return Verdict(False, f"the held-out rays do not fit {_MARGIN:.0%} better")
-    if "darkest_before" in evidence:
+    if "darkest_before" in evidence and not (darkest_margin and _far_better(evidence, "before")):
         most = evidence["darkest_before"] * (1 + _MARGIN if darkest_margin else 1.0)
         if not evidence["darkest_after"] < most:
             return Verdict(False, "the darkest rays fit no better")
@@ -46,9 +46,30 @@ def light_gate(evidence: Mapping[str, float], rival: str, *, darkest_margin: boo
 def _as_good(evidence: Mapping[str, float]) -> bool:
     """Whether it explains the rays as well as the rival, and the darkest better, or all of them far better."""
     held_out, rival = evidence["held_out_after"], evidence["held_out_rival"]
-    if held_out < _FAR_BETTER * rival:
+    if _far_better(evidence, "rival"):
         return evidence["darkest_after"] <= evidence["darkest_rival"]
     return (
         held_out < (1 + _MARGIN) * rival
         and evidence["darkest_after"] < (1 - _DARKER) * evidence["darkest_rival"]
     )
+
+
+def _far_better(evidence: Mapping[str, float], than: str) -> bool:
+    return evidence["held_out_after"] < _FAR_BETTER * evidence[f"held_out_{than}"]
+
+
+def more_likely(scatter: Mapping[str, float], beam: Mapping[str, float]) -> str:
+    """What explains the rays where both do, better than neither: "scatter" or "beam".
+
+    Both cannot be left out then: the rays beside the object have more light than the open field. A brighter beam is
+    the smaller change, and takes nothing away from dark rays.
+
+    Parameters
+    ----------
+    scatter, beam : mapping of str to float
+        See `light_gate`.
+    """
+    held_out = scatter["held_out_after"] / beam["held_out_after"]
+    darkest = 1 + _MARGIN if held_out < _FAR_BETTER else 1.0
+    surely = held_out < 1 - _MARGIN and scatter["darkest_after"] < darkest * beam["darkest_after"]
+    return "scatter" if surely else "beam"

@@ -84,10 +84,15 @@ def shifts_of_views(normal: np.ndarray, told: np.ndarray, gauge: np.ndarray) -> 
     apart = _less_gauge(left, gauge) - _less_gauge(right, gauge)
     # A half that sees less detail has more noise, and less of a part in both.
     part = of_left / np.maximum(of_left + of_right, 1e-300)
-    noise = np.mean(part * (1 - part) * apart**2, axis=0)
-    excess = np.mean(both**2, axis=0) - noise
-    sure = excess > _SURE * np.sqrt(2 / len(both)) * noise
-    return both * np.where(sure, excess / np.maximum(excess + noise, 1e-300), 0.0)
+    # A view's shift has the more noise the less tells it, as in the first and the last views of a helix.
+    told_by, views = whole[1], np.maximum((whole[1] > 0).sum(axis=0), 1)
+    noise, size = (
+        (told_by * square).sum(axis=0) / views for square in (part * (1 - part) * apart**2, both**2)
+    )
+    excess = size - noise
+    sure = excess > _SURE * np.sqrt(2 / views) * noise
+    believed = excess / np.maximum(told_by.sum(axis=0) / views, 1e-300) * told_by
+    return _less_gauge(both * np.where(sure, believed / np.maximum(believed + noise, 1e-300), 0.0), gauge)
 
 
 def _of_views(normal: np.ndarray, told: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

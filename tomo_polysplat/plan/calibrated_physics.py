@@ -11,6 +11,7 @@ import numpy as np
 
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.nuisances.known import SPECTRAL
+from tomo_polysplat.nuisances.light_gate import more_likely
 from tomo_polysplat.nuisances.nuisance import Nuisance
 from tomo_polysplat.nuisances.open_beam import OpenBeam
 from tomo_polysplat.nuisances.scatter import ScatteredLight
@@ -88,19 +89,37 @@ def judge_scatter(
     best = [min(fits, key=lambda fit: fit.held_out) for fits in kinds if fits]
     rivals, not_taken = list(best), []
     for fit in best:
-        kind: type[Nuisance] = ScatteredLight if "scatter" in fit.fitted else OpenBeam
-        evidence = _errors(before, fit)
-        if suspected:
-            evidence |= _darkest(before, fit, [rival for rival in rivals if rival is not fit])
-        verdict, words = kind.gate(evidence), describe_scatter(fit.fitted)
-        errors = f"held-out error {before.held_out:.3e} before, {fit.held_out:.3e} after"
-        errors += f", of the darkest rays {before.darkest:.3e} and {fit.darkest:.3e}"
+        evidence = _evidence(before, fit, suspected, [rival for rival in rivals if rival is not fit])
+        verdict = _kind(fit).gate(evidence)
         if verdict.kept:
-            return fit, f"{words}, accepted: {errors}"
-        not_taken.append(f"{words}, not accepted, as {verdict.why}: {errors}")
+            return fit, f"{describe_scatter(fit.fitted)}, accepted: {_in_words(before, fit)}"
+        words = f"{describe_scatter(fit.fitted)}, not accepted, as {verdict.why}"
+        not_taken.append(f"{words}: {_in_words(before, fit)}")
         if not ScatteredLight.possible(evidence):
             rivals.remove(fit)
+    likelier = _likelier(before, rivals) if suspected else None
+    if likelier is not None:
+        return likelier, f"{describe_scatter(likelier.fitted)}, the likelier: {_in_words(before, likelier)}"
     return None, "; ".join(not_taken)
+
+
+def _likelier(before: ShortFit, fits: Sequence[ShortFit]) -> ShortFit | None:
+    """What is taken of scatter and a brighter beam where neither beats the other; None where none beats neither."""
+    alone = [_evidence(before, fit, True, []) for fit in fits]
+    kept = [fit for fit, evidence in zip(fits, alone) if _kind(fit).gate(evidence).kept]
+    if len(fits) == 2 and any("beam" in fit.fitted for fit in kept):
+        likely = more_likely(*alone)
+        return next(fit for fit in fits if likely in fit.fitted)
+    return kept[0] if kept else None
+
+
+def _kind(fit: ShortFit) -> type[Nuisance]:
+    return ScatteredLight if "scatter" in fit.fitted else OpenBeam
+
+
+def _in_words(before: ShortFit, fit: ShortFit) -> str:
+    errors = f"held-out error {before.held_out:.3e} before, {fit.held_out:.3e} after"
+    return f"{errors}, of the darkest rays {before.darkest:.3e} and {fit.darkest:.3e}"
 
 
 def _errors(before: ShortFit, fit: ShortFit) -> dict[str, float]:
@@ -108,9 +127,14 @@ def _errors(before: ShortFit, fit: ShortFit) -> dict[str, float]:
     return {"held_out_before": before.held_out, "held_out_after": fit.held_out}
 
 
-def _darkest(before: ShortFit, fit: ShortFit, rivals: Sequence[ShortFit]) -> dict[str, float]:
-    """What a gate asks for where nobody has told of scatter: the darkest rays, and a fit by what looks alike."""
-    numbers = {"darkest_before": before.darkest, "darkest_after": fit.darkest}
+def _evidence(
+    before: ShortFit, fit: ShortFit, suspected: bool, rivals: Sequence[ShortFit]
+) -> dict[str, float]:
+    """What a gate asks for; where nobody has told of scatter, the darkest rays and a fit by what looks alike, too."""
+    numbers = _errors(before, fit)
+    if not suspected:
+        return numbers
+    numbers |= {"darkest_before": before.darkest, "darkest_after": fit.darkest}
     if "scatter" in fit.fitted:
         darker = before.rays.darker_than(ScatteredLight.of(fit.fitted))
         numbers |= {"darker": darker, "rays": len(before.rays.measured)}

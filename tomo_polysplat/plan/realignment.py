@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -34,7 +35,7 @@ from tomo_polysplat.plan.means import Means
 from tomo_polysplat.plan.model import rays_of, scene_of
 from tomo_polysplat.plan.order import plan_from_start
 from tomo_polysplat.plan.trial import fitted_shortly
-from tomo_polysplat.ranks import current_ranks
+from tomo_polysplat.ranks import ALONE, current_ranks, led_by
 from tomo_polysplat.scan.gauges import effects, view_gauge
 from tomo_polysplat.scan.moved_rays import falls_of
 from tomo_polysplat.scan.moves import Scanner, moved_geometry
@@ -127,7 +128,9 @@ def realigned(
         if first is not None and not joined and not fits.is_clear(first, start):
             logger.info("Alignment: no more has moved")
             return axis
-        moved, misfits = fits.moved(start)
+        # A detector of joined pixels is small, and other processes may still be starting: a pass would wait for them.
+        with led_by(ALONE) if joined else nullcontext():
+            moved, misfits = fits.moved(start)
     except Exception as broken:
         # Processes that share the steps may be left behind by one that fails.
         if current_ranks().count > 1:

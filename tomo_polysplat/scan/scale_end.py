@@ -13,14 +13,14 @@ import numpy as np
 from tomo_polysplat.scan.noise import photons_per_ray
 from tomo_polysplat.scan.opaque import fill_opaque, is_dark
 
-__all__ = ["dark_end", "fill_dark_end"]
+__all__ = ["ONE_PHOTON", "dark_end", "fill_dark_end"]
 
 # Noise and detail repeat no value exactly: rays at the end are so many, this share of all at least, and this many
 # times as many as those of any other value among some of the largest. Counts of few photons do repeat.
 _FEWEST, _SHARE, _OFTEN = 10, 2e-4, 3
 _LOOKED_AT = 1 << 18
 # Of counts, one photon is a measurement, and the next darkest ray has two.
-_ONE_PHOTON = 1e-4
+ONE_PHOTON = 1e-4
 
 
 def fill_dark_end(values: np.ndarray) -> int:
@@ -71,7 +71,7 @@ def _at_the_end(values: np.ndarray) -> tuple[np.ndarray | None, float]:
     number = sum(int(np.count_nonzero(view == end)) for view in values)
     if number <= max(_FEWEST, _SHARE * values.size):
         return None, end
-    if abs(end - _largest(values, below=end) - math.log(2)) < _ONE_PHOTON:
+    if abs(end - _largest(values, below=end) - math.log(2)) < ONE_PHOTON:
         return None, end
     step = -(-values.size // _LOOKED_AT)
     some = values.reshape(-1)[::step]

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+
+from tomo_polysplat.scan.axis_offset import LARGEST_SHARE
 
 __all__ = ["stuck_pixels"]
 
@@ -20,7 +24,7 @@ _OPAQUE, _DARK_AROUND = 0.98, 0.6
 _AROUND = np.ones((3, 3), bool)
 
 
-def stuck_pixels(values: np.ndarray) -> np.ndarray:
+def stuck_pixels(values: np.ndarray, axis: float | None = None) -> np.ndarray:
     """Which pixels are stuck, (rows, columns): constant beside pixels that change, at a value that these never have.
 
     The zeros of air without noise, which pixels at its border have as well in some views, are not told of.
@@ -29,6 +33,9 @@ def stuck_pixels(values: np.ndarray) -> np.ndarray:
     ----------
     values : (views, rows, columns) array
         -log(I/I0); values that are not finite are ignored.
+    axis : float, optional
+        Column on which the axis of rotation falls. Far from it, and with nothing like it on the other side, what is
+        dark from all around is no object.
     """
     views, rows, columns = values.shape
     stuck = np.zeros((rows, columns), bool)
@@ -43,8 +50,7 @@ def stuck_pixels(values: np.ndarray) -> np.ndarray:
     told[place] = (values[:, place[0], place[1]] == first[place]).all(axis=0)
     if not told.any():
         return stuck
-    largest = float(np.max(values, where=np.isfinite(values), initial=0.0))
-    return _among_working(values, told, same, largest)
+    return _among_working(values, told, same, axis)
 
 
 def _common(first: np.ndarray, working: np.ndarray, same: np.ndarray) -> np.ndarray:
@@ -57,10 +63,14 @@ def _common(first: np.ndarray, working: np.ndarray, same: np.ndarray) -> np.ndar
     return np.isin(first, often) | ~same
 
 
-def _among_working(values: np.ndarray, told: np.ndarray, same: np.ndarray, largest: float) -> np.ndarray:
+def _among_working(values: np.ndarray, told: np.ndarray, same: np.ndarray, axis: float | None) -> np.ndarray:
     """The areas of pixels told of that have the same value, and around which pixels work."""
     from scipy import ndimage
 
+    finite = np.isfinite(values)
+    largest = float(np.max(values, where=finite, initial=0.0))
+    # That of a pixel without light has nothing to do with how much others change.
+    working = float(np.max(values, where=finite & ~told, initial=0.0))
     stuck = np.zeros(told.shape, bool)
     for value in np.unique(values[0][told]):
         areas, count = ndimage.label(told & (values[0] == value), _AROUND)
@@ -81,5 +91,21 @@ def _among_working(values: np.ndarray, told: np.ndarray, same: np.ndarray, large
                 apart = max(apart, abs(float(value) - usual))
             elif usual > _DARK_AROUND * value:
                 continue
-            stuck[wider] |= area & (apart > _CHANGES * largest)
+            most = working if value < _OPAQUE * largest or _beside(told, box[1], axis) else largest
+            stuck[wider] |= area & (apart > _CHANGES * most)
     return stuck
+
+
+def _beside(told: np.ndarray, place: slice, axis: float | None) -> bool:
+    """Whether columns are off the axis, and those as far on the other side of it are none of the pixels told of.
+
+    An opaque body that looks the same from all around is round about the axis, so it shows on both sides of it.
+    """
+    if axis is None:
+        return False
+    columns, doubt = told.shape[1], LARGEST_SHARE * told.shape[1]
+    if place.start - doubt <= axis <= place.stop - 1 + doubt:
+        return False
+    first, last = 2 * axis - (place.stop - 1) - 2 * doubt, 2 * axis - place.start + 2 * doubt
+    across = told[:, max(0, math.floor(first)) : max(0, min(columns, math.ceil(last) + 1))].copy()
+    return not across.any()

@@ -13,7 +13,12 @@ from tomo_polysplat.parallel import run_tasks, split_range
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.water_correction import undo_water_correction
 from tomo_polysplat.scan.counts import Counts, Marks
-from tomo_polysplat.scan.geometry import is_planar_geometry, projections_from_astra, require_projections
+from tomo_polysplat.scan.geometry import (
+    geometry_from_astra,
+    is_planar_geometry,
+    projections_from_astra,
+    require_projections,
+)
 from tomo_polysplat.scan.line_integrals import require_line_integrals
 from tomo_polysplat.scan.noise import photons_per_ray
 from tomo_polysplat.scan.opaque import fill_opaque
@@ -56,7 +61,7 @@ def usable_rays(
     ]
     found = run_tasks(_take_out, parts)
     counts = {"rays": values.size} | {name: sum(part[name] for part in found) for name in found[0]}
-    stuck = stuck_pixels(values)
+    stuck = stuck_pixels(values, _axis_column(proj_geom))
     counts["rays_of_stuck_pixels"] = int(np.isfinite(values[:, stuck]).sum()) if stuck.any() else 0
     used = counts.pop("used") - counts["rays_of_stuck_pixels"]
     if stuck.any():
@@ -83,6 +88,13 @@ def usable_rays(
             "Rays that no light came through, opaque by what is around them: %d.", counts["rays_opaque"]
         )
     return values, counts
+
+
+def _axis_column(proj_geom: Mapping[str, Any]) -> float | None:
+    """The column on which the world's axis falls in all views, to a column; None where it does in none or another."""
+    geometry = geometry_from_astra(proj_geom)
+    columns = geometry.project_points(np.zeros((1, 3)))[:, 0, 0]
+    return float(np.median(columns)) if np.ptp(columns) < 1.0 else None
 
 
 def _of_array(

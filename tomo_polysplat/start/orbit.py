@@ -8,7 +8,7 @@ import numpy as np
 
 from tomo_polysplat.scan.geometry import Geometry
 
-__all__ = ["Orbit", "find_orbit"]
+__all__ = ["Orbit", "find_orbit", "find_turns"]
 
 # A gap between neighbouring views this many times the usual one, and this wide, is a part not scanned.
 _GAP_RATIO, _GAP_RADIANS = 4.0, np.deg2rad(5.0)
@@ -58,6 +58,18 @@ class Orbit:
 
 def find_orbit(geometry: Geometry) -> tuple[Orbit | None, str]:
     """The circular orbit of a scan, or None and what is not circular about it."""
+    orbit, reason = find_turns(geometry)
+    if (
+        orbit is not None
+        and geometry.beam != "parallel"
+        and np.ptp(geometry.origin[:, 2]) >= _ROUND * orbit.radius
+    ):
+        return None, "the source does not move on a horizontal circle"
+    return orbit, reason
+
+
+def find_turns(geometry: Geometry) -> tuple[Orbit | None, str]:
+    """The circle that the source moves on as seen along the axis, at any height, or None and why there is none."""
     reason = _tilt(geometry)
     if reason:
         return None, reason
@@ -72,8 +84,7 @@ def find_orbit(geometry: Geometry) -> tuple[Orbit | None, str]:
     axis, radius = _circle(geometry.origin[:, :2])
     offset = geometry.origin[:, :2] - axis
     distance = np.hypot(offset[:, 0], offset[:, 1])
-    height = np.ptp(geometry.origin[:, 2])
-    if not (np.abs(distance - radius).max() < _ROUND * radius and height < _ROUND * radius):
+    if not np.abs(distance - radius).max() < _ROUND * radius:
         return None, "the source does not move on a horizontal circle"
     # From the source, not from the axis: a detector scaled to the axis (a virtual one) is as good.
     if not (np.einsum("vk,vk->v", offset, (geometry.centre - geometry.origin)[:, :2]) < 0).all():

@@ -20,15 +20,16 @@ _SURE = 4.0
 _FRAMES, _SAME = 0.05, 0.3
 # Share of the rays that may be saturated.
 _SATURATED = 0.01
-# Rays that tell whether there is noise: 1.4 of noise is new in the next view.
+# Rays that tell whether there is noise: 1.4 of noise is new in the next view, and in the next row.
 _FEWEST, _NEW = 50, 0.8
+_LESS_LIGHT = "measure with less light or a shorter exposure; saturation= leaves such rays out"
 # Largest numbers of cameras with 8 to 16 bits.
 _LIMITS = 2.0 ** np.array([8, 10, 12, 14, 16]) - 1
 
 
 def probe_beam(measured: Measured) -> Finding:
     """Question flats, darks and the source: by the file's frames, and by the rays beside the object."""
-    told = _frames(measured.scan.notes) or _saturated(measured)
+    told = _frames(measured.scan.notes) or _marked(measured)
     if told:
         return Finding(BEAM, DEFECT, *told)
     air = measured.air
@@ -36,6 +37,8 @@ def probe_beam(measured: Measured) -> Finding:
         text = "no rays beside the object tell whether the flats belong to the projections"
         return Finding(BEAM, UNKNOWN, text, "a view of air beside the object")
     numbers = {"level": air.level, "same": air.share}
+    if air.share >= _SAME:
+        return _saturated(measured, numbers)
     if abs(air.level) > _TOLERATED + _SURE * air.error:
         factor = np.exp(-air.level)
         text = f"beside the object -log(I/I0) is {air.level:+.3f} instead of 0: {factor:.3g} times the flats' light"
@@ -81,35 +84,52 @@ def _frames(notes: dict[str, Any]) -> tuple[str, str] | None:
     return None
 
 
-def _saturated(measured: Measured) -> tuple[str, str] | None:
-    """Whether the open beam is at the limit of the camera's scale."""
-    remedy = "measure with less light or a shorter exposure; saturation= leaves such rays out"
+def _marked(measured: Measured) -> tuple[str, str] | None:
+    """Whether the reader has marked many rays as saturated."""
     saturated = measured.scan.notes.get("rays", {}).get("saturated", 0) / measured.scan.projections.size
     if saturated > _SATURATED:
-        return f"{100 * saturated:.2g} % of the rays are saturated, beside the object above all", remedy
-    air = measured.air
-    if air is None or air.share < _SAME:
-        return None
-    # Air without noise is the same everywhere.
+        return f"{100 * saturated:.2g} % of the rays are saturated, beside the object above all", _LESS_LIGHT
+    return None
+
+
+def _saturated(measured: Measured, numbers: dict[str, float]) -> Finding:
+    """What many rays beside the object with the very same value mean: the end of the scale, or no noise at all."""
+    same = f"{100 * numbers['same']:.0f} % of the rays beside the object hold the very same value"
     white = np.asarray(measured.scan.notes.get("white_frames", ()), np.float64)
     at_limit = len(white) > 0 and bool(np.isin(white, _LIMITS).all())
-    if not (at_limit or _noisy(measured)):
-        return None
-    text = f"{100 * air.share:.0f} % of the rays beside the object hold the very same value: saturated"
-    return text, remedy
+    if at_limit or _noisy(measured):
+        return Finding(BEAM, DEFECT, f"{same}: saturated", _LESS_LIGHT, numbers)
+    text = f"{same}: the detector is saturated, or the pictures have no noise"
+    return Finding(BEAM, UNKNOWN, text, "a look at the brightest pixels of the raw pictures", numbers)
 
 
 def _noisy(measured: Measured) -> bool:
-    """Whether rays through the object differ from the mean of their neighbours to both sides by chance."""
+    """Whether rays through the object differ from the mean of their neighbours by chance: anew in each view and row.
+
+    Detail of the object goes on in the next row, and in the next view where that is less than a pixel away.
+    """
     values = measured.filled.astype(np.float64)
     bend = values[..., 1:-1] - 0.5 * (values[..., :-2] + values[..., 2:])
     some = values[..., 1:-1] > 0.2 * measured.level
-    both = some[:, 1:] & some[:, :-1]
+    if len(values) == 1 and _step(measured) > 1:
+        return False
+    return all(_new(bend, some, axis) for axis in ((0, 1) if len(values) > 1 else (1,)))
+
+
+def _step(measured: Measured) -> float:
+    """By how many pixels points half-way to the volume's border move from a view to the next one."""
+    places = measured.places
+    return float(np.median(np.linalg.norm(np.diff(places, axis=0), axis=1)))
+
+
+def _new(bend: np.ndarray, some: np.ndarray, axis: int) -> bool:
+    """Whether the bends of some rays are others in the next view or row."""
+    bend, some = np.moveaxis(bend, axis, 0), np.moveaxis(some, axis, 0)
+    both = some[1:] & some[:-1]
     if np.count_nonzero(both) < _FEWEST:
         return False
-    # Detail of the object comes again in the next view, noise does not.
-    change = float(np.median(np.abs(np.diff(bend, axis=1)[both])))
-    return change > _NEW * float(np.median(np.abs(bend[:, 1:][both])))
+    change = float(np.median(np.abs(np.diff(bend, axis=0)[both])))
+    return change > _NEW * float(np.median(np.abs(bend[1:][both])))
 
 
 def _common_change(air: Air) -> tuple[float, float]:

@@ -6,22 +6,40 @@ from dataclasses import replace
 
 import numpy as np
 
-from tomo_polysplat.scan.axis_offset import LARGEST_SHARE, AxisOffset, spread
-from tomo_polysplat.scan.evidence import compare
+from tomo_polysplat.scan.axis_offset import LARGEST_SHARE, AxisOffset, offset_of, spread
+from tomo_polysplat.scan.evidence import RULED_OUT, compare
 from tomo_polysplat.scan.opposite_rays import OppositeRays
 
-__all__ = ["direction_doubt", "turned_round"]
+__all__ = ["MUCH_BETTER", "direction_doubt", "runs_backwards", "turned_round"]
 
 # Views that are compared, and those that it takes to tell; pairs of any place that a place must have, of the most.
 _VIEWS, _FEWEST_VIEWS, _ENOUGH = 60, 24, 0.2
 # Where both ways leave less than this share of the variance, the object looks the same turned round: 80 scans that did
 # go the other way left 0.010 and more as told, and pins, on a circle, 0.0008 at most.
 _ALIKE = 0.003
+# The other direction must fit this many times better.
+MUCH_BETTER = 2.0
 
 
 def turned_round(rays: OppositeRays) -> OppositeRays:
     """The same rays if the angles ran the other way."""
     return replace(rays, slope=-rays.slope)
+
+
+def runs_backwards(rays: OppositeRays, told: AxisOffset) -> float:
+    """How many times better opposite rays agree with the angles turned round, where that is beyond doubt; 0 if not.
+
+    Parameters
+    ----------
+    rays : OppositeRays
+        Of a fan or a cone.
+    told : AxisOffset
+        Where the axis is as told.
+    """
+    turned = offset_of(turned_round(rays))
+    doubt, ratio = direction_doubt(rays, told, turned)
+    sure = doubt < -RULED_OUT and ratio > MUCH_BETTER and not turned.doubt
+    return ratio if sure else 0.0
 
 
 def direction_doubt(rays: OppositeRays, told: AxisOffset, turned: AxisOffset) -> tuple[float, float]:

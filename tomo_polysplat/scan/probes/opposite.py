@@ -14,7 +14,7 @@ from tomo_polysplat.scan.axis_offset import LARGEST_SHARE, AxisOffset, axis_offs
 from tomo_polysplat.scan.centre import find_centre
 from tomo_polysplat.scan.evidence import RULED_OUT
 from tomo_polysplat.scan.opposite_geometry import opposite_rays_of
-from tomo_polysplat.scan.probes.direction import direction_doubt, turned_round
+from tomo_polysplat.scan.probes.direction import MUCH_BETTER, direction_doubt, turned_round
 from tomo_polysplat.scan.probes.finding import DEFECT, OK, UNKNOWN, Finding
 from tomo_polysplat.scan.probes.measured import Measured
 
@@ -22,8 +22,6 @@ __all__ = ["CENTRE", "DIRECTION", "probe_centre_and_direction"]
 
 # Columns off from which it is a defect, and the largest standard error at which that would have shown.
 _TOLERATED, _TELLING = 0.5, 0.5
-# Of a defect, the other direction must fit this many times better.
-_MUCH_BETTER = 2.0
 
 CENTRE, DIRECTION = "centre", "direction of the angles"
 _NEEDS = "a calibration of the scanner, or an object with detail where rays were measured from both ends"
@@ -44,7 +42,7 @@ def probe_centre_and_direction(measured: Measured) -> list[Finding]:
     told, turned = offset_of(rays), offset_of(turned_round(rays))
     doubt, ratio = direction_doubt(rays, told, turned)
     numbers = {"ratio": ratio, "standard errors": abs(doubt)}
-    if doubt < -RULED_OUT and ratio > _MUCH_BETTER and not turned.doubt:
+    if doubt < -RULED_OUT and ratio > MUCH_BETTER and not turned.doubt:
         text = f"opposite rays agree {ratio:.1f} times better with the angles turned round"
         turn = Finding(DIRECTION, DEFECT, text, "take the angles times -1 (or reverse the views)", numbers)
         return [_centre(turned), turn]

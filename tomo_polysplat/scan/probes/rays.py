@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import reduce
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from tomo_polysplat.scan.dropouts import dropped_rays
 from tomo_polysplat.scan.probes.finding import DEFECT, OK, Finding
 from tomo_polysplat.scan.probes.measured import Measured
-from tomo_polysplat.scan.scale_end import dark_end
+from tomo_polysplat.scan.scale_end import ONE_PHOTON, dark_end
 from tomo_polysplat.scan.stuck import stuck_pixels
 
 __all__ = ["DEAD", "RAYS", "bad_rays", "probe_rays"]
@@ -41,10 +42,12 @@ def bad_rays(measured: Measured) -> dict[str, np.ndarray]:
     views = _some_views(measured)
     valid, projections = measured.valid[:, views], measured.scan.projections[:, views]
     starved = _starved(projections, valid, measured.level) | _dark_end(projections, valid)
+    starved |= _one_photon(projections, valid)
     zero = dropped_rays(np.where(valid, projections, np.nan))
     # Few photons make few values, and that of air is one of them.
     zero &= _stands_out_as_value(projections[valid], 0.0)
-    pixels = stuck_pixels(np.where(valid, projections, np.nan).transpose(1, 0, 2))
+    column = float(np.median(measured.geometry.project_points(measured.axis[None])[:, 0, 0]))
+    pixels = stuck_pixels(np.where(valid, projections, np.nan).transpose(1, 0, 2), column)
     pixels |= _dead_pixels(projections, valid & ~pixels[:, None], measured.level)
     pixels |= (~valid & ~starved).mean(axis=1) > _MOSTLY
     dead = np.broadcast_to(pixels[:, None], valid.shape)
@@ -97,6 +100,15 @@ def _dark_end(projections: np.ndarray, valid: np.ndarray) -> np.ndarray:
     values = np.where(valid, projections, np.nan).astype(np.float32).swapaxes(0, 1)
     opaque, _ = dark_end(values)
     return np.zeros(valid.shape, bool) if opaque is None else opaque.swapaxes(0, 1)
+
+
+def _one_photon(projections: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Rays of the largest value, where counts clipped at one photon end: the next darkest have two."""
+    largest = np.max(projections, initial=0.0, where=valid)
+    second = np.max(projections, initial=0.0, where=valid & (projections < largest))
+    if abs(largest - second - math.log(2)) > ONE_PHOTON:
+        return np.zeros(valid.shape, bool)
+    return valid & (projections == largest)
 
 
 def _dead_pixels(projections: np.ndarray, valid: np.ndarray, level: float) -> np.ndarray:

@@ -14,6 +14,8 @@ TRUNCATION = "truncation"
 # the views in which they must do so.
 _NOT_AIR, _SOME_VIEWS = 0.06, 0.02
 _SURE = 4.0
+# Columns by which nobody places a detector beside the axis without wanting to.
+_OFF_CENTRE = 1.0
 
 
 def probe_truncation(measured: Measured) -> Finding:
@@ -41,17 +43,20 @@ def probe_truncation(measured: Measured) -> Finding:
     if not cut:
         return Finding(TRUNCATION, OK, "air at both ends of the detector", "", shares, error)
     views = ", ".join(f"the {name} column in {100 * shares[name]:.0f} % of the views" for name in cut)
-    if len(cut) == 1 and _is_offset(measured):
+    if len(cut) == 1 and _is_offset(measured, cut[0]):
         text = f"the object reaches {views}, as it does with a detector that is offset on purpose"
         return Finding(TRUNCATION, OK, text, "", shares, error)
     remedy = "make the volume larger than the object, so that what lies outside the view has room"
     return Finding(TRUNCATION, DEFECT, f"the object reaches beyond {views}", remedy, shares, error)
 
 
-def _is_offset(measured: Measured) -> bool:
-    """Whether the detector is off-centre by more than a tenth and the scan goes all the way round."""
+def _is_offset(measured: Measured, cut: str) -> bool:
+    """Whether the axis is off-centre towards the cut end, and the scan goes all the way round.
+
+    The other end shows air in every view, so what is cut off is seen from the other side.
+    """
     columns = measured.geometry.project_points(measured.axis[None])[:, 0, 0]
     middle = 0.5 * (measured.geometry.columns - 1)
     gaps = np.diff(np.sort(measured.azimuth), append=np.sort(measured.azimuth)[0] + 2 * np.pi)
-    off_centre = abs(float(np.median(columns)) - middle) > 0.1 * measured.geometry.columns
-    return bool(off_centre and gaps.max() < 0.5)
+    nearer = (middle - float(np.median(columns))) * (1 if cut == "first" else -1)
+    return bool(nearer > _OFF_CENTRE and gaps.max() < 0.5)
