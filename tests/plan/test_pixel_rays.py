@@ -13,6 +13,7 @@ from tomo_polysplat.fit.optimise import Run
 from tomo_polysplat.fit.stopping import Clock
 from tomo_polysplat.kernels.compile_time import working_time
 from tomo_polysplat.plan.answer import Status
+from tomo_polysplat.plan.decisions import pixel_rays
 from tomo_polysplat.plan.decisions.pixel_rays import PixelRays
 from tomo_polysplat.plan.lab import Lab
 from tomo_polysplat.plan.order import ask_between
@@ -121,17 +122,31 @@ def test_a_budget_that_ends_amid_the_question_leaves_the_run_as_it_was(passes):
     assert answer.value == 1 and "time budget" in answer.why
 
 
-@pytest.mark.parametrize(("steps", "passes"), [(90, 2), (30, 2), (24, 3), (1, 3)])
-def test_each_way_has_steps_enough_to_get_used_to_it_but_no_more_than_a_fifth_of_the_run(steps, passes):
+def passes_asked(monkeypatch, left, steps=30):
+    """Passes that either way is asked for, one after the other, where ``left`` is what averaged light leaves."""
     asked = []
 
     def ahead(clock, some):
         asked.append(some)
-        clock.deadline = working_time() - 1
-        return []
+        return [(0.2, 0.3, 1)] * some
 
-    amid(ahead, Clock(10, None), steps)
-    assert asked == [passes, passes]
+    monkeypatch.setattr(pixel_rays, "_share", lambda both: left)
+    return amid(ahead, Clock(10, None), steps), asked
+
+
+@pytest.mark.parametrize(("steps", "passes"), [(90, 2), (30, 2), (24, 3), (1, 3)])
+def test_each_way_has_steps_enough_to_get_used_to_it_but_no_more_than_a_fifth_of_the_run(
+    monkeypatch, steps, passes
+):
+    (answer, run, fitter), asked = passes_asked(monkeypatch, 1.0, steps)
+    assert asked == [1, 1, passes - 1, passes - 1]
+    assert answer.value == 2 and run.fitter is not fitter and run.made == (0.2, 0.3, passes)
+
+
+def test_one_pass_each_way_is_enough_where_averaged_light_leaves_far_more(monkeypatch):
+    (answer, run, fitter), asked = passes_asked(monkeypatch, 2.0)
+    assert asked == [1, 1]
+    assert answer.value == 1 and run.fitter is fitter and run.made == (0.2, 0.3, 1)
 
 
 def test_a_run_resumed_around_the_question_is_the_uninterrupted_one(tmp_path, monkeypatch):

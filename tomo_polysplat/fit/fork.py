@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from tomo_polysplat.fit.fitter import Fitter
@@ -42,11 +43,24 @@ def passes_of_a_fork(fitter: Fitter, passes: float, steps: int, most: float) -> 
     return max(_PASSES, min(math.ceil(steps / fitter.steps_of_a_pass), round(most * passes)))
 
 
-def fork(fitter: Fitter, other: Fitter, clock: Clock, passes: int) -> Fork:
-    """Go both ways for so many passes; the clock goes on with the first, and late is who had no time for the second."""
+def fork(
+    fitter: Fitter, other: Fitter, clock: Clock, passes: int, enough: Callable[[], bool] | None = None
+) -> Fork:
+    """Go both ways for so many passes; the clock goes on with the first, and late is who had no time for the second.
+
+    Where ``enough`` says so after the first pass of each, that is all.
+    """
     its_clock = copy.copy(clock)
-    made = [fitter.ahead(clock, passes), other.ahead(its_clock, passes)]
-    return Fork(its_clock.late, *(_last(some) for some in made))
+    if enough is not None and passes > 1:
+        made, its = fitter.ahead(clock, 1), other.ahead(its_clock, 1)
+        if its_clock.late or enough():
+            return Fork(its_clock.late, _last(made), _last(its))
+        passes -= 1
+    else:
+        made, its = [], []
+    made += fitter.ahead(clock, passes)
+    its += other.ahead(its_clock, passes)
+    return Fork(its_clock.late, _last(made), _last(its))
 
 
 def _last(made: list[Made]) -> Made | None:

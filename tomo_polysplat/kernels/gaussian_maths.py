@@ -30,9 +30,10 @@ def squared(cutoff):
 
 
 @njit(inline="always")
-def gaussian(q, cut, factor):
-    """``factor exp(-q / 2)`` of lanes, the exponential within 4e-7 relative, where ``q <= cut``, else 0."""
-    return within(q, cut, power_of_two(q * np.float32(-0.7213475204444817)) * factor)
+def gaussian(q, cut, y, bottom, factor):
+    """``factor exp(-q / 2)`` of lanes, the exponential within 4e-7 relative, where ``q <= cut`` and ``y <= bottom``,
+    else 0."""
+    return within(q, cut, y, bottom, power_of_two(q * np.float32(-0.7213475204444817)) * factor)
 
 
 @step

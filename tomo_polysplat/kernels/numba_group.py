@@ -11,7 +11,7 @@ import numpy as np
 from tomo_polysplat.compiled import called, njit
 from tomo_polysplat.kernels.gaussian_maths import step, whitening, whitening_adjoint
 
-__all__ = ["GROUP", "SIZE", "add_where", "gaussian_of", "put_group", "take_gradients", "three"]
+__all__ = ["GROUP", "SIZE", "add_where", "gaussian_of", "in_threes", "put_group", "take_gradients", "three"]
 
 GROUP = 16
 SIZE = 19  # numbers of a Gaussian that `put_group` puts down
@@ -87,3 +87,9 @@ def take_gradients(first, some, group, grads, grad_position, grad_scale, grad_ro
             grad_scale[n, i] = out[i * GROUP + k]
         for i in range(4):
             grad_rotation[n, i] = out[(3 + i) * GROUP + k]
+
+
+def in_threes(weight):
+    """The same, with zeros for channels that are missing to a multiple of three, as the kernels want them."""
+    missing = 0 if len(weight) == 1 else -len(weight) % 3
+    return np.concatenate([weight, np.zeros((missing, weight.shape[1]), np.float32)]) if missing else weight

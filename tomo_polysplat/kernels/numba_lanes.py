@@ -16,14 +16,16 @@ from typing import Any
 
 from llvmlite import ir
 from numba import types
-from numba.core.cgutils import get_or_insert_function
+from numba.core.cgutils import for_range_slice, get_or_insert_function
 from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
 
 __all__ = [
     "HALF",
     "LANES",
+    "QUARTER",
     "add_blocks",
     "ceiling",
+    "fetch",
     "floor",
     "larger",
     "smaller",
@@ -35,13 +37,16 @@ __all__ = [
     "power_of_two",
     "ramp",
     "store",
+    "store_quarters",
     "within",
 ]
 
 LANES = 16
 HALF = LANES // 2
+QUARTER = LANES // 4
 
 _FLOAT, _INT = ir.FloatType(), ir.IntType(32)
+_BYTE, _LINE = ir.IntType(8), 64  # bytes of a line of a cache
 _VECTOR, _BLOCK = ir.VectorType(_FLOAT, LANES), ir.VectorType(_FLOAT, HALF)
 _INTS = ir.VectorType(_INT, LANES)
 _FLAGS = ("contract",)
@@ -187,6 +192,24 @@ def load_blocks(typing, array, start, apart):
 
 
 @_intrinsic
+def fetch(typing, array):
+    """Have the C-contiguous array brought near, to be read soon."""
+
+    def generate(context, builder, signature, values):
+        whole = context.make_array(signature.args[0])(context, builder, values[0])
+        start = builder.bitcast(whole.data, _BYTE.as_pointer())
+        kind = ir.FunctionType(ir.VoidType(), [_BYTE.as_pointer(), _INT, _INT, _INT])
+        function = get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        length = builder.mul(whole.nitems, whole.itemsize)
+        with for_range_slice(builder, length.type(0), length, length.type(_LINE)) as (at, _):
+            # To be read, into the nearest cache, as data.
+            builder.call(function, [builder.gep(start, [at]), _INT(0), _INT(3), _INT(1)])
+        return context.get_dummy_value()
+
+    return types.void(array), generate
+
+
+@_intrinsic
 def add_blocks(typing, array, start, apart, factor, value):
     """Add ``factor * value`` to what `load_blocks` reads, where its two blocks do not overlap."""
 
@@ -285,28 +308,48 @@ def power_of_two(typing, value):
 
 
 @_intrinsic
-def within(typing, size, most, value):
-    """``value`` in the lanes where ``size <= most``, and 0 in the others, whatever ``value`` is there."""
+def within(typing, size, most, place, end, value):
+    """``value`` in the lanes where ``size <= most`` and ``place <= end``, and 0 in the others, whatever it is there."""
 
     def generate(context, builder, signature, values):
-        inside = builder.fcmp_ordered("<=", values[0], _spread(builder, values[1]))
-        return builder.select(inside, values[2], _all(0.0))
+        size, most, place, end, value = values
+        inside, before = (
+            builder.fcmp_ordered("<=", a, _spread(builder, b)) for a, b in ((size, most), (place, end))
+        )
+        # Two choices, one after the other, would cost the compiler's fast root.
+        return builder.select(builder.and_(inside, before), value, _all(0.0))
 
-    return _lanes(_lanes, types.float32, _lanes), generate
+    return _lanes(_lanes, types.float32, _lanes, types.float32, _lanes), generate
+
+
+@_intrinsic
+def store_quarters(typing, array, start, value):
+    """Write sums of a value's lanes, of every fourth, to ``array[start : start + QUARTER]``, for `lane_sums`."""
+
+    def generate(context, builder, signature, values):
+        array, start, value = values
+        for count in (HALF, QUARTER):
+            parts = (builder.shuffle_vector(value, value, _mask(range(k, k + count))) for k in (0, count))
+            value = builder.fadd(*parts, flags=_FLAGS)
+        kind = ir.VectorType(_FLOAT, QUARTER)
+        pointer = _pointer(context, builder, signature.args[0], array, start, kind)
+        builder.store(value, pointer, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, _lanes), generate
 
 
 @_intrinsic
 def lane_sums(typing, array, start):
-    """Sums of ``LANES`` blocks: lane k is ``sum(array[start + k LANES : start + (k + 1) LANES])``, likewise.
+    """Sums of ``LANES`` parts: lane k is ``sum(array[start + k QUARTER : start + (k + 1) QUARTER])``, likewise.
 
-    Two vectors at a time become one that holds sums of half as many lanes of either: 15 steps, where to add up the
-    lanes of one vector after the other takes 64.
+    Two vectors at a time become one that holds sums of half as many numbers of either.
     """
 
     def generate(context, builder, signature, values):
         source = _pointer(context, builder, signature.args[0], *values)
-        vectors = [builder.load(builder.gep(source, [_INT(k)]), align=4) for k in range(LANES)]
-        half = LANES // 2
+        vectors = [builder.load(builder.gep(source, [_INT(k)]), align=4) for k in range(QUARTER)]
+        half = QUARTER // 2
         while half:
             lower = [k for k in range(2 * LANES) if k // half % 2 == 0]
             parts = [_mask(k + shift for k in lower) for shift in (0, half)]

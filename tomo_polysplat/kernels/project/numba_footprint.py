@@ -1,8 +1,9 @@
-"""Where a Gaussian falls on the detector, and the way back from there to its gradients, in float64.
+"""Where a Gaussian falls on the detector, and the way back from there to its gradients.
 
-Both are long chains of operations that wait for each other, once a Gaussian and view, and so they run for a group of
-Gaussians at once (``numba_group``). Vectors are tuples, which the compiler keeps in registers. README.md derives the
-formulas.
+Differences and cross products, which cancel, are in float64; what is made of them is in float32, as are the sums over
+pixels. Both are long chains of operations that wait for each other, once a Gaussian and view, and so they run for a
+group of Gaussians at once (``numba_group``). Vectors are tuples, which the compiler keeps in registers. README.md
+derives the formulas.
 """
 
 from __future__ import annotations
@@ -13,14 +14,25 @@ import numpy as np
 
 from tomo_polysplat.compiled import njit
 from tomo_polysplat.kernels.gaussian_maths import dot, mix, step
-from tomo_polysplat.kernels.numba_group import GROUP, SIZE, gaussian_of, put_group
+from tomo_polysplat.kernels.numba_group import GROUP, SIZE, gaussian_of, put_group, three
 
-__all__ = ["MOMENTS", "RECORD", "numbers_of", "pull_back", "pull_back_view", "ray_frame", "rows_of", "set_up"]
+__all__ = [
+    "MOMENTS",
+    "RECORD",
+    "ends_of",
+    "numbers_of",
+    "pull_back",
+    "pull_back_view",
+    "ray_frame",
+    "rows_of",
+    "set_up",
+]
 
 RECORD = 12  # numbers of a footprint, in the order of _described
 MOMENTS = 11  # sums over a footprint, in the order read by pull_back
 
-_OUT = RECORD + 5  # what _footprints tells of a Gaussian
+# As plain numbers they would make float64 of a product.
+_NONE, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
 
 
 @step
@@ -64,56 +76,74 @@ def ray_frame(point, cone, origin, inverse, matrix, white):
 
 
 @step
+def _single(x):
+    """The vector in float32."""
+    return np.float32(x[0]), np.float32(x[1]), np.float32(x[2])
+
+
+@step
 def _triangle(nu, nv):
-    """Orthonormal q1, q2 and r11, r12, r22 with ``nu = r11 q1`` and ``nv = r12 q1 + r22 q2``."""
-    r11 = math.sqrt(dot(nu, nu))
-    by_r11 = 1.0 / r11 if r11 > 0.0 else 0.0
-    q1 = nu[0] * by_r11, nu[1] * by_r11, nu[2] * by_r11
+    """Orthonormal q1, q2, then r11, r12, r22 with ``nu = r11 q1`` and ``nv = r12 q1 + r22 q2``, and 1 / r11, 1 / r22
+    (0 where that is none). Of float32."""
+    q1, r11, by_r11 = _direction(nu)
     r12 = dot(q1, nv)
-    rest = mix(1.0, nv, -r12, q1)
-    r22 = math.sqrt(dot(rest, rest))
-    by_r22 = 1.0 / r22 if r22 > 0.0 else 0.0
-    return q1, (rest[0] * by_r22, rest[1] * by_r22, rest[2] * by_r22), r11, r12, r22
+    q2, r22, by_r22 = _direction((nv[0] - r12 * q1[0], nv[1] - r12 * q1[1], nv[2] - r12 * q1[2]))
+    return q1, q2, (r11, r12, r22), (by_r11, by_r22)
+
+
+@step
+def _direction(x):
+    length = math.sqrt(dot(x, x))
+    inverse = _ONE / length if length > _NONE else _NONE
+    return (x[0] * inverse, x[1] * inverse, x[2] * inverse), length, inverse
 
 
 @step
 def _described(cone, planar, cutoff, rows, columns, centre, w, wu, wv):
     """The numbers of a footprint by threes, and its half-open ranges of rows and columns (all 0 if there are none).
 
-    Column0, row0, r11, r12, r22 (the whitened distance is |(r11 x + r12 y, r22 y)| / |e|), the coefficients of
-    |e|^2 = n[5] + 2 (n[6] x + n[7] y) + n[8] x^2 + 2 n[9] x y + n[10] y^2, r12 / r11.
+    Column0, row0, r11, r12, r22 (the whitened distance is |(r11 x + r12 y, r22 y)| / |e|), then those of
+    |e|^2 = n[5] + n[6] x + n[7] y + n[8] x^2 + n[9] x y + n[10] y^2.
     """
-    _, _, r11, r12, r22 = _triangle(_cross(w, wu), _cross(w, wv))
-    kappa = centre[2]
+    _, _, (r11, r12, r22), _ = _triangle(_single(_cross(w, wu)), _single(_cross(w, wv)))
+    column0, row0, kappa = _single(centre)
+    if planar:
+        row0 = _NONE
+    w, wu, wv = _single(w), _single(wu), _single(wv)
     ee = kappa * kappa * dot(w, w)
-    eu = ev = uu = uv = vv = 0.0
+    eu = ev = uu = uv = vv = _NONE
     if cone:
         eu, ev = kappa * dot(w, wu), kappa * dot(w, wv)
         uu, uv, vv = dot(wu, wu), dot(wu, wv), dot(wv, wv)
-    row0 = 0.0 if planar else centre[1]
     # (distance^2 - cutoff^2) |e|^2 = a x^2 + 2 b x y + c y^2 + 2 d x + 2 f y + g, not positive within the cut.
-    cut = cutoff * cutoff
+    cut = np.float32(cutoff * cutoff)
     a, b, c = r11 * r11 - cut * uu, r11 * r12 - cut * uv, r12 * r12 + r22 * r22 - cut * vv
     d, f, g = -cut * eu, -cut * ev, -cut * ee
     if planar:
-        i0, i1 = 0.0, 1.0
-        j0, j1 = _range(a, d, g, centre[0], columns)
+        i0, i1 = _NONE, _ONE
+        j0, j1 = _range(a, d, g, column0, columns)
     else:
-        i0, i1 = _range(c - b * b / a, f - b * d / a, g - d * d / a, row0, rows)
-        j0, j1 = _range(a - b * b / c, d - b * f / c, g - f * f / c, centre[0], columns)
-    numbers = (centre[0], row0, r11), (r12, r22, ee), (eu, ev, uu), (uv, vv, r12 / r11)
-    some = i1 > 0.0 and j1 > 0.0
-    return numbers, (i0 if some else 0.0, i1 if some else 0.0, j0 if some else 0.0, j1 if some else 0.0)
+        by_a, by_c = _ONE / a, _ONE / c
+        i0, i1 = _range(c - b * b * by_a, f - b * d * by_a, g - d * d * by_a, row0, rows)
+        j0, j1 = _range(a - b * b * by_c, d - b * f * by_c, g - f * f * by_c, column0, columns)
+    numbers = (column0, row0, r11), (r12, r22, ee), (_TWO * eu, _TWO * ev, uu), (_TWO * uv, vv, _NONE)
+    some = i1 > _NONE and j1 > _NONE
+    return numbers, (
+        i0 if some else _NONE,
+        i1 if some else _NONE,
+        j0 if some else _NONE,
+        j1 if some else _NONE,
+    )
 
 
 @step
 def _range(square, half, rest, centre, length):
     """Half-open range of the indices i with ``square x^2 + 2 half x + rest <= 0``, x = i - centre; 0, 0 if none."""
-    inside = half * half - square * rest
-    spread, middle = math.sqrt(inside) / square, centre - half / square
-    low, high = max(0.0, np.ceil(middle - spread)), min(length - 1.0, np.floor(middle + spread))
-    some = square > 0.0 and inside >= 0.0 and low <= high
-    return low if some else 0.0, high + 1.0 if some else 0.0
+    inside, by_square = half * half - square * rest, _ONE / square
+    spread, middle = math.sqrt(inside) * by_square, centre - half * by_square
+    low, high = max(_NONE, np.ceil(middle - spread)), min(np.float32(length - 1), np.floor(middle + spread))
+    some = square > _NONE and inside >= _NONE and low <= high
+    return low if some else _NONE, high + _ONE if some else _NONE
 
 
 @step
@@ -127,52 +157,58 @@ def _reach(white, scale, toward):
 
 
 @step
-def _footprints(cone, planar, cutoff, rows, columns, origin, inverse, matrix, group, out):
-    """Fill ``out`` with numbers (12) and ranges (4) of a group in a view, and 1 for what lies ahead of the source."""
+def _footprints(cone, planar, cutoff, rows, columns, origin, inverse, matrix, group, out, ends, lost):
+    """Fill ``out`` with the numbers of a group in a view, ``ends`` with its ranges, or none for what does not lie
+    ahead of the source, and ``lost`` with 1 for that."""
     for k in range(GROUP):
         point, scale, white = gaussian_of(group, k)
-        centre, _, w, wu, wv = ray_frame(point, cone, origin, inverse, matrix, white)
-        ahead = 1.0
+        centre, r, w, wu, wv = ray_frame(point, cone, origin, inverse, matrix, white)
+        ahead = True
         if cone:
-            depth = 1.0 / centre[2] if centre[2] > 0.0 else 0.0
-            ahead = 1.0 if depth > 1.001 * cutoff * _reach(white, scale, inverse[2]) else 0.0
-        numbers, span = _described(cone, planar, cutoff, rows, columns, centre, w, wu, wv)
+            # A centre behind the source has a negative depth.
+            ahead = dot(inverse[2], r) > 1.001 * cutoff * _reach(white, scale, inverse[2])
+        numbers, ranges = _described(cone, planar, cutoff, rows, columns, centre, w, wu, wv)
         for i in range(4):
             for j in range(3):
                 out[(3 * i + j) * GROUP + k] = numbers[i][j]
-            out[(RECORD + i) * GROUP + k] = span[i]
-        out[(RECORD + 4) * GROUP + k] = ahead
+            ends[i * GROUP + k] = np.int32(ranges[i]) if ahead else np.int32(0)
+        lost[k] = np.int32(0) if ahead else np.int32(1)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def set_up(
     start, stop, position, scale, rotation, cone, planar, origin, inverse, matrix, cutoff, rows, columns, record, span
 ):  # fmt: skip
-    """Footprints of the Gaussians start..stop in every view; returns how many reach a source plane."""
-    group, out = np.zeros(SIZE * GROUP), np.empty(_OUT * GROUP)
+    """Footprints of the groups start..stop in every view; returns how many reach a source plane.
+
+    ``record`` (views, groups, RECORD x GROUP) float32 and ``span`` (views, groups, 4 x GROUP) int32 are filled: number
+    i of Gaussian k of a group stands at ``i * GROUP + k``.
+    """
+    group, lost = np.zeros(SIZE * GROUP), np.empty(GROUP, np.int32)
     skipped = 0
-    for first in range(start, stop, GROUP):
-        some = min(GROUP, stop - first)
-        put_group(first, some, position, scale, rotation, group)
+    for g in range(start, stop):
+        some = min(GROUP, len(position) - g * GROUP)
+        put_group(g * GROUP, some, position, scale, rotation, group)
         for v in range(len(origin)):
             place = origin[v, 0], origin[v, 1], origin[v, 2]
             inverted, direct = rows_of(inverse[v]), rows_of(matrix[v])
-            _footprints(cone, planar, cutoff, rows, columns, place, inverted, direct, group, out)
+            out, ends = record[v, g], span[v, g]
+            _footprints(cone, planar, cutoff, rows, columns, place, inverted, direct, group, out, ends, lost)
             for k in range(some):
-                ahead = out[(RECORD + 4) * GROUP + k] > 0.0
-                skipped += not ahead
-                for i in range(RECORD):
-                    record[v, first + k, i] = out[i * GROUP + k]
-                for i in range(4):
-                    span[v, first + k, i] = int(out[(RECORD + i) * GROUP + k]) if ahead else 0
+                skipped += lost[k]
     return skipped
 
 
 @njit(inline="always")
-def numbers_of(record, v, n):
-    """The numbers of a footprint as a tuple: an array would be read again after every store to another."""
-    a = record[v, n]
-    return a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], a[8], a[9], a[10], a[11]
+def numbers_of(a, k):
+    """The numbers of a footprint of a group as a tuple: an array would be read again after every store to another."""
+    return (*three(a, 0, k), *three(a, 3, k), *three(a, 6, k), *three(a, 9, k))
+
+
+@njit(inline="always")
+def ends_of(a, k):
+    """Its half-open ranges of rows and of columns."""
+    return (*three(a, 0, k), a[3 * GROUP + k])
 
 
 @step
@@ -180,36 +216,37 @@ def _slopes(cone, planar, frame, m):
     """dL/d(column, row, depth) of the centre and dL/d(W r), dL/d(W U), dL/d(W V), from moments of a footprint.
 
     With t = r11 x + r12 y and u = r22 y, m holds the sums of h (t, u, t^2, t u, u^2) and of
-    s (1, t, u, t^2, t u, u^2), where h = dL/d(distance^2 |e|^2) and s = dL/d|e|^2.
+    s (1, t, u, t^2, t u, u^2), where h = dL/d(distance^2 |e|^2) and s = dL/d|e|^2. Of float32, but for the frame.
     """
-    (column0, row0, kappa), _, w, wu, wv = frame
+    centre, _, w, wu, wv = frame
     (m0, m1, m2), (m3, m4, m5), (m6, m7, m8), (m9, m10, _) = m
-    q1, q2, r11, r12, r22 = _triangle(_cross(w, wu), _cross(w, wv))
+    q1, q2, (r11, r12, r22), (by_t, by_u) = _triangle(_single(_cross(w, wu)), _single(_cross(w, wv)))
+    column0, row0, kappa = _single(centre)
+    w, wu, wv = _single(w), _single(wu), _single(wv)
     # x = by_t t - back u, y = by_u u.
-    by_t, by_u = 1.0 / r11, 1.0 / r22 if r22 > 0.0 else 0.0
     back = by_t * r12 * by_u
     sum_t, sum_u = mix(m2, q1, m3, q2), mix(m3, q1, m4, q2)
-    g_nu, g_nv = mix(2 * by_t, sum_t, -2 * back, sum_u), mix(2 * by_u, sum_u, 0.0, sum_u)
-    g_column, g_row = -2 * r11 * m0, -2 * (r12 * m0 + r22 * m1)
+    g_nu, g_nv = mix(_TWO * by_t, sum_t, -_TWO * back, sum_u), mix(_TWO * by_u, sum_u, _NONE, sum_u)
+    g_column, g_row = -_TWO * r11 * m0, -_TWO * (r12 * m0 + r22 * m1)
     # nu = w x WU and nv = w x WV.
     g_wu, g_wv = _cross(g_nu, w), _cross(g_nv, w)
-    g_w = mix(1.0, _cross(wu, g_nu), 1.0, _cross(wv, g_nv))
+    g_w = mix(_ONE, _cross(wu, g_nu), _ONE, _cross(wv, g_nv))
+    g_depth = _NONE
     if cone:
         # e = e0 + t et + u eu.
-        e0, et, eu = mix(kappa, w, 0.0, w), mix(by_t, wu, 0.0, wu), mix(by_u, wv, -back, wu)
-        g_e = mix(2.0, mix(m5, e0, m6, et), 2 * m7, eu)
-        sum_t = mix(1.0, mix(m6, e0, m8, et), m9, eu)
-        sum_u = mix(1.0, mix(m7, e0, m9, et), m10, eu)
-        g_wu = mix(1.0, g_wu, 1.0, mix(2 * by_t, sum_t, -2 * back, sum_u))
-        g_wv = mix(1.0, g_wv, 2 * by_u, sum_u)
-        g_w = mix(1.0, g_w, kappa, g_e)
+        e0, et, eu = mix(kappa, w, _NONE, w), mix(by_t, wu, _NONE, wu), mix(by_u, wv, -back, wu)
+        g_e = mix(_TWO, mix(m5, e0, m6, et), _TWO * m7, eu)
+        sum_t = mix(_ONE, mix(m6, e0, m8, et), m9, eu)
+        sum_u = mix(_ONE, mix(m7, e0, m9, et), m10, eu)
+        g_wu = mix(_ONE, g_wu, _ONE, mix(_TWO * by_t, sum_t, -_TWO * back, sum_u))
+        g_wv = mix(_ONE, g_wv, _TWO * by_u, sum_u)
+        g_w = mix(_ONE, g_w, kappa, g_e)
         g_column -= dot(g_e, wu)
-        g_row = 0.0 if planar else g_row - dot(g_e, wv)
+        g_row = _NONE if planar else g_row - dot(g_e, wv)
         g_depth = -kappa * (g_column * column0 + g_row * row0 + kappa * dot(g_e, w))
     else:
-        g_row = 0.0 if planar else g_row
-        g_depth = 0.0
-        g_w = mix(1.0, g_w, 2 * m5, w)
+        g_row = _NONE if planar else g_row
+        g_w = mix(_ONE, g_w, _TWO * m5, w)
     return (kappa * g_column, kappa * g_row, g_depth), g_w, g_wu, g_wv
 
 

@@ -6,8 +6,6 @@ the Gaussians, so neither needs atomics and both give the same bits on every run
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from tomo_polysplat.compiled import njit
@@ -17,6 +15,7 @@ from tomo_polysplat.kernels.numba_group import (
     SIZE,
     add_where,
     gaussian_of,
+    in_threes,
     put_group,
     take_gradients,
     three,
@@ -24,7 +23,9 @@ from tomo_polysplat.kernels.numba_group import (
 from tomo_polysplat.kernels.numba_lanes import (
     HALF,
     LANES,
+    QUARTER,
     add_blocks,
+    fetch,
     halves,
     inverse_root,
     lane_sums,
@@ -32,10 +33,12 @@ from tomo_polysplat.kernels.numba_lanes import (
     load_blocks,
     ramp,
     store,
+    store_quarters,
 )
 from tomo_polysplat.kernels.project.numba_footprint import (
     MOMENTS,
     RECORD,
+    ends_of,
     numbers_of,
     pull_back,
     pull_back_view,
@@ -50,126 +53,141 @@ __all__ = ["backward", "forward"]
 
 
 @njit(inline="always")
-def _columns(rec, y, cut, columns):
-    """Half-open range of the columns inside the cut on the row ``y`` below the centre.
+def _across(rec, j, two):
+    """Of lanes on the columns from ``j`` on: r11 x, and |e|^2 and its slope by y where y = 0.
 
-    Solved about the point where r11 x + r12 y = 0, so that nothing cancels however thin the Gaussian is.
+    They are the same in all rows. With ``two`` the columns of either half are the same.
     """
-    one, two = np.float32(1), np.float32(2)
-    up2 = (rec[4] * y) * (rec[4] * y)
-    e0, e1 = rec[5] + y * (two * rec[7] + y * rec[10]), two * (rec[6] + rec[9] * y)
-    shift = rec[11] * y
-    square = rec[2] * rec[2] - cut * rec[8]
-    half = cut * (np.float32(0.5) * e1 - shift * rec[8])
-    inside = half * half - square * (up2 - cut * (e0 - shift * (e1 - shift * rec[8])))
-    if not (inside > np.float32(0) and square > np.float32(0)):
-        return 0, 0
-    inverse = one / square
-    spread, middle = math.sqrt(inside) * inverse, rec[0] - shift + half * inverse
-    low, high = max(np.float32(0), np.ceil(middle - spread)), min(columns - one, np.floor(middle + spread))
-    return (int(low), int(high) + 1) if low <= high else (0, 0)
+    x0 = np.float32(j) - rec[0]
+    x = halves(x0, x0 + np.float32(0 if two else HALF)) + ramp()
+    return rec[2] * x, rec[5] + x * (rec[6] + x * rec[8]), rec[7] + rec[9] * x
 
 
 @njit(inline="always")
-def _block(rec, x, y, cut):
-    """t, u, 1 / |e|^2, the distance q and ``exp(-q / 2) / |e|``, zero beyond the cut, of lanes at the offset x, y."""
-    two = np.float32(2)
-    t, u = rec[2] * x + rec[3] * y, rec[4] * y
-    e0, e1 = rec[5] + y * (two * rec[7] + y * rec[10]), two * rec[6] + two * rec[9] * y
-    root = inverse_root(e0 + x * (e1 + x * rec[8]))
+def _down(rec, i, two):
+    """y of lanes in the row ``i``, and with ``two`` in the next one."""
+    y = np.float32(i) - rec[1]
+    return halves(y, y + np.float32(1 if two else 0))
+
+
+@njit(inline="always")
+def _block(rec, across, y, cut, bottom):
+    """t, u, 1 / |e|^2, the distance q and ``exp(-q / 2) / |e|``, zero beyond the cut and below the row ``bottom``."""
+    t, u = across[0] + rec[3] * y, rec[4] * y
+    root = inverse_root(across[1] + y * (across[2] + y * rec[10]))
     inverse = root * root
     q = (t * t + u * u) * inverse
-    return t, u, inverse, q, gaussian(q, cut, root)
+    return t, u, inverse, q, gaussian(q, cut, y, bottom, root)
 
 
 @njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
-def _splat(v, first, last, record, span, weight, cutoff, columns, image):
-    """Add every footprint to the rows first..last of view ``v`` of ``image`` (views, rows, channels, padded)."""
-    cut = squared(cutoff)
+def _splat(v, first, last, record, span, weight, cutoff, image):
+    """Add every footprint to the rows first..last of view ``v`` of ``image`` (views, rows, channels, padded).
+
+    There are one channel, or three, or a multiple of three.
+    """
+    cut, zero = squared(cutoff), np.float32(0)
     rows, channels, stride = image.shape[1:]
-    for n in range(record.shape[1]):
-        low, high = max(first, span[v, n, 0]), min(last, span[v, n, 1])
-        rec = numbers_of(record, v, n)
-        j0, j1 = span[v, n, 2], span[v, n, 3]
-        narrow, wide = j1 - j0 <= HALF, j1 - j0 > LANES
-        i = low
-        while i < high:
-            # Two short rows at once, where there are two.
-            two = narrow and i + 1 < high
-            y0 = np.float32(i) - rec[1]
-            y = halves(y0, np.float32(i + 1) - rec[1] if two else y0)
-            apart = channels * stride if two else HALF
-            if wide:
-                j0, j1 = _columns(rec, y0, cut, columns)
+    three = channels > 1
+    for n in range(weight.shape[1]):
+        numbers, k = record[v, n // GROUP], n % GROUP
+        i0, i1, j0, j1 = ends_of(span[v, n // GROUP], k)
+        low, high = max(first, i0), min(last, i1)
+        if low >= high:
+            continue
+        rec = numbers_of(numbers, k)
+        # Two short rows at once.
+        two = j1 - j0 <= HALF
+        each, bottom = 2 if two else 1, np.float32(high) - np.float32(0.5) - rec[1]
+        for c in range(0, channels, 3):
+            w0, w1, w2 = (
+                weight[c, n],
+                weight[c + 1, n] if three else zero,
+                weight[c + 2, n] if three else zero,
+            )
             for j in range(j0, j1, LANES):
-                x0 = np.float32(j) - rec[0]
-                x = halves(x0, x0 + np.float32(0 if two else HALF)) + ramp()
-                value = _block(rec, x, y, cut)[4]
-                at = ((v * rows + i) * channels) * stride + j
-                for c in range(channels):
-                    add_blocks(image, at + c * stride, apart, weight[c, n], value)
-            i += 2 if two else 1
+                across, y = _across(rec, j, two), _down(rec, low, two)
+                at = ((v * rows + low) * channels + c) * stride + j
+                for i in range(low, high, each):
+                    value = _block(rec, across, y, cut, bottom)[4]
+                    apart = channels * stride if two and i + 1 < high else HALF
+                    add_blocks(image, at, apart, w0, value)
+                    if three:
+                        add_blocks(image, at + stride, apart, w1, value)
+                        add_blocks(image, at + 2 * stride, apart, w2, value)
+                    y, at = y + np.float32(each), at + each * channels * stride
 
 
 @njit(inline="always")
-def _gather(v, n, k, record, span, weight, cutoff, columns, grad_image, acc):
+def _gather(v, n, k, numbers, ends, weight, cutoff, grad_image, acc):
     """Write to ``acc``, as those of Gaussian ``k`` of a group, the sums over the footprint of Gaussian ``n`` in view
-    ``v``, lane by lane: the moments in the order of ``pull_back``, then the gradient of its weight in every channel."""
-    cut, half, one = squared(cutoff), np.float32(-0.5), np.float32(1)
+    ``v``, by quarters: the moments in the order of ``pull_back``, then the gradient of its weight in every channel."""
+    cut, half, one, none = squared(cutoff), np.float32(-0.5), np.float32(1), np.float32(0)
     rows, channels, stride = grad_image.shape[1:]
-    rec = numbers_of(record, v, n)
-    j0, j1 = span[v, n, 2], span[v, n, 3]
-    narrow, wide = j1 - j0 <= HALF, j1 - j0 > LANES
-    zero = halves(np.float32(0), np.float32(0))
+    three = channels > 1
+    rec, (low, high, j0, j1) = numbers_of(numbers, k), ends_of(ends, k)
+    two = j1 - j0 <= HALF
+    each, bottom = 2 if two else 1, np.float32(high) - np.float32(0.5) - rec[1]
+    zero = halves(none, none)
     m0 = m1 = m2 = m3 = m4 = m5 = m6 = m7 = m8 = m9 = m10 = zero
-    for c in range(channels):
-        store(acc, ((MOMENTS + c) * GROUP + k) * LANES, zero)
-    i, high = span[v, n, 0], span[v, n, 1]
-    while i < high:
-        two = narrow and i + 1 < high
-        y0 = np.float32(i) - rec[1]
-        y = halves(y0, np.float32(i + 1) - rec[1] if two else y0)
-        apart = channels * stride if two else HALF
-        if wide:
-            j0, j1 = _columns(rec, y0, cut, columns)
+    for c in range(0, channels, 3):
+        w0, w1, w2 = weight[c, n], weight[c + 1, n] if three else none, weight[c + 2, n] if three else none
+        s0 = s1 = s2 = zero
         for j in range(j0, j1, LANES):
-            x0 = np.float32(j) - rec[0]
-            x = halves(x0, x0 + np.float32(0 if two else HALF)) + ramp()
-            t, u, inverse, q, value = _block(rec, x, y, cut)
-            at = ((v * rows + i) * channels) * stride + j
-            total = zero
-            for c in range(channels):
-                slope = load_blocks(grad_image, at + c * stride, apart)
-                total = total + weight[c, n] * slope
-                to = ((MOMENTS + c) * GROUP + k) * LANES
-                store(acc, to, load(acc, to) + slope * value)
-            h = half * total * value * inverse
-            s = h * (one - q)
-            ht, hu, st, su = h * t, h * u, s * t, s * u
-            m0, m1, m2, m3, m4 = m0 + ht, m1 + hu, m2 + ht * t, m3 + ht * u, m4 + hu * u
-            m5, m6, m7, m8, m9, m10 = m5 + s, m6 + st, m7 + su, m8 + st * t, m9 + st * u, m10 + su * u
-        i += 2 if two else 1
-    to, each = k * LANES, GROUP * LANES
+            across, y = _across(rec, j, two), _down(rec, low, two)
+            at = ((v * rows + low) * channels + c) * stride + j
+            for i in range(low, high, each):
+                t, u, inverse, q, value = _block(rec, across, y, cut, bottom)
+                apart = channels * stride if two and i + 1 < high else HALF
+                slope = load_blocks(grad_image, at, apart)
+                total, s0 = w0 * slope, s0 + slope * value
+                if three:
+                    slope = load_blocks(grad_image, at + stride, apart)
+                    total, s1 = total + w1 * slope, s1 + slope * value
+                    slope = load_blocks(grad_image, at + 2 * stride, apart)
+                    total, s2 = total + w2 * slope, s2 + slope * value
+                h = half * total * value * inverse
+                s = h * (one - q)
+                ht, hu, st, su = h * t, h * u, s * t, s * u
+                m0, m1, m2, m3, m4 = m0 + ht, m1 + hu, m2 + ht * t, m3 + ht * u, m4 + hu * u
+                m5, m6, m7, m8, m9, m10 = m5 + s, m6 + st, m7 + su, m8 + st * t, m9 + st * u, m10 + su * u
+                y, at = y + np.float32(each), at + each * channels * stride
+        _store_sums(acc, MOMENTS + c, k, (s0, s1, s2) if three else (s0, zero, zero), three)
+    to, next_one = k * QUARTER, GROUP * QUARTER
     for m in (m0, m1, m2, m3, m4, m5, m6, m7, m8, m9, m10):
-        store(acc, to, m)
-        to += each
+        store_quarters(acc, to, m)
+        to += next_one
 
 
 @njit(inline="always")
-def _gather_group(
-    v, first, some, record, span, weight, cutoff, columns, grad_image, acc, of_group, of_weight
-):
+def _store_sums(acc, first, k, sums, three):
+    """Write the sums of one channel, or of three, to ``acc``."""
+    to, each = (first * GROUP + k) * QUARTER, GROUP * QUARTER
+    store_quarters(acc, to, sums[0])
+    if three:
+        store_quarters(acc, to + each, sums[1])
+        store_quarters(acc, to + 2 * each, sums[2])
+
+
+@njit(inline="always")
+def _gather_group(v, first, some, record, span, weight, cutoff, grad_image, acc, of_group, of_weight):
     """Fill ``of_group`` with the moments of a group in view ``v``, and with whether there is a footprint; add the
     gradients of the weights to ``of_weight``."""
-    of_group[MOMENTS * GROUP :] = 0.0
+    of_group[MOMENTS * GROUP :] = np.float32(0)
+    g, last = first // GROUP, v + 1 == len(record)
+    numbers, ends = record[v, g], span[v, g]
+    # Of the next view, or of the next group: they lie far apart in memory.
+    to, of = 0 if last else v + 1, min(g + 1, record.shape[1] - 1) if last else g
+    fetch(record[to, of])
+    fetch(span[to, of])
     for k in range(some):
-        if span[v, first + k, 0] < span[v, first + k, 1]:
-            of_group[MOMENTS * GROUP + k] = 1.0
-        _gather(v, first + k, k, record, span, weight, cutoff, columns, grad_image, acc)
+        if ends[k] < ends[GROUP + k]:
+            of_group[MOMENTS * GROUP + k] = np.float32(1)
+        _gather(v, first + k, k, numbers, ends, weight, cutoff, grad_image, acc)
     for m in range(MOMENTS):
-        store(of_group, m * GROUP, lane_sums(acc, m * GROUP * LANES))
+        store(of_group, m * GROUP, lane_sums(acc, m * GROUP * QUARTER))
     for c in range(len(weight)):
-        sums = lane_sums(acc, (MOMENTS + c) * GROUP * LANES)
+        sums = lane_sums(acc, (MOMENTS + c) * GROUP * QUARTER)
         store(of_weight, c * GROUP, load(of_weight, c * GROUP) + sums)
 
 
@@ -209,15 +227,16 @@ def _take_back_view(cone, planar, origin, inverse, matrix, group, moments, sums)
 
 @njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def _gather_range(
-    start, stop, position, scale, rotation, weight, cone, planar, origin, inverse, matrix, cutoff, columns,
+    start, stop, position, scale, rotation, weight, cone, planar, origin, inverse, matrix, cutoff,
     record, span, grad_image, grad_position, grad_scale, grad_rotation, grad_weight, grad_views,
 ):  # fmt: skip
     """The gradients of the Gaussians start..stop, summed over the views, and where there is room for them
     (groups, views, 12) those of the views, summed over each group: ``start`` begins one."""
     group, grads = np.zeros(SIZE * GROUP), np.empty(12 * GROUP)
     # The last number says whether there is a footprint.
-    of_group, of_weight = np.zeros((MOMENTS + 1) * GROUP), np.empty(len(weight) * GROUP, np.float32)
-    acc = np.zeros((MOMENTS + len(weight)) * GROUP * LANES, np.float32)
+    of_group = np.zeros((MOMENTS + 1) * GROUP, np.float32)
+    of_weight = np.empty(len(weight) * GROUP, np.float32)
+    acc = np.zeros((MOMENTS + len(weight)) * GROUP * QUARTER, np.float32)
     for first in range(start, stop, GROUP):
         some = min(GROUP, stop - first)
         put_group(first, some, position, scale, rotation, group)
@@ -225,7 +244,7 @@ def _gather_range(
         of_weight[:] = np.float32(0)
         for v in range(len(origin)):
             _gather_group(
-                v, first, some, record, span, weight, cutoff, columns, grad_image, acc, of_group, of_weight
+                v, first, some, record, span, weight, cutoff, grad_image, acc, of_group, of_weight
             )  # fmt: skip
             place = origin[v, 0], origin[v, 1], origin[v, 2]
             inverted, direct = rows_of(inverse[v]), rows_of(matrix[v])
@@ -242,20 +261,21 @@ def _gather_range(
 def forward(position, scale, rotation, weight, views: DetectorViews, cutoff: float):
     """Images (channels, views, rows, columns) float32 without the pixel factor, skipped pairs, and the state
     that :func:`backward` takes. Arguments as for the reference, as float32 numpy arrays."""
-    count, channels = len(position), len(weight)
-    record = np.empty((len(views), count, RECORD), np.float32)
-    span = np.empty((len(views), count, 4), np.int32)
+    count, channels, weight = len(position), len(weight), in_threes(weight)
+    groups = -(-count // GROUP)
+    record = np.empty((len(views), groups, RECORD * GROUP), np.float32)
+    span = np.empty((len(views), groups, 4 * GROUP), np.int32)
     inverse = views.inverse
     scene = (position, scale, rotation, views.cone, views.planar, views.origin, inverse, views.matrix)
-    parts = shares(count, 4, cpu_threads())
+    parts = shares(groups, 4, cpu_threads())
     skipped = sum(
         run_tasks(lambda a, b: set_up(a, b, *scene, cutoff, views.rows, views.columns, record, span), parts)
     )
-    image = np.zeros((len(views), views.rows, channels, views.columns + LANES), np.float32)
+    image = np.zeros((len(views), views.rows, len(weight), views.columns + LANES), np.float32)
     bands = split_range(views.rows, max(1, -(-2 * cpu_threads() // max(1, len(views)))))
     tasks = [(v, a, b) for v in range(len(views)) for a, b in bands]
-    run_tasks(lambda v, a, b: _splat(v, a, b, record, span, weight, cutoff, views.columns, image), tasks)
-    return image[..., : views.columns].transpose(2, 0, 1, 3), skipped, (record, span, inverse)
+    run_tasks(lambda v, a, b: _splat(v, a, b, record, span, weight, cutoff, image), tasks)
+    return image[..., :channels, : views.columns].transpose(2, 0, 1, 3), skipped, (record, span, inverse)
 
 
 def backward(
@@ -266,16 +286,18 @@ def backward(
     With ``of_views`` that of ``views.vectors`` comes fifth, (views, 4, 3) float64, without what the pixel factor adds.
     """
     record, span, inverse = state
+    channels, weight = len(weight), in_threes(weight)
     padded = np.zeros((len(views), views.rows, len(weight), views.columns + LANES), np.float32)
-    padded[..., : views.columns] = grad_image.transpose(1, 2, 0, 3)
+    padded[..., :channels, : views.columns] = grad_image.transpose(1, 2, 0, 3)
     grads = tuple(np.zeros_like(a) for a in (position, scale, rotation, weight))
     groups = -(-len(position) // GROUP)
     # Sums of groups, so that the order of all additions is the same for any number of threads.
     by_group = np.zeros((groups if of_views else 0, len(views), 12))
     scene = (position, scale, rotation, weight, views.cone, views.planar, views.origin, inverse, views.matrix)
-    rest = (*scene, cutoff, views.columns, record, span, padded, *grads, by_group)
+    rest = (*scene, cutoff, record, span, padded, *grads, by_group)
     run_tasks(
         lambda a, b: _gather_range(a * GROUP, min(b * GROUP, len(position)), *rest),
         shares(groups, 16, cpu_threads()),
     )
+    grads = (*grads[:3], grads[3][:channels])
     return (*grads, by_group.sum(axis=0).reshape(-1, 4, 3)) if of_views else grads

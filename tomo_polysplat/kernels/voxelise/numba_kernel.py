@@ -5,16 +5,15 @@ The forward shares out slabs of slices and the backward Gaussians: no atomics, t
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from tomo_polysplat.compiled import njit
 from tomo_polysplat.kernels.gaussian_maths import FAST, gaussian, squared
-from tomo_polysplat.kernels.numba_group import GROUP, SIZE, put_group, take_gradients
+from tomo_polysplat.kernels.numba_group import GROUP, SIZE, in_threes, put_group, take_gradients
 from tomo_polysplat.kernels.numba_lanes import (
     HALF,
     LANES,
+    QUARTER,
     add_blocks,
     ceiling,
     floor,
@@ -22,11 +21,11 @@ from tomo_polysplat.kernels.numba_lanes import (
     inverse_root,
     lane_sums,
     larger,
-    load,
     load_blocks,
     ramp,
     smaller,
     store,
+    store_quarters,
 )
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.kernels.voxelise.numba_ellipsoid import MOMENTS, NUMBERS, describe, pull_back, set_up
@@ -57,107 +56,127 @@ def _rows(rec, by, cut, ny, iz, rows):
 
 
 @njit(inline="always")
-def _row_columns(rec, y, z, cut, length):
-    """The columns a Gaussian reaches in one row."""
-    w, u, across = rec[8] * z, rec[6] * y + rec[7] * z, rec[4] * y + rec[5] * z
-    root = math.sqrt(max(np.float32(0), cut - w * w - u * u))
-    middle, spread = rec[0] - across / rec[3], root / rec[3]
-    low, high = max(0.0, np.ceil(middle - spread)), min(length - 1.0, np.floor(middle + spread))
-    return (int(low), int(high) + 1) if low <= high else (0, 0)
-
-
-@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
-def _fill(first, last, record, weight, cutoff, ny, nx, volume):
-    """Add every Gaussian to the slices first..last of ``volume`` (nz, ny, channels, padded nx)."""
-    cut, one = squared(cutoff), np.float32(1)
-    channels, stride = volume.shape[2:]
-    rows = np.empty(2 * LANES, np.float32)
-    for n in range(len(record)):
-        rec, (low, high, j0, j1), by = _numbers_of(record, n)
-        xc, yc, zc, r11, r12, r13, r22, r23, r33 = rec
-        # A Gaussian of at most one block a row needs no range of columns for every row.
-        narrow, wide = j1 - j0 <= HALF, j1 - j0 > LANES
-        begin = max(low, first)
-        for iz in range(begin, min(high, last)):
-            at_slice = (iz - begin) % LANES
-            if at_slice == 0:
-                _rows(rec, by, cut, ny, iz, rows)
-            z = np.float32(iz) - zc
-            z2 = (r33 * z) * (r33 * z)
-            iy, end = int(rows[at_slice]), int(rows[LANES + at_slice])
-            while iy < end:
-                # Two short rows at once, where there are two.
-                two = narrow and iy + 1 < end
-                y0 = np.float32(iy) - yc
-                y = halves(y0, np.float32(iy + 1) - yc if two else y0)
-                apart = channels * stride if two else HALF
-                if wide:
-                    j0, j1 = _row_columns(rec, y0, z, cut, nx)
-                u = r22 * y + r23 * z
-                rest, across = u * u + z2, r12 * y + r13 * z
-                for j in range(j0, j1, LANES):
-                    x0 = np.float32(j) - xc
-                    x = halves(x0, x0 + np.float32(0 if two else HALF)) + ramp()
-                    t = r11 * x + across
-                    value = gaussian(t * t + rest, cut, one)
-                    at = ((iz * ny + iy) * channels) * stride + j
-                    for c in range(channels):
-                        add_blocks(volume, at + c * stride, apart, weight[c, n], value)
-                iy += 2 if two else 1
+def _across(rec, j, two):
+    """r11 x of lanes on the columns from ``j`` on; with ``two`` those of either half are the same."""
+    x0 = np.float32(j) - rec[0]
+    return rec[3] * (halves(x0, x0 + np.float32(0 if two else HALF)) + ramp())
 
 
 @njit(inline="always")
-def _gather(n, k, record, weight, cutoff, nx, grad_volume, rows, acc):
-    """Write to ``acc``, as those of Gaussian ``k`` of a group, the sums over the voxels of Gaussian ``n``, lane by
-    lane: of h times (t, u, w, tt, tu, tw, uu, uw, ww), with h = dL/d(distance^2) = dL/d(t^2 + u^2 + w^2), and of
+def _slice(rec, across, iz, iy, two):
+    """t and u where y = 0, w, and y of lanes in the row ``iy``, and with ``two`` in the next one, of a slice."""
+    z, y = np.float32(iz) - rec[2], np.float32(iy) - rec[1]
+    return (across + rec[5] * z, rec[7] * z, rec[8] * z), halves(y, y + np.float32(1 if two else 0))
+
+
+@njit(inline="always")
+def _block(rec, begun, y, cut, bottom):
+    """t, u and the value of lanes, zero beyond the cut and below the row ``bottom``."""
+    t, u = begun[0] + rec[4] * y, begun[1] + rec[6] * y
+    return t, u, gaussian(t * t + (u * u + begun[2] * begun[2]), cut, y, bottom, np.float32(1))
+
+
+@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
+def _fill(first, last, record, weight, cutoff, ny, volume):
+    """Add every Gaussian to the slices first..last of ``volume`` (nz, ny, channels, padded nx).
+
+    There are one channel, or three, or a multiple of three.
+    """
+    cut, none = squared(cutoff), np.float32(0)
+    channels, stride = volume.shape[2:]
+    three, rows = channels > 1, np.empty(2 * LANES, np.float32)
+    for n in range(len(record)):
+        rec, (low, high, j0, j1), by = _numbers_of(record, n)
+        begin, end = max(low, first), min(high, last)
+        # Two short rows at once.
+        two = j1 - j0 <= HALF
+        each = 2 if two else 1
+        for c in range(0, channels, 3):
+            w0, w1, w2 = (
+                weight[c, n],
+                weight[c + 1, n] if three else none,
+                weight[c + 2, n] if three else none,
+            )
+            for j in range(j0, j1, LANES):
+                across = _across(rec, j, two)
+                for iz in range(begin, end):
+                    place = (iz - begin) % LANES
+                    if place == 0:
+                        _rows(rec, by, cut, ny, iz, rows)
+                    i0, i1 = int(rows[place]), int(rows[LANES + place])
+                    begun, y = _slice(rec, across, iz, i0, two)
+                    bottom = np.float32(i1) - np.float32(0.5) - rec[1]
+                    at = ((iz * ny + i0) * channels + c) * stride + j
+                    for iy in range(i0, i1, each):
+                        value = _block(rec, begun, y, cut, bottom)[2]
+                        apart = channels * stride if two and iy + 1 < i1 else HALF
+                        add_blocks(volume, at, apart, w0, value)
+                        if three:
+                            add_blocks(volume, at + stride, apart, w1, value)
+                            add_blocks(volume, at + 2 * stride, apart, w2, value)
+                        y, at = y + np.float32(each), at + each * channels * stride
+
+
+@njit(inline="always")
+def _gather(n, k, record, weight, cutoff, grad_volume, rows, acc):
+    """Write to ``acc``, as those of Gaussian ``k`` of a group, the sums over the voxels of Gaussian ``n``, by quarters:
+    of h times (t, u, w, tt, tu, tw, uu, uw, ww), with h = dL/d(distance^2) = dL/d(t^2 + u^2 + w^2), and of
     dL/df f by channel."""
-    cut, half, one = squared(cutoff), np.float32(-0.5), np.float32(1)
+    cut, half, none = squared(cutoff), np.float32(-0.5), np.float32(0)
     _, ny, channels, stride = grad_volume.shape
     rec, (low, high, j0, j1), by = _numbers_of(record, k)
-    xc, yc, zc, r11, r12, r13, r22, r23, r33 = rec
-    narrow, wide = j1 - j0 <= HALF, j1 - j0 > LANES
-    zero = halves(np.float32(0), np.float32(0))
+    three, two = channels > 1, j1 - j0 <= HALF
+    each, zero = 2 if two else 1, halves(none, none)
     m0 = m1 = m2 = m3 = m4 = m5 = m6 = m7 = m8 = zero
-    for c in range(channels):
-        store(acc, ((MOMENTS + c) * GROUP + k) * LANES, zero)
-    for iz in range(low, high):
-        at_slice = (iz - low) % LANES
-        if at_slice == 0:
-            _rows(rec, by, cut, ny, iz, rows)
-        z = np.float32(iz) - zc
-        w = r33 * z
-        z2 = w * w
-        iy, end = int(rows[at_slice]), int(rows[LANES + at_slice])
-        while iy < end:
-            two = narrow and iy + 1 < end
-            y0 = np.float32(iy) - yc
-            y = halves(y0, np.float32(iy + 1) - yc if two else y0)
-            apart = channels * stride if two else HALF
-            if wide:
-                j0, j1 = _row_columns(rec, y0, z, cut, nx)
-            u = r22 * y + r23 * z
-            rest, across = u * u + z2, r12 * y + r13 * z
-            for j in range(j0, j1, LANES):
-                x0 = np.float32(j) - xc
-                x = halves(x0, x0 + np.float32(0 if two else HALF)) + ramp()
-                t = r11 * x + across
-                value = gaussian(t * t + rest, cut, one)
-                at = ((iz * ny + iy) * channels) * stride + j
-                total = zero
-                for c in range(channels):
-                    slope = load_blocks(grad_volume, at + c * stride, apart)
-                    total = total + weight[c, n] * slope
-                    to = ((MOMENTS + c) * GROUP + k) * LANES
-                    store(acc, to, load(acc, to) + slope * value)
-                h = half * total * value
-                ht, hu, hw = h * t, h * u, h * w
-                m0, m1, m2, m3, m4 = m0 + ht, m1 + hu, m2 + hw, m3 + ht * t, m4 + ht * u
-                m5, m6, m7, m8 = m5 + ht * w, m6 + hu * u, m7 + hu * w, m8 + hw * w
-            iy += 2 if two else 1
-    to, each = k * LANES, GROUP * LANES
+    for c in range(0, channels, 3):
+        w0, w1, w2 = weight[c, n], weight[c + 1, n] if three else none, weight[c + 2, n] if three else none
+        s0 = s1 = s2 = zero
+        for j in range(j0, j1, LANES):
+            across = _across(rec, j, two)
+            for iz in range(low, high):
+                place = (iz - low) % LANES
+                if place == 0:
+                    _rows(rec, by, cut, ny, iz, rows)
+                i0, i1 = int(rows[place]), int(rows[LANES + place])
+                begun, y = _slice(rec, across, iz, i0, two)
+                bottom = np.float32(i1) - np.float32(0.5) - rec[1]
+                at = ((iz * ny + i0) * channels + c) * stride + j
+                # w is the same in a slice: of h, h t and h u there is a sum by slices.
+                by_h = by_t = by_u = zero
+                for iy in range(i0, i1, each):
+                    t, u, value = _block(rec, begun, y, cut, bottom)
+                    apart = channels * stride if two and iy + 1 < i1 else HALF
+                    slope = load_blocks(grad_volume, at, apart)
+                    total, s0 = w0 * slope, s0 + slope * value
+                    if three:
+                        slope = load_blocks(grad_volume, at + stride, apart)
+                        total, s1 = total + w1 * slope, s1 + slope * value
+                        slope = load_blocks(grad_volume, at + 2 * stride, apart)
+                        total, s2 = total + w2 * slope, s2 + slope * value
+                    h = half * total * value
+                    ht, hu = h * t, h * u
+                    by_h, by_t, by_u = by_h + h, by_t + ht, by_u + hu
+                    m3, m4, m6 = m3 + ht * t, m4 + ht * u, m6 + hu * u
+                    y, at = y + np.float32(each), at + each * channels * stride
+                w = begun[2]
+                hw = w * by_h
+                m0, m1, m2, m5, m7, m8 = (
+                    m0 + by_t,
+                    m1 + by_u,
+                    m2 + hw,
+                    m5 + w * by_t,
+                    m7 + w * by_u,
+                    m8 + w * hw,
+                )
+        to = ((MOMENTS + c) * GROUP + k) * QUARTER
+        store_quarters(acc, to, s0)
+        if three:
+            store_quarters(acc, to + GROUP * QUARTER, s1)
+            store_quarters(acc, to + 2 * GROUP * QUARTER, s2)
+    to = k * QUARTER
     for m in (m0, m1, m2, m3, m4, m5, m6, m7, m8):
-        store(acc, to, m)
-        to += each
+        store_quarters(acc, to, m)
+        to += GROUP * QUARTER
 
 
 @njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
@@ -169,16 +188,16 @@ def _gather_range(
     group, out, grads = np.zeros(SIZE * GROUP), np.empty(NUMBERS * GROUP), np.empty(12 * GROUP)
     record, rows = np.empty((GROUP, NUMBERS), np.float32), np.empty(2 * LANES, np.float32)
     moments = np.empty((MOMENTS + len(weight)) * GROUP)
-    acc = np.zeros(len(moments) * LANES, np.float32)
+    acc = np.zeros(len(moments) * QUARTER, np.float32)
     corner, edges = (first[0], first[1], first[2]), (spacing[0], spacing[1], spacing[2])
     for n in range(start, stop, GROUP):
         some = min(GROUP, stop - n)
         put_group(n, some, position, scale, rotation, group)
         describe(some, corner, edges, cutoff, len(grad_volume), nx, group, out, record, 0)
         for k in range(some):
-            _gather(n + k, k, record, weight, cutoff, nx, grad_volume, rows, acc)
+            _gather(n + k, k, record, weight, cutoff, grad_volume, rows, acc)
         for m in range(MOMENTS + len(weight)):
-            store(moments, m * GROUP, lane_sums(acc, m * GROUP * LANES))
+            store(moments, m * GROUP, lane_sums(acc, m * GROUP * QUARTER))
         pull_back(edges, group, moments, grads)
         take_gradients(n, some, group, grads, grad_position, grad_scale, grad_rotation)
         for c in range(len(weight)):
@@ -188,22 +207,22 @@ def _gather_range(
 
 def forward(position, scale, rotation, weight, box: VoxelBox, cutoff: float) -> np.ndarray:
     """Volume (channels, nz, ny, nx) float32; arguments as for the reference, as float32 numpy arrays."""
-    nz, ny, nx = box.shape
+    (nz, ny, nx), channels, weight = box.shape, len(weight), in_threes(weight)
     record = np.empty((len(position), NUMBERS), np.float32)
     scene = (position, scale, rotation, box.first, box.spacing, cutoff, nz, nx)
     run_tasks(lambda a, b: set_up(a, b, *scene, record), shares(len(position), 4, cpu_threads()))
     volume = np.zeros((nz, ny, len(weight), nx + LANES), np.float32)
     tasks = shares(nz, 2, cpu_threads())
-    run_tasks(lambda a, b: _fill(a, b, record, weight, cutoff, ny, nx, volume), tasks)
-    return volume[..., :nx].transpose(2, 0, 1, 3)
+    run_tasks(lambda a, b: _fill(a, b, record, weight, cutoff, ny, volume), tasks)
+    return volume[..., :channels, :nx].transpose(2, 0, 1, 3)
 
 
 def backward(position, scale, rotation, weight, box: VoxelBox, cutoff: float, grad_volume: np.ndarray):
     """Gradients of position, scale, rotation and weight for ``grad_volume`` (channels, nz, ny, nx)."""
-    nz, ny, nx = box.shape
+    (nz, ny, nx), channels, weight = box.shape, len(weight), in_threes(weight)
     padded = np.zeros((nz, ny, len(weight), nx + LANES), np.float32)
-    padded[..., :nx] = grad_volume.transpose(1, 2, 0, 3)
+    padded[..., :channels, :nx] = grad_volume.transpose(1, 2, 0, 3)
     grads = tuple(np.zeros_like(a) for a in (position, scale, rotation, weight))
     scene = (position, scale, rotation, weight, box.first, box.spacing, cutoff, nx, padded)
     run_tasks(lambda a, b: _gather_range(a, b, *scene, *grads), shares(len(position), 16, cpu_threads()))
-    return grads
+    return (*grads[:3], grads[3][:channels])
