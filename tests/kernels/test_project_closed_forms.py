@@ -180,8 +180,10 @@ def test_derivatives_of_the_reference(views):
 
 
 def test_a_round_gaussian_has_no_gradient_of_its_rotation(fast):
+    """On the CPU to the rounding of float64: of what rounding leaves Adam makes full steps."""
     scene = gaussians(7)
     scene[1][:] = 0.1
     for kernel, device in (("reference", "cpu"), fast):
         results, _ = run_project(scene, cone_views(), kernel, device)
-        assert results[3].abs().max() < 1e-5 * results[2].abs().max()
+        least = 1e-5 if device == "cuda" else 1e-12
+        assert results[3].abs().max() < least * results[2].abs().max()

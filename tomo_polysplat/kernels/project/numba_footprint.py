@@ -1,9 +1,9 @@
 """Where a Gaussian falls on the detector, and the way back from there to its gradients.
 
-Differences and cross products, which cancel, are in float64; what is made of them is in float32, as are the sums over
-pixels. Both are long chains of operations that wait for each other, once a Gaussian and view, and so they run for a
-group of Gaussians at once (``numba_group``). Vectors are tuples, which the compiler keeps in registers. README.md
-derives the formulas.
+The way back is in float64, and so are the differences and cross products of the way there, which cancel. What is made
+of these is in float32, as are the sums over pixels. Both are long chains of operations that wait for each other, once a
+Gaussian and view, and so they run for a group of Gaussians at once (``numba_group``). Vectors are tuples, which the
+compiler keeps in registers. README.md derives the formulas.
 """
 
 from __future__ import annotations
@@ -216,13 +216,13 @@ def _slopes(cone, planar, frame, m):
     """dL/d(column, row, depth) of the centre and dL/d(W r), dL/d(W U), dL/d(W V), from moments of a footprint.
 
     With t = r11 x + r12 y and u = r22 y, m holds the sums of h (t, u, t^2, t u, u^2) and of
-    s (1, t, u, t^2, t u, u^2), where h = dL/d(distance^2 |e|^2) and s = dL/d|e|^2. Of float32, but for the frame.
+    s (1, t, u, t^2, t u, u^2), where h = dL/d(distance^2 |e|^2) and s = dL/d|e|^2. What
+    cancels, as of the rotation of a round Gaussian, has to: of what rounding leaves Adam makes full steps.
     """
     centre, _, w, wu, wv = frame
     (m0, m1, m2), (m3, m4, m5), (m6, m7, m8), (m9, m10, _) = m
-    q1, q2, (r11, r12, r22), (by_t, by_u) = _triangle(_single(_cross(w, wu)), _single(_cross(w, wv)))
-    column0, row0, kappa = _single(centre)
-    w, wu, wv = _single(w), _single(wu), _single(wv)
+    q1, q2, (r11, r12, r22), (by_t, by_u) = _triangle(_cross(w, wu), _cross(w, wv))
+    column0, row0, kappa = centre
     # x = by_t t - back u, y = by_u u.
     back = by_t * r12 * by_u
     sum_t, sum_u = mix(m2, q1, m3, q2), mix(m3, q1, m4, q2)
