@@ -29,7 +29,7 @@ FILES = ("demo.png", "demo.h5", "demo.json")
 # inwards, and what is missing there makes a bright rim (56³: 28.7 dB without metal and a rim of 1.03 in the middle
 # slices; 29.4 dB and 1.01 by round ones).
 _SIZE, _VIEWS = 60, 96
-_SETTINGS = {"passes": 6.0, "views_per_step": 4, "max_gaussians": 25_000, "seed_edge": 0.0}
+_SETTINGS = {"passes": 5.0, "views_per_step": 4, "max_gaussians": 22_000, "seed_edge": 0.0}
 
 
 def run_demo(
