@@ -51,15 +51,11 @@ def fork(
     Where ``enough`` says so after the first pass of each, that is all.
     """
     its_clock = copy.copy(clock)
-    if enough is not None and passes > 1:
-        made, its = fitter.ahead(clock, 1), other.ahead(its_clock, 1)
-        if its_clock.late or enough():
-            return Fork(its_clock.late, _last(made), _last(its))
-        passes -= 1
-    else:
-        made, its = [], []
-    made += fitter.ahead(clock, passes)
-    its += other.ahead(its_clock, passes)
+    first = passes if enough is None else 1
+    made, its = fitter.ahead(clock, first), other.ahead(its_clock, first)
+    if enough is not None and passes > first and not its_clock.late and not enough():
+        made += fitter.ahead(clock, passes - first)
+        its += other.ahead(its_clock, passes - first)
     return Fork(its_clock.late, _last(made), _last(its))
 
 

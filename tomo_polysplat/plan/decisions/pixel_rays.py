@@ -78,13 +78,20 @@ class PixelRays(Decision):
             raise Untold("the time budget is kept for the fit")
         fitter = run.fitter
         other = lab.branch(pixel_rays=AVERAGED_RAYS)
-        both = [fitter, other]
+        both, share = [fitter, other], 0.0
+
+        def surely_thin() -> bool:
+            nonlocal share
+            share = _share(both)
+            return share >= _SURELY_THIN
+
         passes = passes_of_a_fork(fitter, known[Passes], _STEPS, _MOST)
-        ways = fork(fitter, other, run.clock, passes, lambda: _share(both) >= _SURELY_THIN)
+        ways = fork(fitter, other, run.clock, passes, surely_thin)
         if ways.late:
             run.made = ways.was
             raise Untold("the time budget was used before the rays could tell")
-        share = _share(both)
+        if share < _SURELY_THIN:
+            share = _share(both)
         verdict = PixelLight.gate({"share": share})
         averaged, why = verdict.kept, verdict.why
         run.fitter, run.made = (other, ways.other) if averaged else (fitter, ways.was)
