@@ -181,7 +181,7 @@ def test_the_rays_held_out_are_those_of_the_fit():
     measured, views = problem.measured(torch.device("cpu")), detector_views(problem.geometry, problem.planar)
     rays = Rays(measured, views, np.inf, 0.015, 0.1)
     aside = (rays.batch(np.arange(VIEWS))[3] > 0).numpy()
-    found = HeldOut(geometry, grid, values, 0.1).of(np.arange(VIEWS))
+    found = HeldOut(geometry, grid, values, 0.1, torch.device("cpu")).of(np.arange(VIEWS)).numpy()
     assert found.mean() == pytest.approx(0.1, abs=0.01)
     # Each view of the fit has the rays of one view of the scan, whichever that is.
     fitted = rays.projections.numpy()
@@ -194,7 +194,7 @@ def test_a_view_tells_of_its_rays_held_out():
     """Those alone are off, as after a fit that has taken in their neighbours' noise."""
     values = line_integrals()
     geometry, grid = from_astra(CONE, VOLUME)
-    aside = HeldOut(geometry, grid, values, 0.05).of(np.arange(VIEWS))
+    aside = HeldOut(geometry, grid, values, 0.05, torch.device("cpu")).of(np.arange(VIEWS)).numpy()
     values[aside] += 0.1
     result = ball()
     result.settings = {"held_out": 0.05}

@@ -78,7 +78,7 @@ class Rays:
         if self.noise:
             depth = values if self.dimmed is None else values + self.dimmed
             weight = weight * torch.rsqrt(1 + torch.exp(depth) * self.noise)
-        aside = self._aside(chosen, values.shape[1:])
+        aside = self.aside(chosen)
         return self.views.select(chosen), values, weight * ~aside, weight * aside
 
     @functools.cached_property
@@ -105,9 +105,9 @@ class Rays:
         pixels = len(self.views) * self.views.rows * self.views.columns
         return float(self.totals.sum()) / max(pixels, 1) / (1 - self.held_out)
 
-    def _aside(self, chosen: np.ndarray, shape: torch.Size) -> torch.Tensor:
-        """Pixels held out: a fixed pseudo-random choice, different in every view, that needs no memory."""
-        device = self.target
+    def aside(self, chosen: np.ndarray) -> torch.Tensor:
+        """(n, rows, columns) rays held out: a fixed pseudo-random choice that needs no memory."""
+        device, shape = self.target, self.projections.shape[1:]
         if not self.held_out:
             return torch.zeros((len(chosen), *shape), dtype=torch.bool, device=device)
         pixel = torch.arange(shape.numel(), device=device, dtype=torch.int64).reshape(shape) * 2654435761

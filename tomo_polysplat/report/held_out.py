@@ -27,16 +27,21 @@ class HeldOut:
         Its rays, which tell views of the same geometry apart.
     share : float
         Of the rays that is held out.
+    device : torch.device
+        Where the answers are wanted.
     """
 
-    def __init__(self, geometry: Geometry, grid: VolumeGrid, values: np.ndarray, share: float) -> None:
+    # One parameter for each thing that the choice follows from.
+    def __init__(
+        self, geometry: Geometry, grid: VolumeGrid, values: np.ndarray, share: float, device: torch.device
+    ) -> None:
         length = 0.5 * float(grid.extent.max())
         order = view_order(snapped_geometry(geometry.normalised(grid.centre, length)), values)
         self._rank = np.argsort(order)
         # The choice does not depend on what was measured; one number stands for all.
-        blank = torch.zeros(1, 1, 1).expand(geometry.shape)
+        blank = torch.zeros(1, 1, 1, device=device).expand(geometry.shape)
         self._rays = Rays(blank, detector_views(geometry.select(order), False), math.inf, 1.0, share)
 
-    def of(self, views: np.ndarray) -> np.ndarray:
+    def of(self, views: np.ndarray) -> torch.Tensor:
         """(n, rows, columns) whether each ray of these views was held out."""
-        return np.stack([self._rays.batch(self._rank[[view]])[3][0].numpy() > 0 for view in views])
+        return self._rays.aside(self._rank[views])

@@ -83,8 +83,9 @@ def residuals_of(
     filters = None if spectrum is None else filter_of(result, scan)
     behind = None if filters is None else FilterMap.of(filters, scan.unit, *values.shape[1:])
     model = _Model(result, detector_views(some, planar), pick_fast_device(device), behind)
-    unseen = HeldOut(geometry, grid, values, float(result.settings.get("held_out", 0.0)))
-    photons = photons_per_ray(values, model.dimmed)
+    share = float(result.settings.get("held_out", 0.0))
+    unseen = HeldOut(geometry, grid, values, share, model.device)
+    photons = photons_per_ray(values, model.dimmed, model.device)
     return _collected(model, values, chosen, photons, MisfitMap(some, grid), unseen)
 
 
@@ -172,44 +173,46 @@ def _collected(
     where: MisfitMap,
     unseen: HeldOut,
 ) -> Residuals:
-    pixels = np.zeros((3, *values.shape[1:]))  # how many, their sum, the sum of their squares
-    sums, near = (
-        np.zeros((4, len(chosen))),
-        0,
-    )  # squares and number of all rays of a view, and of those held out
+    # How many, their sum, the sum of their squares; of a view, squares and number of all rays, and of those held out.
+    pixels = torch.zeros((3, *values.shape[1:]), dtype=torch.float64, device=model.device)
+    sums, near = np.zeros((4, len(chosen))), 0
     for first in range(0, len(chosen), _AT_ONCE):
         some = np.arange(first, min(first + _AT_ONCE, len(chosen)))
         scaled, good = _scaled(model, some, values[chosen[some]], photons)
         squares = scaled**2
-        pixels += np.stack([part.sum(axis=0) for part in (good, scaled, squares)])
+        for total, part in zip(pixels, (good, scaled, squares)):
+            total += part.sum(dim=0)
         where.add(some, squares, good)
         aside = good & unseen.of(chosen[some])
-        parts = (squares, good, np.where(aside, squares, 0.0), aside)
-        sums[:, some] = [part.sum(axis=(1, 2)) for part in parts]
-        near += int((np.abs(scaled[good]) < _FAR).sum())
-    rays = int(pixels[0].sum())
+        parts = (squares, good, torch.where(aside, squares, 0.0), aside)
+        sums[:, some] = (
+            torch.stack([part.sum(dim=(1, 2), dtype=torch.float64) for part in parts]).cpu().numpy()
+        )
+        near += int((good & (scaled.abs() < _FAR)).sum())
+    # The sums by pixel, coarser.
     block = max(1, -(-max(values.shape[1:]) // _MAP))
-    number, total, squares = (_blocks(part, block) for part in pixels)
+    number, total, of_squares = (_blocks(part, block) for part in pixels.cpu().numpy())
+    rays = int(number.sum())
     bias = np.divide(total, number, out=np.full(number.shape, np.nan), where=number > 0)
     by_view, held_out = _root_mean(*sums[:2]), _root_mean(*sums[2:])
     totals = sums.sum(axis=1)
     rms, rms_held_out = (float(_root_mean(totals[k], totals[k + 1])) for k in (0, 2))
-    maps = by_view, _root_mean(squares, number), bias, held_out
+    maps = by_view, _root_mean(of_squares, number), bias, held_out
     within = near / max(rays, 1)
     return Residuals(chosen, *maps, rms, within, rms_held_out, rays, photons, *where.worst(), block)
 
 
 def _scaled(
     model: _Model, some: np.ndarray, values: np.ndarray, photons: float
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Residuals of some views in units of noise, 0 where a ray is not usable, and where one is."""
     measured = torch.from_numpy(np.ascontiguousarray(values)).to(model.device)
     predicted = model.predict(some, measured)
     depth = predicted + model.behind[2] if model.behind else predicted
     noise = torch.exp(0.5 * depth) / photons**0.5 if np.isfinite(photons) else 1.0
-    scaled = ((predicted - measured) / noise).cpu().numpy().astype(np.float64)
-    good = np.isfinite(scaled)
-    return np.where(good, scaled, 0.0), good
+    scaled = ((predicted - measured) / noise).double()
+    good = torch.isfinite(scaled)
+    return torch.where(good, scaled, 0.0), good
 
 
 def _root_mean(squares: np.ndarray, number: np.ndarray) -> np.ndarray:

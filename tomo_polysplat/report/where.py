@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 
@@ -37,16 +38,18 @@ class MisfitMap:
         self._geometry = geometry
         self._sum, self._seen = np.zeros(len(self._points)), np.zeros(len(self._points))
 
-    def add(self, views: np.ndarray, squares: np.ndarray, good: np.ndarray) -> None:
+    def add(self, views: np.ndarray, squares: torch.Tensor, good: torch.Tensor) -> None:
         """Take the squared residuals (views, rows, columns) of some views, where `good`."""
         places = self._geometry.select(views).project_points(self._points)
         for place, image, usable in zip(places, squares, good):
             inside = np.isfinite(place).all(axis=1)
             column, row = np.where(inside[:, None], place, -1).round().astype(int).T
             inside &= (row >= 0) & (row < image.shape[0]) & (column >= 0) & (column < image.shape[1])
-            inside[inside] = usable[row[inside], column[inside]]
-            self._sum[inside] += image[row[inside], column[inside]]
-            self._seen[inside] += 1
+            # Only what lies at the points comes from a GPU.
+            pixel = torch.from_numpy(row[inside] * image.shape[1] + column[inside]).to(image.device)
+            seen = usable.flatten()[pixel].cpu().numpy()
+            self._sum[inside] += np.where(seen, image.flatten()[pixel].cpu().numpy(), 0.0)
+            self._seen[inside] += seen
 
     def values(self) -> np.ndarray:
         """(z, y, x) root mean square residual of the rays through each point; 0 where less than half see it."""

@@ -19,7 +19,9 @@ _OF_A_MEDIAN, _CLEARLY = 2.33, 3.0
 
 
 def photons_per_ray(
-    projections: np.ndarray | torch.Tensor, dimmed: np.ndarray | torch.Tensor | None = None
+    projections: np.ndarray | torch.Tensor,
+    dimmed: np.ndarray | torch.Tensor | None = None,
+    device: torch.device | None = None,
 ) -> float:
     """Photons of an unattenuated ray, from the scatter of neighbouring pixels.
 
@@ -35,6 +37,8 @@ def photons_per_ray(
         -log(I/I0); NaN where a ray is unusable.
     dimmed : (rows, columns) array or tensor, optional
         -log of the share of the beam that reaches each pixel through a filter of its own.
+    device : torch.device, optional
+        Where to compute it; where the projections are by default.
 
     Returns
     -------
@@ -46,7 +50,8 @@ def photons_per_ray(
     some = projections[:: max(1, len(projections) // _VIEWS)]
     rows = max(1, -(-math.prod(some.shape) // _MOST))
     some = some[:, ::rows]
-    some = torch.from_numpy(some.astype(np.float64)) if isinstance(some, np.ndarray) else some.double()
+    some = torch.from_numpy(np.array(some)) if isinstance(some, np.ndarray) else some
+    some = some.to(device).double()
     difference = some[..., 3:-1] - 2 * some[..., 2:-2] + some[..., 1:-3]
     # Bins go by the pixels beside the three: if they went by a pixel's own value, its noise would be sorted away.
     middle = 0.5 * (some[..., 4:] + some[..., :-4])
