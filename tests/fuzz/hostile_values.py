@@ -11,7 +11,8 @@ NUMBERS = st.one_of(
     st.floats(-1e4, 1e4),
 )
 ODD_TEXTS = ["", "cm", "W", "Al", "NaN", "\x00", "\ud800", "<b>", "$\\frac", "a" * 5000]
-TEXTS = st.sampled_from(ODD_TEXTS) | st.text()
+# By categories, and not by codec: which of a million characters a codec knows takes seconds to find out.
+TEXTS = st.sampled_from(ODD_TEXTS) | st.text(st.characters(exclude_categories=["Cs"]))
 DTYPES = ["f2", "f4", ">f8", "f8", "i1", "u2", ">i4", "i8", "u8", "?", "c8", "U3", "S2", "M8[s]", "m8[s]"]
 ARRAYS = st.sampled_from(DTYPES).flatmap(
     lambda name: hnp.arrays(np.dtype(name), hnp.array_shapes(min_dims=0, max_dims=4, min_side=0, max_side=5))

