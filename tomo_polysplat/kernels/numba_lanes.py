@@ -275,16 +275,31 @@ def smaller(typing, value, number):
 
 @_intrinsic
 def inverse_root(typing, value):
-    """``1 / sqrt(value)`` within 2e-7 relative, of at least 1e-20."""
+    """``1 / sqrt(value)`` within 4e-7 relative, of at least 1e-20."""
 
     def generate(context, builder, signature, values):
-        flags = ("afn", "arcp", "contract")
-        root = _called(
-            builder, "sqrt", [_called(builder, "maxnum", [*values, _FLOAT(_LEAST)])], fastmath=flags
+        value = _called(builder, "maxnum", [*values, _FLOAT(_LEAST)])
+        if not _has_avx(context):
+            flags = ("afn", "arcp", "contract")
+            return builder.fdiv(_all(1.0), _called(builder, "sqrt", [value], fastmath=flags), flags=flags)
+        # The compiler takes a root and a quotient, which on some processors is a third of all time in the kernels.
+        kind = ir.FunctionType(_BLOCK, [_BLOCK])
+        estimate = get_or_insert_function(builder.module, kind, "llvm.x86.avx.rsqrt.ps.256")
+        parts = (_mask(range(first, first + HALF)) for first in (0, HALF))
+        root = _joined(
+            builder, *(builder.call(estimate, [builder.shuffle_vector(value, value, part)]) for part in parts)
         )
-        return builder.fdiv(_all(1.0), root, flags=flags)
+        # A step of Newton's: from 4e-4 to 2e-7.
+        half = builder.fmul(value, _all(-0.5), flags=_FLAGS)
+        rest = builder.fmul(half, builder.fmul(root, root, flags=_FLAGS), flags=_FLAGS)
+        return builder.fmul(root, builder.fadd(rest, _all(1.5), flags=_FLAGS), flags=_FLAGS)
 
     return _lanes(_lanes), generate
+
+
+def _has_avx(context: Any) -> bool:
+    """Whether what is compiled runs with AVX."""
+    return "+avx," in f"{getattr(context.codegen(), '_tm_features', '')},"
 
 
 @_intrinsic

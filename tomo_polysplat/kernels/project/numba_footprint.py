@@ -83,11 +83,11 @@ def _single(x):
 
 @step
 def _triangle(nu, nv):
-    """Orthonormal q1, q2, then r11, r12, r22 with ``nu = r11 q1`` and ``nv = r12 q1 + r22 q2``, and 1 / r11, 1 / r22
-    (0 where that is none). Of float32."""
-    q1, r11, by_r11 = _direction(nu)
-    r12 = dot(q1, nv)
-    q2, r22, by_r22 = _direction((nv[0] - r12 * q1[0], nv[1] - r12 * q1[1], nv[2] - r12 * q1[2]))
+    """Orthonormal q1, q2, then r11, r12, r22 with ``nv = r11 q1`` and ``nu = r12 q1 + r22 q2``, and 1 / r11, 1 / r22
+    (0 where that is none)."""
+    q1, r11, by_r11 = _direction(nv)
+    r12 = dot(q1, nu)
+    q2, r22, by_r22 = _direction((nu[0] - r12 * q1[0], nu[1] - r12 * q1[1], nu[2] - r12 * q1[2]))
     return q1, q2, (r11, r12, r22), (by_r11, by_r22)
 
 
@@ -102,7 +102,7 @@ def _direction(x):
 def _described(cone, planar, cutoff, rows, columns, centre, w, wu, wv):
     """The numbers of a footprint by threes, and its half-open ranges of rows and columns (all 0 if there are none).
 
-    Column0, row0, r11, r12, r22 (the whitened distance is |(r11 x + r12 y, r22 y)| / |e|), then those of
+    Column0, row0, r11, r12, r22 (the whitened distance is |(r11 y + r12 x, r22 x)| / |e|), then those of
     |e|^2 = n[5] + n[6] x + n[7] y + n[8] x^2 + n[9] x y + n[10] y^2.
     """
     _, _, (r11, r12, r22), _ = _triangle(_single(_cross(w, wu)), _single(_cross(w, wv)))
@@ -117,7 +117,7 @@ def _described(cone, planar, cutoff, rows, columns, centre, w, wu, wv):
         uu, uv, vv = dot(wu, wu), dot(wu, wv), dot(wv, wv)
     # (distance^2 - cutoff^2) |e|^2 = a x^2 + 2 b x y + c y^2 + 2 d x + 2 f y + g, not positive within the cut.
     cut = np.float32(cutoff * cutoff)
-    a, b, c = r11 * r11 - cut * uu, r11 * r12 - cut * uv, r12 * r12 + r22 * r22 - cut * vv
+    a, b, c = r12 * r12 + r22 * r22 - cut * uu, r11 * r12 - cut * uv, r11 * r11 - cut * vv
     d, f, g = -cut * eu, -cut * ev, -cut * ee
     if planar:
         i0, i1 = _NONE, _ONE
@@ -215,7 +215,7 @@ def ends_of(a, k):
 def _slopes(cone, planar, frame, m):
     """dL/d(column, row, depth) of the centre and dL/d(W r), dL/d(W U), dL/d(W V), from moments of a footprint.
 
-    With t = r11 x + r12 y and u = r22 y, m holds the sums of h (t, u, t^2, t u, u^2) and of
+    With t = r11 y + r12 x and u = r22 x, m holds the sums of h (t, u, t^2, t u, u^2) and of
     s (1, t, u, t^2, t u, u^2), where h = dL/d(distance^2 |e|^2) and s = dL/d|e|^2. What
     cancels, as of the rotation of a round Gaussian, has to: of what rounding leaves Adam makes full steps.
     """
@@ -223,23 +223,23 @@ def _slopes(cone, planar, frame, m):
     (m0, m1, m2), (m3, m4, m5), (m6, m7, m8), (m9, m10, _) = m
     q1, q2, (r11, r12, r22), (by_t, by_u) = _triangle(_cross(w, wu), _cross(w, wv))
     column0, row0, kappa = centre
-    # x = by_t t - back u, y = by_u u.
+    # y = by_t t - back u, x = by_u u.
     back = by_t * r12 * by_u
     sum_t, sum_u = mix(m2, q1, m3, q2), mix(m3, q1, m4, q2)
-    g_nu, g_nv = mix(_TWO * by_t, sum_t, -_TWO * back, sum_u), mix(_TWO * by_u, sum_u, _NONE, sum_u)
-    g_column, g_row = -_TWO * r11 * m0, -_TWO * (r12 * m0 + r22 * m1)
+    g_nv, g_nu = mix(_TWO * by_t, sum_t, -_TWO * back, sum_u), mix(_TWO * by_u, sum_u, _NONE, sum_u)
+    g_row, g_column = -_TWO * r11 * m0, -_TWO * (r12 * m0 + r22 * m1)
     # nu = w x WU and nv = w x WV.
     g_wu, g_wv = _cross(g_nu, w), _cross(g_nv, w)
     g_w = mix(_ONE, _cross(wu, g_nu), _ONE, _cross(wv, g_nv))
     g_depth = _NONE
     if cone:
         # e = e0 + t et + u eu.
-        e0, et, eu = mix(kappa, w, _NONE, w), mix(by_t, wu, _NONE, wu), mix(by_u, wv, -back, wu)
+        e0, et, eu = mix(kappa, w, _NONE, w), mix(by_t, wv, _NONE, wv), mix(by_u, wu, -back, wv)
         g_e = mix(_TWO, mix(m5, e0, m6, et), _TWO * m7, eu)
         sum_t = mix(_ONE, mix(m6, e0, m8, et), m9, eu)
         sum_u = mix(_ONE, mix(m7, e0, m9, et), m10, eu)
-        g_wu = mix(_ONE, g_wu, _ONE, mix(_TWO * by_t, sum_t, -_TWO * back, sum_u))
-        g_wv = mix(_ONE, g_wv, _TWO * by_u, sum_u)
+        g_wv = mix(_ONE, g_wv, _ONE, mix(_TWO * by_t, sum_t, -_TWO * back, sum_u))
+        g_wu = mix(_ONE, g_wu, _TWO * by_u, sum_u)
         g_w = mix(_ONE, g_w, kappa, g_e)
         g_column -= dot(g_e, wu)
         g_row = _NONE if planar else g_row - dot(g_e, wv)

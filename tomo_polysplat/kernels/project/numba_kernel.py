@@ -54,13 +54,14 @@ __all__ = ["backward", "forward"]
 
 @njit(inline="always")
 def _across(rec, j, two):
-    """Of lanes on the columns from ``j`` on: r11 x, and |e|^2 and its slope by y where y = 0.
+    """Of lanes on the columns from ``j`` on: u = r22 x, its square, and where y = 0 t, |e|^2 and its slope by y.
 
     They are the same in all rows. With ``two`` the columns of either half are the same.
     """
     x0 = np.float32(j) - rec[0]
     x = halves(x0, x0 + np.float32(0 if two else HALF)) + ramp()
-    return rec[2] * x, rec[5] + x * (rec[6] + x * rec[8]), rec[7] + rec[9] * x
+    u = rec[4] * x
+    return u, u * u, rec[3] * x, rec[5] + x * (rec[6] + x * rec[8]), rec[7] + rec[9] * x
 
 
 @njit(inline="always")
@@ -72,12 +73,12 @@ def _down(rec, i, two):
 
 @njit(inline="always")
 def _block(rec, across, y, cut, bottom):
-    """t, u, 1 / |e|^2, the distance q and ``exp(-q / 2) / |e|``, zero beyond the cut and below the row ``bottom``."""
-    t, u = across[0] + rec[3] * y, rec[4] * y
-    root = inverse_root(across[1] + y * (across[2] + y * rec[10]))
+    """t, 1 / |e|^2, the distance q and ``exp(-q / 2) / |e|``, zero beyond the cut and below the row ``bottom``."""
+    t = across[2] + rec[2] * y
+    root = inverse_root(across[3] + y * (across[4] + y * rec[10]))
     inverse = root * root
-    q = (t * t + u * u) * inverse
-    return t, u, inverse, q, gaussian(q, cut, y, bottom, root)
+    q = (t * t + across[1]) * inverse
+    return t, inverse, q, gaussian(q, cut, y, bottom, root)
 
 
 @njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
@@ -109,7 +110,7 @@ def _splat(v, first, last, record, span, weight, cutoff, image):
                 across, y = _across(rec, j, two), _down(rec, low, two)
                 at = ((v * rows + low) * channels + c) * stride + j
                 for i in range(low, high, each):
-                    value = _block(rec, across, y, cut, bottom)[4]
+                    value = _block(rec, across, y, cut, bottom)[3]
                     apart = channels * stride if two and i + 1 < high else HALF
                     add_blocks(image, at, apart, w0, value)
                     if three:
@@ -122,7 +123,7 @@ def _splat(v, first, last, record, span, weight, cutoff, image):
 def _gather(v, n, k, numbers, ends, weight, cutoff, grad_image, acc):
     """Write to ``acc``, as those of Gaussian ``k`` of a group, the sums over the footprint of Gaussian ``n`` in view
     ``v``, by quarters: the moments in the order of ``pull_back``, then the gradient of its weight in every channel."""
-    cut, half, one, none = squared(cutoff), np.float32(-0.5), np.float32(1), np.float32(0)
+    cut, half, none = squared(cutoff), np.float32(-0.5), np.float32(0)
     rows, channels, stride = grad_image.shape[1:]
     three = channels > 1
     rec, (low, high, j0, j1) = numbers_of(numbers, k), ends_of(ends, k)
@@ -136,8 +137,10 @@ def _gather(v, n, k, numbers, ends, weight, cutoff, grad_image, acc):
         for j in range(j0, j1, LANES):
             across, y = _across(rec, j, two), _down(rec, low, two)
             at = ((v * rows + low) * channels + c) * stride + j
+            # u is the same in all rows, so sums of h and of g = h - s with 1, t and t^2 tell all moments.
+            h0 = h1 = h2 = g0 = g1 = g2 = zero
             for i in range(low, high, each):
-                t, u, inverse, q, value = _block(rec, across, y, cut, bottom)
+                t, inverse, q, value = _block(rec, across, y, cut, bottom)
                 apart = channels * stride if two and i + 1 < high else HALF
                 slope = load_blocks(grad_image, at, apart)
                 total, s0 = w0 * slope, s0 + slope * value
@@ -147,11 +150,15 @@ def _gather(v, n, k, numbers, ends, weight, cutoff, grad_image, acc):
                     slope = load_blocks(grad_image, at + 2 * stride, apart)
                     total, s2 = total + w2 * slope, s2 + slope * value
                 h = half * total * value * inverse
-                s = h * (one - q)
-                ht, hu, st, su = h * t, h * u, s * t, s * u
-                m0, m1, m2, m3, m4 = m0 + ht, m1 + hu, m2 + ht * t, m3 + ht * u, m4 + hu * u
-                m5, m6, m7, m8, m9, m10 = m5 + s, m6 + st, m7 + su, m8 + st * t, m9 + st * u, m10 + su * u
+                g = h * q
+                ht, gt = h * t, g * t
+                h0, h1, h2 = h0 + h, h1 + ht, h2 + ht * t
+                g0, g1, g2 = g0 + g, g1 + gt, g2 + gt * t
                 y, at = y + np.float32(each), at + each * channels * stride
+            u, d0, d1 = across[0], h0 - g0, h1 - g1
+            hu, du = u * h0, u * d0
+            m0, m1, m2, m3, m4 = m0 + h1, m1 + hu, m2 + h2, m3 + u * h1, m4 + u * hu
+            m5, m6, m7, m8, m9, m10 = m5 + d0, m6 + d1, m7 + du, m8 + (h2 - g2), m9 + u * d1, m10 + u * du
         _store_sums(acc, MOMENTS + c, k, (s0, s1, s2) if three else (s0, zero, zero), three)
     to, next_one = k * QUARTER, GROUP * QUARTER
     for m in (m0, m1, m2, m3, m4, m5, m6, m7, m8, m9, m10):
