@@ -90,9 +90,11 @@ def test_what_a_budget_is_too_short_for_is_said_after_four_steps(monkeypatch, ca
     assert "about 60 s more" in result.plan["time_budget"].why and told[0] == (10, True)
 
 
-def test_no_time_at_all_gives_the_start_itself():
+def test_no_time_at_all_gives_the_start_itself(caplog):
     scan = fan(False)
-    result = reconstruct(scan, time_budget=1e-6)
+    with caplog.at_level(logging.WARNING):
+        result = reconstruct(scan, time_budget=1e-6)
+    assert "start volume took all of the 1e-06 s of time_budget" in caplog.text
     assert result.plan["returned"].value == "start" and not result.gaussians
     assert result.counts["gaussians"] == 0 and result.volume.min() >= 0
     assert rms(result.volume, scan) < 0.1 * scan.truth.max()

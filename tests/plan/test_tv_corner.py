@@ -3,8 +3,13 @@
 import numpy as np
 import pytest
 import torch
+from planned import ball, problem
 
+from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.kernels.compile_time import working_time
 from tomo_polysplat.plan.decisions.tv_corner import bodies, corners_for, share_alike, tv_corners
+from tomo_polysplat.plan.lab import Lab
+from tomo_polysplat.plan.order import decide_start
 from tomo_polysplat.settings import Settings
 
 
@@ -63,3 +68,13 @@ def test_matter_beside_metal_is_no_witness():
     soft, dense = bodies(relative, Settings())
     assert not soft[0, 9, 5:12].any() and bool(soft[0, 9, 12])
     assert int(dense.sum()) == 16 and not (soft & dense).any()
+
+
+@pytest.mark.parametrize(("left", "made"), [(None, 1), (60.0, 1), (-1.0, 0)])
+def test_halves_are_not_made_after_the_time_budget(monkeypatch, left, made):
+    of, asked = problem(41), []
+    monkeypatch.setattr(Problem, "agreement", lambda self, bodies: asked.append(1) or [0.9, None])
+    end = None if left is None else working_time() + left
+    lab = Lab(of, torch.as_tensor(ball(of, 1.0)), Settings(), torch.device("cpu"), end=end)
+    decide_start(lab)
+    assert len(asked) == made and ("do not tell" in lab.plan.answers["tv_corner"].why) == (not made)

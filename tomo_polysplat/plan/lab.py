@@ -14,6 +14,7 @@ from tomo_polysplat.fit.optimise import FitOutcome, Run
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.kernels.compile_time import working_time
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.plan.first_gaussians import first_gaussians
 from tomo_polysplat.plan.means import Means
@@ -55,6 +56,8 @@ class Lab:
         That the run begins with, or goes on with from a checkpoint.
     run : Run or None
         The run, between two of its passes.
+    end : float or None
+        When the time budget ends, in seconds of ``kernels.compile_time.working_time``.
     """
 
     problem: Problem
@@ -68,6 +71,7 @@ class Lab:
     calibrate: Callable[[], dict[str, Any]] | None = None
     gaussians: Gaussians | None = None
     run: Run | None = None
+    end: float | None = None
     _seeds: dict[Any, tuple[Gaussians, dict[str, Any]]] = field(default_factory=dict, init=False)
     _trials: dict[Any, FitOutcome] = field(default_factory=dict, init=False)
 
@@ -95,6 +99,11 @@ class Lab:
     def rays(self) -> Rays:
         """The measured rays."""
         return rays_of(self.problem, self.plan, self.settings, self.device)
+
+    @property
+    def late(self) -> bool:
+        """Whether the time budget is over."""
+        return self.end is not None and working_time() >= self.end
 
     @property
     def seeding(self) -> Settings:

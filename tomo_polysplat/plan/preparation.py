@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -43,6 +44,8 @@ __all__ = [
     "prepare",
     "under",
 ]
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -159,7 +162,9 @@ def prepare(
             return PreparedFit(plan, gaussians, scene, rays_of(problem, plan, settings, device))
         if lab is None:
             report(0.0, "start volume")
-            lab = lab_of(problem, plan, run_options)
+            lab = lab_of(problem, plan, run_options, end)
+            if lab.late:
+                _warn_of_late_start(run_options.time_budget)
         else:
             lab.plan.facts = plan.facts | lab.plan.facts
             plan = lab.plan
@@ -186,14 +191,21 @@ def no_result_yet() -> Iterator[None]:
         raise KeyboardInterrupt("interrupted before the fit had begun: there is no result yet") from None
 
 
-def lab_of(problem: Problem, plan: Plan, means: Means) -> Lab:
+def lab_of(problem: Problem, plan: Plan, means: Means, end: float | None = None) -> Lab:
     """A lab for all questions of a problem, with what its start volume answers in the ``plan``."""
     settings, device = means.settings, means.device
     start, why = first_volume(problem, device, settings)
-    lab = Lab(problem, start, settings, device, means.seed, means.time_budget, plan, fit_start)
+    lab = Lab(problem, start, settings, device, means.seed, means.time_budget, plan, fit_start, end=end)
     decide_start(lab)
     plan.note("start", why)
     return lab
+
+
+def _warn_of_late_start(budget: float | None) -> None:
+    remedy = "Give it more time, fewer voxels, or a GPU"
+    logger.warning(
+        "The start volume took all of the %g s of time_budget: little will be fitted. %s.", budget, remedy
+    )
 
 
 def fit_start(lab: Lab, settings: Settings, steps: int) -> ShortFit:

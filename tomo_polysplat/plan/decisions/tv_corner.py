@@ -128,6 +128,11 @@ def corners_for(agreement: Sequence[float | None], shape: Sequence[int], alike: 
     return _SMOOTH * ratio ** (fine * of_soft), _SMOOTH * ratio ** (fine * of_dense)
 
 
+def _untold(bodies: Sequence[torch.Tensor]) -> list[float | None]:
+    """No agreement, where there is no time for the volumes that tell it."""
+    return [None] * len(bodies)
+
+
 def _ramp(value: float, start: float, end: float) -> float:
     """From 0 to 1."""
     return min(max((value - start) / (end - start), 0.0), 1.0)
@@ -154,6 +159,8 @@ class TvCorner(Decision):
         """By what two halves of the views agree on."""
         light = known.answer(SupportLevel).evidence["lightness"]
         settings = adapted_to(known[SoftReference], lab.settings)
-        corners, why = tv_corners(lab.relative, settings, lab.problem.agreement, light)
+        # Two more volumes take as long as the start did.
+        agreement = _untold if lab.late else lab.problem.agreement
+        corners, why = tv_corners(lab.relative, settings, agreement, light)
         given = bool(lab.settings.tv_corner) or not lab.settings.tv_weight
         return Answer(list(corners), why, Status.GIVEN if given else Status.ASKED)
