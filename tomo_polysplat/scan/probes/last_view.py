@@ -34,7 +34,9 @@ def probe_last_view(measured: Measured) -> Finding:
     column = float(np.median(measured.geometry.project_points(measured.axis[None])[:, 0, 0]))
     off = column + (np.arange(-_OFF, _OFF + _APART / 2, _APART) if half else np.zeros(1))
     light, least = _light(measured)
-    closing = [_change(light[:, -1], light[:, 0] if not half else _mirrored(light[:, 0], place)) for place in off]
+    closing = [
+        _change(light[:, -1], light[:, 0] if not half else _mirrored(light[:, 0], place)) for place in off
+    ]
     numbers = {"told": gap, "ratio": closing[len(off) // 2] / max(least, 1e-300)}
     # Squares of so many independent values.
     doubt = _SURE * np.sqrt(2 / max(light[:, 0].size / (4 * np.pi * _SMOOTH**2), 1.0))
@@ -45,7 +47,9 @@ def probe_last_view(measured: Measured) -> Finding:
         turn = "the angles want numpy.linspace(..., endpoint=True), or one view is there twice"
         return Finding(LAST_VIEW, DEFECT, text, turn, numbers)
     if same or (other and gap == 1):
-        return Finding(LAST_VIEW, OK, f"{where}{'' if gap == 0 else ' but for one step'}, as told", "", numbers)
+        return Finding(
+            LAST_VIEW, OK, f"{where}{'' if gap == 0 else ' but for one step'}, as told", "", numbers
+        )
     return Finding(LAST_VIEW, UNKNOWN, unknown, remedy, numbers)
 
 
