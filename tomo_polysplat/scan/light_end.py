@@ -52,7 +52,7 @@ def mend_light_end(values: np.ndarray) -> int:
     values[saturated] = 0.0
     values[near] = np.nan
     words = "they are taken to pass beside the object, but for %d at the border, which are left out"
-    logger.warning(f"%s: the detector was saturated there; {words}: %s.", share, int(near.sum()), remedy)
+    logger.warning("%s: the detector was saturated there; " + words + ": %s.", share, near.sum(), remedy)
     return many
 
 
@@ -82,7 +82,7 @@ def _within(rays: np.ndarray, wide: int) -> np.ndarray:
 
 
 def _width(values: np.ndarray, saturated: np.ndarray, low: float) -> int:
-    """Pixels of the border that may see matter: where a round object's edge goes on from the first ray above the end."""
+    """Pixels at the border that may see matter: as far as a round edge goes on from the first ray above the end."""
     steps = np.abs(np.diff(values, axis=2))[saturated[..., 1:] != saturated[..., :-1]]
     steps = steps[np.isfinite(steps)]
     # The chord of a round edge rises with the root of the depth: half as far as its slope there tells.

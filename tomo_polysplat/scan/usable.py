@@ -38,6 +38,7 @@ _MOST_LEFT_OUT = 0.2
 _AT_ONCE = 1 << 20
 
 
+# One step after another, each of which takes rays out and counts them.
 def usable_rays(
     projections: Any,
     proj_geom: Mapping[str, Any],

@@ -28,7 +28,9 @@ def probe_last_view(measured: Measured) -> Finding:
         return Finding(LAST_VIEW, UNKNOWN, text, "a look at where the stage went")
     where = "half a turn from the first" if half else "where the first is"
     unknown = f"whether the last view is {where}, or one step before, does not show"
-    remedy = "a look at where the stage went: numpy.linspace(..., endpoint=True) if it went all the way, else endpoint=False"
+    remedy = (
+        "angles from numpy.linspace(..., endpoint=True) if the stage went all the way, else endpoint=False"
+    )
     if measured.scan.views <= _FEWEST:
         return Finding(LAST_VIEW, UNKNOWN, unknown, remedy)
     column = float(np.median(measured.geometry.project_points(measured.axis[None])[:, 0, 0]))
