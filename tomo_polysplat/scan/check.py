@@ -59,8 +59,8 @@ def check_scan(scan: Scan) -> list[Finding]:
     -------
     list of Finding
         On bad rays, the logarithm and its base, the order of the axes and of the views, the last view, the open beam,
-        truncation, voxels that no ray sees, the unit of length, the centre and the direction of the angles. A probe without
-        evidence says "unknown" and what it would take, and the others answer all the same.
+        truncation, voxels that no ray sees, the unit of length, the centre and the direction of the angles. A probe
+        without evidence says "unknown" and what it would take, and the others answer all the same.
     """
     measured = Measured(scan)
     kinds = bad_rays(measured)
