@@ -70,6 +70,7 @@ def more_likely(scatter: Mapping[str, float], beam: Mapping[str, float]) -> str:
     scatter, beam : mapping of str to float
         See `light_gate`; ``of_light`` of the scatter is how much it varies, 0 for a constant.
     """
-    better = scatter["held_out_after"] < (1 - _MARGIN) * beam["held_out_after"]
-    darker = scatter["darkest_after"] < beam["darkest_after"]
+    held_out = scatter["held_out_after"] / beam["held_out_after"]
+    better, darkest = held_out < 1 - _MARGIN, 1 + _MARGIN if held_out < _FAR_BETTER else 1.0
+    darker = scatter["darkest_after"] < darkest * beam["darkest_after"]
     return "scatter" if better and (darker or scatter.get("of_light", 0.0) != 0) else "beam"
