@@ -74,6 +74,17 @@ def test_what_explains_far_more_of_the_rays_is_not_left_out_for_its_likeness():
     assert more_likely(both | {"held_out_after": 0.3, "darkest_after": 0.91}, both) == "scatter"
 
 
+def test_scatter_that_varies_and_explains_more_is_no_beam_whatever_the_darkest_rays_say():
+    beam = ERRORS | DARKEST | {"held_out_after": 0.5}
+    soft = beam | {"held_out_after": 0.47, "darkest_after": 1.5, "of_light": -0.1}
+    assert more_likely(soft, beam) == "scatter"
+    assert (
+        more_likely(soft | {"of_light": 0.0}, beam)
+        == more_likely(soft | {"held_out_after": 0.49}, beam)
+        == "beam"
+    )
+
+
 def test_few_dark_rays_do_not_outweigh_all_others_where_the_beam_explains_these():
     far = ERRORS | DARKEST | {"held_out_after": 0.69, "darkest_after": 1.06}
     assert OpenBeam.gate(far).kept and not ScatteredLight.gate(far).kept

@@ -13,7 +13,7 @@ from tomo_polysplat.scan.scan import Scan
 PHOTONS, RADIUS = 400.0, 0.8
 
 
-def water(photons=PHOTONS, seed=0, doubled=False):
+def water(photons=PHOTONS, seed=0, doubled=False, told=None):
     """A cylinder of water in 91 columns of a parallel beam, with Poisson counts, and three rods in it."""
     columns, views, pixel = 91, 61, 0.021
     angles = np.linspace(0, 2 * np.pi, views, endpoint=doubled)
@@ -24,6 +24,7 @@ def water(photons=PHOTONS, seed=0, doubled=False):
         path = path + 2 * np.sqrt(np.clip(0.15**2 - away**2, 0, None))
     light = np.random.default_rng(seed).poisson(photons * np.exp(-0.9 * np.repeat(path[None], 9, axis=0)))
     values = -np.log(np.maximum(light, 1) / photons)
+    angles = np.linspace(0, 2 * np.pi, views, endpoint=doubled if told is None else told)
     proj_geom, vol_geom = tps.parallel_geometry(pixel=pixel, detector=(9, columns), radians=angles)
     spectrum = tps.Spectrum.monochromatic(14.5)  # where water attenuates by about 1.7 1/cm
     return Scan(values.astype(np.float32), proj_geom, vol_geom, spectrum=spectrum)
@@ -65,7 +66,20 @@ def test_lengths_make_matter_of_a_possible_density(times, verdict, density):
     assert answer(replace(scan, spectrum=None), "unit of length").verdict == UNKNOWN
 
 
-def test_a_last_view_where_the_first_is_told_to_be_is_asked_about():
-    assert answer(water(1e4), "order of views").verdict == OK
-    found = answer(water(1e4, doubled=True), "order of views")
-    assert found.verdict == UNKNOWN and "endpoint=False" in found.remedy
+@pytest.mark.parametrize(
+    ("went", "told", "verdict", "remedy"),
+    [
+        (False, False, OK, ""),
+        (True, True, OK, ""),
+        (True, False, DEFECT, "endpoint=True"),
+        (False, True, UNKNOWN, "endpoint=False"),
+    ],
+)
+def test_the_last_view_tells_whether_a_turn_has_a_step_less(went, told, verdict, remedy):
+    found = answer(water(1e5, doubled=went, told=told), "last view")
+    assert found.verdict == verdict and remedy in found.remedy
+
+
+def test_noise_hides_where_the_last_view_is():
+    for went in (False, True):
+        assert answer(water(30.0, doubled=went, told=False), "last view").verdict == UNKNOWN

@@ -62,14 +62,15 @@ def more_likely(scatter: Mapping[str, float], beam: Mapping[str, float]) -> str:
     """What explains the rays where both do, better than neither: "scatter" or "beam".
 
     Both cannot be left out then: the rays beside the object have more light than the open field. A brighter beam is
-    the smaller change, and takes nothing away from dark rays.
+    the smaller change, and takes nothing away from dark rays. Yet it is as much brighter everywhere: scatter that
+    varies, and explains more, is no beam. Without metal that tells more than the darkest rays, which have much light.
 
     Parameters
     ----------
     scatter, beam : mapping of str to float
-        See `light_gate`.
+        See `light_gate`; ``of_light`` of the scatter is how much it varies, 0 for a constant.
     """
     held_out = scatter["held_out_after"] / beam["held_out_after"]
-    darkest = 1 + _MARGIN if held_out < _FAR_BETTER else 1.0
-    surely = held_out < 1 - _MARGIN and scatter["darkest_after"] < darkest * beam["darkest_after"]
-    return "scatter" if surely else "beam"
+    better, darkest = held_out < 1 - _MARGIN, 1 + _MARGIN if held_out < _FAR_BETTER else 1.0
+    darker = scatter["darkest_after"] < darkest * beam["darkest_after"]
+    return "scatter" if better and (darker or scatter.get("of_light", 0.0) != 0) else "beam"

@@ -138,6 +138,7 @@ def _evidence(
     if "scatter" in fit.fitted:
         darker = before.rays.darker_than(ScatteredLight.of(fit.fitted))
         numbers |= {"darker": darker, "rays": len(before.rays.measured)}
+        numbers |= {"of_light": float(fit.fitted.get("scatter_of_light", 0.0))}
     for rival in rivals:
         numbers |= {"held_out_rival": rival.held_out, "darkest_rival": rival.darkest}
     return numbers

@@ -10,6 +10,7 @@ import numpy as np
 from tomo_polysplat.scan.probes.axes import AXES, probe_axes
 from tomo_polysplat.scan.probes.beam import BEAM, probe_beam
 from tomo_polysplat.scan.probes.finding import DEFECT, OK, UNKNOWN, Finding, Verdict
+from tomo_polysplat.scan.probes.last_view import LAST_VIEW, probe_last_view
 from tomo_polysplat.scan.probes.lengths import LENGTHS, probe_lengths
 from tomo_polysplat.scan.probes.logarithm import LOGARITHM, probe_logarithm
 from tomo_polysplat.scan.probes.measured import Measured
@@ -32,6 +33,7 @@ FIRST: tuple[tuple[tuple[str, ...], Probe], ...] = (
 )
 LATER: tuple[tuple[tuple[str, ...], Probe], ...] = (
     ((ORDER,), probe_order),
+    ((LAST_VIEW,), probe_last_view),
     ((SCALE,), probe_scale),
     ((BEAM,), probe_beam),
     ((TRUNCATION,), probe_truncation),
@@ -56,9 +58,9 @@ def check_scan(scan: Scan) -> list[Finding]:
     Returns
     -------
     list of Finding
-        On bad rays, the logarithm and its base, the order of the axes and of the views, the open beam, truncation,
-        voxels that no ray sees, the unit of length, the centre and the direction of the angles. A probe without
-        evidence says "unknown" and what it would take, and the others answer all the same.
+        On bad rays, the logarithm and its base, the order of the axes and of the views, the last view, the open beam,
+        truncation, voxels that no ray sees, the unit of length, the centre and the direction of the angles. A probe
+        without evidence says "unknown" and what it would take, and the others answer all the same.
     """
     measured = Measured(scan)
     kinds = bad_rays(measured)

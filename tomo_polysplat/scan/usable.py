@@ -19,6 +19,7 @@ from tomo_polysplat.scan.geometry import (
     projections_from_astra,
     require_projections,
 )
+from tomo_polysplat.scan.light_end import mend_light_end
 from tomo_polysplat.scan.line_integrals import require_line_integrals
 from tomo_polysplat.scan.noise import photons_per_ray
 from tomo_polysplat.scan.opaque import fill_opaque
@@ -37,6 +38,7 @@ _MOST_LEFT_OUT = 0.2
 _AT_ONCE = 1 << 20
 
 
+# One step after another, each of which takes rays out and counts them.
 def usable_rays(
     projections: Any,
     proj_geom: Mapping[str, Any],
@@ -81,6 +83,8 @@ def usable_rays(
     else:
         # A scale that goes to infinity has no end before.
         counts["rays_opaque"] = fill_dark_end(values)
+    if saturated := mend_light_end(values):
+        counts["rays_saturated"] = saturated
     if used < (1 - _MOST_LEFT_OUT) * values.size:
         _tell_left_out({name: n for name, n in counts.items() if name != "rays_opaque"}, used)
     if counts["rays_opaque"]:

@@ -30,8 +30,6 @@ _FURTHER, _FAR, _ELSEWHERE = 2.5, 0.3, 0.5
 _TIMES, _LEAST = 10.0, 0.05
 # Share of the views that have to stand out in other places, for the order to be right.
 _POWER = 0.2
-# Views are in one place that are closer than this share of a step.
-_ONE_PLACE = 0.1
 
 
 def probe_order(measured: Measured) -> Finding:
@@ -74,10 +72,10 @@ def probe_order(measured: Measured) -> Finding:
         text = f"views {named} do not look like their neighbours, but like views from elsewhere"
         return Finding(ORDER, DEFECT, text, "leave them out, or mend their order or angle", numbers, doubt)
     shows = _would_show(views, squared, near, usual) >= _POWER
-    return _in_order(numbers, doubt, shows, _ends_where_it_began(measured))
+    return _in_order(numbers, doubt, shows)
 
 
-def _in_order(numbers: dict[str, float], doubt: float, shows: bool, closes: bool) -> Finding:
+def _in_order(numbers: dict[str, float], doubt: float, shows: bool) -> Finding:
     """What to say where nothing is seen to be misplaced.
 
     Parameters
@@ -88,28 +86,15 @@ def _in_order(numbers: dict[str, float], doubt: float, shows: bool, closes: bool
         Standard error of the rank.
     shows : bool
         Whether misplaced views would be seen.
-    closes : bool
-        Whether the last view is told to be where the first is.
     """
     ratio, rank = numbers["ratio"], numbers["rank"]
     text = f"views from neighbouring places differ {100 * max(ratio, 0):.2g} % as much as any two views"
-    if closes:
-        text += "; the last view is told to be where the first is"
-        remedy = "right if the stage went there; else the angles want numpy.linspace(..., endpoint=False)"
-        return Finding(ORDER, UNKNOWN, text, remedy, numbers, doubt)
     if ratio < _UNLIKE and rank < _RANDOM and not shows:
         text += ", but many would not stand out elsewhere either"
         return Finding(ORDER, UNKNOWN, text, "more light, or an object that is not round", numbers, doubt)
     if ratio < _UNLIKE and rank < _RANDOM:
         return Finding(ORDER, OK, text, "", numbers, doubt)
     return Finding(ORDER, UNKNOWN, text, "more views, or more light", numbers, doubt)
-
-
-def _ends_where_it_began(measured: Measured) -> bool:
-    """Whether the first and the last view are told to be in one place."""
-    steps = np.linalg.norm(np.diff(measured.places, axis=0), axis=1)
-    apart = float(np.linalg.norm(measured.places[-1] - measured.places[0]))
-    return apart < _ONE_PLACE * float(np.median(steps))
 
 
 def blurred_views(measured: Measured, chosen: np.ndarray, step: float) -> Alike:
