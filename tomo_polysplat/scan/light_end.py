@@ -61,7 +61,8 @@ def saturated_rays(values: np.ndarray) -> np.ndarray | None:
 
     Without noise air holds 0, and that is no end.
     """
-    low = min((float(view.min(initial=np.inf, where=np.isfinite(view))) for view in values), default=np.inf)
+    # Not the minimum, which NaN would be; nor where values are finite, which takes ten times as long.
+    low = min((float(np.fmin.reduce(view, axis=None)) for view in values), default=np.inf)
     if not math.isfinite(low):
         return None
     number = sum(int(np.count_nonzero(view == low)) for view in values)
