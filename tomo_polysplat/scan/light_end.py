@@ -20,12 +20,10 @@ _FEWEST, _SHARE = 10, 2e-4
 # Of these, the share that has no other neighbours. Noise cut off at the mean of air, as by ``numpy.maximum``, leaves
 # 2^-9 of them, and a cut at one standard deviation, which does no harm, a quarter.
 _INSIDE = 0.5
-# The bend of three pixels is new in the next view and row: noise changes by 1.4 of itself, detail goes on.
-_NEW, _FEWEST_BENDS = 0.8, 50
 
 
 def mend_light_end(values: np.ndarray) -> int:
-    """Say that a camera was saturated; let rays pass beside the object that are well inside of such areas.
+    """Say that a camera was saturated, whose open field was not; let rays in such areas pass beside the object.
 
     Parameters
     ----------
@@ -44,9 +42,6 @@ def mend_light_end(values: np.ndarray) -> int:
     many, low = int(np.count_nonzero(saturated)), float(values[saturated][0])
     share = f"{100 * many / values.size:.2g} % of the rays hold the same value, the least of all, {low:.3g}"
     remedy = "measure with less light; where that cannot be, with an open field that is not saturated"
-    if low <= 0:
-        logger.warning("%s: the detector was saturated there, and in the open field: %s.", share, remedy)
-        return many
     wide = _width(values, saturated, low)
     near = saturated & _within(~saturated, wide)
     values[saturated] = 0.0
@@ -59,11 +54,11 @@ def mend_light_end(values: np.ndarray) -> int:
 def saturated_rays(values: np.ndarray) -> np.ndarray | None:
     """Which rays are at the lower end of the scale, (views, rows, columns); None where that is no end.
 
-    Without noise air holds 0, and that is no end.
+    Of an open field that was saturated, too, air holds 0. So it does without noise, and that is no end: `check` asks.
     """
     # Not the minimum, which NaN would be; nor where values are finite, which takes ten times as long.
     low = min((float(np.fmin.reduce(view, axis=None)) for view in values), default=np.inf)
-    if not math.isfinite(low):
+    if not math.isfinite(low) or low <= 0:
         return None
     number = sum(int(np.count_nonzero(view == low)) for view in values)
     if number <= max(_FEWEST, _SHARE * values.size):
@@ -72,7 +67,7 @@ def saturated_rays(values: np.ndarray) -> np.ndarray | None:
     inside = at_end & ~_within(~at_end, 1)
     if np.count_nonzero(inside) < _INSIDE * number or not at_end.any(axis=(1, 2)).all():
         return None
-    return at_end if low != 0 or _noisy(values, at_end) else None
+    return at_end
 
 
 def _within(rays: np.ndarray, wide: int) -> np.ndarray:
@@ -88,21 +83,3 @@ def _width(values: np.ndarray, saturated: np.ndarray, low: float) -> int:
     steps = steps[np.isfinite(steps)]
     # The chord of a round edge rises with the root of the depth: half as far as its slope there tells.
     return max(1, round(0.5 * low / float(np.median(steps)))) if len(steps) else 1
-
-
-def _noisy(values: np.ndarray, at_end: np.ndarray) -> bool:
-    """Whether rays that are not at the end surely differ by chance, anew in each view and row."""
-    if values.shape[1] == 1:
-        return False
-    use = np.isfinite(values) & ~at_end
-    use = use[..., 1:-1] & use[..., :-2] & use[..., 2:]
-    bend = np.where(use, values[..., 1:-1] - 0.5 * (values[..., :-2] + values[..., 2:]), 0.0)
-    for axis in (0, 1):
-        first, second = (np.moveaxis(part, axis, 0) for part in (bend, use))
-        both = second[1:] & second[:-1]
-        if np.count_nonzero(both) < _FEWEST_BENDS:
-            return False
-        change = np.median(np.abs(np.diff(first, axis=0)[both]))
-        if not change > _NEW * np.median(np.abs(first[1:][both])):
-            return False
-    return True
