@@ -5,7 +5,7 @@ import logging
 import numpy as np
 import pytest
 
-from tomo_polysplat.scan.light_end import mend_light_end, saturated_rays
+from tomo_polysplat.scan.light_end import lower_end, mend_light_end
 
 VIEWS, ROWS, COLUMNS, PHOTONS = 24, 12, 40, 1e4
 
@@ -59,6 +59,6 @@ def test_a_scan_that_is_not_saturated_is_left_alone(kind, caplog):
     elif kind == "one ray":
         values[0, 0, 0] = -1.0
     before = values.copy()
-    assert saturated_rays(values) is None and mend_light_end(values) == 0
+    assert lower_end(values) is None and mend_light_end(values) == 0
     assert not caplog.records
     np.testing.assert_array_equal(values, before)

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-__all__ = ["mend_light_end", "saturated_rays"]
+__all__ = ["lower_end", "mend_light_end"]
 
 logger = logging.getLogger(__name__)
 
@@ -36,23 +36,25 @@ def mend_light_end(values: np.ndarray) -> int:
     int
         Saturated rays.
     """
-    saturated = saturated_rays(values)
-    if saturated is None:
+    low = lower_end(values)
+    if low is None:
         return 0
-    many, low = int(np.count_nonzero(saturated)), float(values[saturated][0])
+    wide, many, left_out = _width(values, low), 0, 0
+    # View by view: a mark for every ray would be a quarter of all that the rays take.
+    for view in values:
+        saturated = view == low
+        near = saturated & _within(~saturated, wide)
+        view[saturated], view[near] = 0.0, np.nan
+        many, left_out = many + int(np.count_nonzero(saturated)), left_out + int(np.count_nonzero(near))
     share = f"{100 * many / values.size:.2g} % of the rays hold the same value, the least of all, {low:.3g}"
+    words = f"they are taken to pass beside the object, but for {left_out} at the border, which are left out"
     remedy = "measure with less light; where that cannot be, with an open field that is not saturated"
-    wide = _width(values, saturated, low)
-    near = saturated & _within(~saturated, wide)
-    values[saturated] = 0.0
-    values[near] = np.nan
-    words = "they are taken to pass beside the object, but for %d at the border, which are left out"
-    logger.warning("%s: the detector was saturated there; " + words + ": %s.", share, near.sum(), remedy)
+    logger.warning("%s: the detector was saturated there; %s: %s.", share, words, remedy)
     return many
 
 
-def saturated_rays(values: np.ndarray) -> np.ndarray | None:
-    """Which rays are at the lower end of the scale, (views, rows, columns); None where that is no end.
+def lower_end(values: np.ndarray) -> float | None:
+    """The value (above 0) of rays (views, rows, columns) at the lower end of the scale; None where there is no end.
 
     Of an open field that was saturated, too, air holds 0. So it does without noise, and that is no end: `check` asks.
     """
@@ -60,26 +62,27 @@ def saturated_rays(values: np.ndarray) -> np.ndarray | None:
     low = min((float(np.fmin.reduce(view, axis=None)) for view in values), default=np.inf)
     if not math.isfinite(low) or low <= 0:
         return None
-    number = sum(int(np.count_nonzero(view == low)) for view in values)
-    if number <= max(_FEWEST, _SHARE * values.size):
+    numbers = [int(np.count_nonzero(view == low)) for view in values]
+    if min(numbers) == 0 or sum(numbers) <= max(_FEWEST, _SHARE * values.size):
         return None
-    at_end = values == low
-    inside = at_end & ~_within(~at_end, 1)
-    if np.count_nonzero(inside) < _INSIDE * number or not at_end.any(axis=(1, 2)).all():
-        return None
-    return at_end
+    inside = sum(int(np.count_nonzero(~_within(view != low, 1))) for view in values)
+    return low if inside >= _INSIDE * sum(numbers) else None
 
 
 def _within(rays: np.ndarray, wide: int) -> np.ndarray:
-    """Rays no more than so many pixels from some of a view, along rows and columns."""
+    """Rays (rows, columns) no more than so many pixels from some, along rows and columns."""
     from scipy.ndimage import maximum_filter
 
-    return maximum_filter(rays, size=(1, 2 * wide + 1, 2 * wide + 1), mode="nearest")
+    return maximum_filter(rays, size=2 * wide + 1, mode="nearest")
 
 
-def _width(values: np.ndarray, saturated: np.ndarray, low: float) -> int:
+def _width(values: np.ndarray, low: float) -> int:
     """Pixels at the border that may see matter: as far as a round edge goes on from the first ray above the end."""
-    steps = np.abs(np.diff(values, axis=2))[saturated[..., 1:] != saturated[..., :-1]]
+    found = []
+    for view in values:
+        ends = view == low
+        found.append(np.abs(np.diff(view, axis=1))[ends[:, 1:] != ends[:, :-1]])
+    steps = np.concatenate(found)
     steps = steps[np.isfinite(steps)]
     # The chord of a round edge rises with the root of the depth: half as far as its slope there tells.
     return max(1, round(0.5 * low / float(np.median(steps)))) if len(steps) else 1
