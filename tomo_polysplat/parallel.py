@@ -13,13 +13,24 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike
 
-__all__ = ["contiguous", "copy_array", "cpu_threads", "kept_threads", "run_tasks", "shares", "split_range"]
+__all__ = [
+    "contiguous",
+    "copy_array",
+    "cpu_threads",
+    "kept_threads",
+    "of_parts",
+    "run_tasks",
+    "shares",
+    "split_range",
+]
 
-_COPIED_AT_ONCE = 1 << 21  # bytes of a task, so that the copy takes longer than to hand it to a thread
+# Bytes of a task, so that to copy them, or to look at them, takes longer than to hand them to a thread.
+_COPIED_AT_ONCE, _LOOKED_AT_AT_ONCE = 1 << 21, 1 << 22
 # The process that keeps threads, and its threads.
 _kept: ContextVar[tuple[int, ThreadPoolExecutor] | None] = ContextVar("_kept", default=None)
 
@@ -112,6 +123,12 @@ def run_tasks(function: Callable[..., object], tasks: Sequence[tuple]) -> list:
     for helper in begun:
         helper.result()
     return results
+
+
+def of_parts(function: Callable[[np.ndarray], Any], array: np.ndarray) -> list:
+    """What a function gives of runs of the first axis that make up an array, by several threads where it is large."""
+    parts = split_range(len(array), array.nbytes // _LOOKED_AT_AT_ONCE) if len(array) else []
+    return run_tasks(function, [(array[a:b],) for a, b in parts])
 
 
 def copy_array(to: np.ndarray, source: np.ndarray) -> None:

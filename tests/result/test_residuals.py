@@ -1,5 +1,6 @@
 """Residuals in units of noise, from projections known in closed form, and the verdict that is drawn from them."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import h5py
@@ -15,6 +16,7 @@ from tomo_polysplat.report.held_out import HeldOut
 from tomo_polysplat.report.residuals import residuals_of
 from tomo_polysplat.report.verdict import verdict
 from tomo_polysplat.result.result import Result
+from tomo_polysplat.scan.counts import Counts
 from tomo_polysplat.scan.geometry import VolumeGrid, from_astra
 from tomo_polysplat.scan.scan import Scan
 
@@ -202,6 +204,32 @@ def test_a_view_tells_of_its_rays_held_out():
     assert found.rms_held_out > 4 * found.rms / 2 and (found.held_out > 3).all()
     assert "(those kept out of the fit to" in verdict(result, found)[0]
     assert np.isnan(residuals_of(ball(), scan_of(values)).rms_held_out), "no settings, none held out"
+
+
+def test_only_the_views_that_are_shown_are_read_and_those_that_values_tell_apart():
+    """Two views are from 0 and 360 degrees, which the values put in order, in the fit as here."""
+    values, read = line_integrals(), set()
+    values[-1] = values[0]
+    values[0] += 1e-3
+    values = np.roll(values, 4, axis=0)
+    told = CONE | {"ProjectionAngles": np.roll(np.append(CONE["ProjectionAngles"][:-1], 2 * np.pi), 4)}
+    geometry, grid = from_astra(told, VOLUME)
+    assert HeldOut.views_told_by_values(geometry, grid).tolist() == [3, 4]
+    aside = HeldOut(geometry, grid, values, 0.05, torch.device("cpu")).of(np.arange(VIEWS)).numpy()
+    values[aside] += 0.1
+    stored = (1e7 * np.exp(-values)).astype(np.float64)
+
+    def views_of(part):
+        read.update(range(VIEWS)[part])
+        return stored[part]
+
+    images = np.full((ROWS, COLUMNS), 1e7), np.zeros((ROWS, COLUMNS))
+    counts = Counts(lambda: nullcontext(views_of), stored.shape, "counts", *images)
+    result = ball()
+    result.settings = {"held_out": 0.05}
+    found = residuals_of(result, Scan(counts, told, VOLUME, valid=counts.marks), most_views=3)
+    assert found.views.tolist() == [0, 10, 20] and read == {0, 3, 4, 10, 20}
+    assert (found.held_out > 4 * found.by_view / 2).all()
 
 
 def scanned():

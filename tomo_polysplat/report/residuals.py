@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -39,6 +39,8 @@ MOST_VIEWS, _AT_ONCE, _MAP = 180, 4, 192
 _NUMBERS = 1 << 26
 # A ray this many deviations off is not explained.
 _FAR = 3.0
+# What an ASTRA geometry has for each view.
+_BY_VIEW = ("ProjectionAngles", "Vectors")
 
 
 def residuals_of(
@@ -70,31 +72,45 @@ def residuals_of(
         wanted = f"the scan of the result, {result.grid.shape} in {result.unit}"
         raise fail("scan", wanted, got)
     spectrum = result.spectrum if result.materials is not None else None
-    correction = scan.water_correction if spectrum is not None else None
-    values, _ = usable_rays(scan.projections, scan.proj_geom, scan.usable, correction, spectrum)
-    values = _as_steady(values, result)
     geometry, grid = from_astra(scan.proj_geom, scan.vol_geom)
     count = min(most_views, geometry.views)
     chosen = np.unique(np.linspace(0, geometry.views - 1, count).round().astype(int))
+    values = _OfViews(result, scan, np.union1d(chosen, HeldOut.views_told_by_values(geometry, grid)))
     # Where the scanner stood, if the fit has moved it.
     seen = geometry if result.geometry is None else from_astra(result.geometry, scan.vol_geom)[0]
     some = seen.select(chosen)
     planar = is_planar_geometry(scan.proj_geom) or geometry.planar
     filters = None if spectrum is None else filter_of(result, scan)
-    behind = None if filters is None else FilterMap.of(filters, scan.unit, *values.shape[1:])
+    behind = None if filters is None else FilterMap.of(filters, scan.unit, geometry.rows, geometry.columns)
     model = _Model(result, detector_views(some, planar), pick_fast_device(device), behind)
     share = float(result.settings.get("held_out", 0.0))
     unseen = HeldOut(geometry, grid, values, share, model.device)
-    photons = photons_per_ray(values, model.dimmed, model.device)
-    return _collected(model, values, chosen, photons, MisfitMap(some, grid), unseen)
+    photons = photons_per_ray(values.array, model.dimmed, model.device)
+    return _collected(model, values[chosen], chosen, photons, MisfitMap(some, grid), unseen)
 
 
-def _as_steady(values: np.ndarray, result: ResultData) -> np.ndarray:
-    """The projections (views, rows, columns) less gains and drift that the fit has taken out, in place."""
-    for part, shape in ((result.gains, values.shape[1:]), (result.drift, (len(values), 1, 1))):
-        if part is not None:
-            values -= np.asarray(part, values.dtype).reshape(shape)
-    return values
+class _OfViews:
+    """Rays (rows, columns) of some views by their number in the scan, less gains and drift that the fit took out.
+
+    The other views are not read: of a scan that lies in its file they would take longer than all that follows.
+    """
+
+    def __init__(self, result: ResultData, scan: Scan, views: np.ndarray) -> None:
+        spectrum = result.spectrum if result.materials is not None else None
+        correction = scan.water_correction if spectrum is not None else None
+        usable = scan.usable
+        valid = None if usable is None else usable[:, views]
+        told = {name: np.asarray(scan.proj_geom[name])[views] for name in _BY_VIEW if name in scan.proj_geom}
+        some = dict(scan.proj_geom) | told
+        self.array, _ = usable_rays(scan.projections[:, views], some, valid, correction, spectrum)
+        self._views = views
+        drift = None if result.drift is None else np.asarray(result.drift)[views]
+        for part, shape in ((result.gains, self.array.shape[1:]), (drift, (len(views), 1, 1))):
+            if part is not None:
+                self.array -= np.asarray(part, self.array.dtype).reshape(shape)
+
+    def __getitem__(self, views: Any) -> np.ndarray:
+        return self.array[np.searchsorted(self._views, views)]
 
 
 class _Model:
@@ -178,7 +194,7 @@ def _collected(
     sums, near = np.zeros((4, len(chosen))), 0
     for first in range(0, len(chosen), _AT_ONCE):
         some = np.arange(first, min(first + _AT_ONCE, len(chosen)))
-        scaled, good = _scaled(model, some, values[chosen[some]], photons)
+        scaled, good = _scaled(model, some, values[some], photons)
         squares = scaled**2
         for total, part in zip(pixels, (good, scaled, squares)):
             total += part.sum(dim=0)

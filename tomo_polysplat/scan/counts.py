@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
 from math import prod
 from typing import Any
@@ -193,13 +194,17 @@ class Counts(_MadeWhenLookedAt):
         """Views that are read together."""
         return max(1, _BLOCK // (self.shape[0] * self.shape[2]))
 
-    def blocks(self) -> Iterator[Block]:
-        """All views, some at a time, in their order."""
+    def blocks(self, into: np.ndarray | None = None) -> Iterator[Block]:
+        """All views, some at a time, in their order; the next ones are read meanwhile.
+
+        `into`, a (views, rows, columns) float32 array, gets the line integrals, of which blocks then have views.
+        """
         views = self.shape[1]
-        with self._opened() as read:
-            for first in range(0, views, self.at_once):
-                chosen = slice(first, min(first + self.at_once, views))
-                yield Block(chosen, *self._judged(read(chosen), self._flat, self._dark))
+        chosen = [slice(k, min(k + self.at_once, views)) for k in range(0, views, self.at_once)]
+        with self._opened() as read, closing(_ahead(read, chosen)) as ahead:
+            for part, stored in zip(chosen, ahead):
+                made = None if into is None else into[part]
+                yield Block(part, *self._judged(stored, self._flat, self._dark, made))
 
     def some(
         self, rows: np.ndarray, views: np.ndarray, columns: np.ndarray
@@ -222,20 +227,23 @@ class Counts(_MadeWhenLookedAt):
                 yield slice(begin, end), values, usable
 
     def _judged(
-        self, stored: np.ndarray, flat: np.ndarray | None, dark: np.ndarray | None
+        self,
+        stored: np.ndarray,
+        flat: np.ndarray | None,
+        dark: np.ndarray | None,
+        made: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray, dict[str, int]]:
-        """What `attenuation` makes of some views, by several threads."""
-        values, usable = np.empty(stored.shape, np.float32), np.empty(stored.shape, bool)
+        """What `attenuation` makes of some views, by several threads, in `made` where that is given."""
+        values = np.empty(stored.shape, np.float32) if made is None else made
+        usable = np.empty(stored.shape, bool)
         # By rows, or by views where those are more.
         by_rows = stored.shape[1] > len(stored)
 
         def judge(a: int, b: int) -> dict[str, int]:
             part = (slice(None), slice(a, b)) if by_rows else (slice(a, b),)
             light, background = (image if image is None else image[part[1:]] for image in (flat, dark))
-            values[part], usable[part], found = attenuation(
-                stored[part], self._kind, light, background, self._saturation
-            )
-            return found
+            into = values[part], usable[part]
+            return attenuation(stored[part], self._kind, light, background, self._saturation, into)[2]
 
         found = run_tasks(judge, split_range(stored.shape[int(by_rows)], -(-stored.size // _PART)))
         return values, usable, {name: sum(part[name] for part in found) for name in found[0]}
@@ -290,6 +298,21 @@ def _needed(key: Any, length: int) -> tuple[np.ndarray, Any]:
         return (wanted, slice(None)) if key.step > 0 else (wanted[::-1], slice(None, None, -1))
     chosen, place = np.unique(wanted, return_inverse=True)
     return chosen, place.reshape(wanted.shape)
+
+
+def _ahead(read: Read, chosen: Sequence[slice]) -> Generator[np.ndarray, None, None]:
+    """What is read of each, the next one while the last one is used."""
+    if len(chosen) == 1:
+        yield read(chosen[0])
+        return
+    with ThreadPoolExecutor(1) as reader:
+        following = reader.submit(read, chosen[0])
+        for part in [*chosen[1:], None]:
+            stored = following.result()
+            if part is not None:
+                following = reader.submit(read, part)
+            yield stored
+            del stored
 
 
 def _runs(views: np.ndarray, most: int) -> Iterator[tuple[int, int]]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+import math
 
 import numpy as np
 
 from tomo_polysplat.checks import fail, require_shape
 from tomo_polysplat.parallel import cpu_threads, run_tasks, split_range
+from tomo_polysplat.scan.counts_kernel import KINDS, line_integrals_of_counts
 
 __all__ = ["attenuation", "fill_invalid", "flat_and_dark"]
 
@@ -53,6 +55,7 @@ def attenuation(
     flat: np.ndarray | None = None,
     dark: np.ndarray | None = None,
     saturation: float | None = None,
+    into: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, dict[str, int]]:
     """Line integrals, and which of them are valid.
 
@@ -66,6 +69,8 @@ def attenuation(
         Mean open-beam and dark images; for counts only.
     saturation : float or None
         Counts from which the detector is saturated; None takes the largest value of an integer type.
+    into : float32 and bool arrays, shape of `values`, optional
+        Where the results go.
 
     Returns
     -------
@@ -76,43 +81,48 @@ def attenuation(
     counts : dict
         How many rays of each kind were found.
     """
-    usable = np.isfinite(values)
-    counts = {"not_finite": int(values.size - np.count_nonzero(usable))}
+    made, usable = (np.empty(values.shape, dtype) for dtype in (np.float32, bool)) if into is None else into
+    if kind == "counts":
+        if flat is None or dark is None:
+            remedy = "counts cannot be used without them"
+            raise fail("flat, dark", "open-beam and dark images", "None", remedy)
+        return made, usable, _of_counts(values, flat, dark, saturation, made, usable)
     if kind == "attenuation":
         # Values beyond float32 count as infinite.
         with np.errstate(over="ignore"):
-            narrow = np.where(usable, values, 0).astype(np.float32)
-        usable &= np.isfinite(narrow)
-        counts = {"not_finite": int(values.size - np.count_nonzero(usable))}
-        narrow[~usable] = 0.0
-        narrow[np.isposinf(values)] = np.inf
-        return narrow, usable, counts
-    if kind == "counts":
-        if flat is None or dark is None:
-            raise fail(
-                "flat, dark", "open-beam and dark images", "None", "counts cannot be used without them"
-            )
-        limit = np.iinfo(values.dtype).max if saturation is None and values.dtype.kind in "iu" else saturation
-        if limit is not None:
-            counts["saturated"] = _drop(usable, values >= limit)
-        light = flat - dark
-        counts["dead_pixel"] = _drop(
-            usable, np.broadcast_to(~(np.isfinite(light) & (light > 0)), values.shape)
-        )
-        with np.errstate(divide="ignore", invalid="ignore"):
-            values = (values - dark) / light
-    dim = usable & ~(values > 0)
-    counts["no_light"] = _drop(usable, dim)
-    projections = -np.log(np.where(usable, values, 1)).astype(np.float32)
-    projections[dim] = np.inf
-    return projections, usable, counts
+            made[:] = values
+        usable[:] = np.isfinite(made)
+        made[~(usable | np.isposinf(values))] = 0.0
+        return made, usable, {"not_finite": int(values.size - np.count_nonzero(usable))}
+    finite = np.isfinite(values)
+    dim = finite & ~(values > 0)
+    usable[:] = finite & ~dim
+    made[:] = -np.log(np.where(usable, values, 1))
+    made[dim] = np.inf
+    counts = {
+        "not_finite": int(values.size - np.count_nonzero(finite)),
+        "no_light": int(np.count_nonzero(dim)),
+    }
+    return made, usable, counts
 
 
-def _drop(usable: np.ndarray, bad: np.ndarray) -> int:
-    """Mark the bad ones among the usable as unusable, and say how many that were."""
-    newly = usable & bad
-    usable &= ~bad
-    return int(np.count_nonzero(newly))
+def _of_counts(
+    values: np.ndarray,
+    flat: np.ndarray,
+    dark: np.ndarray,
+    saturation: float | None,
+    made: np.ndarray,
+    usable: np.ndarray,
+) -> dict[str, int]:
+    limit = np.iinfo(values.dtype).max if saturation is None and values.dtype.kind in "iu" else saturation
+    # Two types are compiled: that of most cameras, and one that holds the numbers of all others.
+    one = np.dtype(np.uint16 if values.dtype == np.uint16 else np.float64)
+    flat, dark = (np.ascontiguousarray(image, np.float64) for image in (flat, dark))
+    found, end = np.zeros(len(KINDS), np.int64), math.inf if limit is None else float(limit)
+    for view, lines, good in zip(values, made, usable):
+        line_integrals_of_counts(np.ascontiguousarray(view, one), flat, dark, end, lines, good, found)
+    counts = {name: int(number) for name, number in zip(KINDS, found)}
+    return {name: number for name, number in counts.items() if name != "saturated" or limit is not None}
 
 
 def fill_invalid(projections: np.ndarray, valid: np.ndarray | None) -> np.ndarray:

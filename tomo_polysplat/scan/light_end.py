@@ -11,6 +11,8 @@ import math
 
 import numpy as np
 
+from tomo_polysplat.parallel import of_parts
+
 __all__ = ["lower_end", "mend_light_end"]
 
 logger = logging.getLogger(__name__)
@@ -59,7 +61,7 @@ def lower_end(values: np.ndarray) -> float | None:
     Of an open field that was saturated, too, air holds 0. So it does without noise, and that is no end: `check` asks.
     """
     # Not the minimum, which NaN would be; nor where values are finite, which takes ten times as long.
-    low = min((float(np.fmin.reduce(view, axis=None)) for view in values), default=np.inf)
+    low = min(of_parts(lambda part: float(np.fmin.reduce(part, axis=None)), values), default=np.inf)
     if not math.isfinite(low) or low <= 0:
         return None
     numbers = [int(np.count_nonzero(view == low)) for view in values]

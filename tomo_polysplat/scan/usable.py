@@ -131,9 +131,8 @@ def _of_counts(
     values = np.empty((views, rows, columns), np.float32)
     own = valid is None or _is_own(valid, counts)
     marked = None if own else _marked(_on_host(valid), counts.shape, proj_geom)
-    for block in counts.blocks():
-        values[block.views] = block.values
-        if not block.usable.all():
+    for block in counts.blocks(values):
+        if any(block.found.values()):
             marked = np.zeros(values.shape, bool) if marked is None else marked
             marked[block.views] |= block.marked
     return values, marked
