@@ -44,7 +44,9 @@ def opposite_rays_of(
     last = int(np.argmax(np.diff(azimuth, append=azimuth[0] + 2 * np.pi)))
     order, azimuth = np.roll(order, -last - 1), np.roll(azimuth, -last - 1)
     azimuth = np.where(azimuth < azimuth[0], azimuth + 2 * np.pi, azimuth)
-    values = sum(share * _values(projections, valid, some) for share, some in rows)
+    # Read together: a file is gone through as a whole, whichever rows are wanted.
+    read = np.split(np.asarray(projections[:, np.concatenate([some for _, some in rows])]), len(rows), axis=1)
+    values = sum(share * _values(part, valid, some) for part, (share, some) in zip(read, rows))
     return OppositeRays(np.where(np.isfinite(values), values, np.nan)[order], azimuth, axis, slope)
 
 
@@ -100,9 +102,9 @@ def _of_cone(geometry: Geometry) -> tuple[np.ndarray, float, float, list[tuple[f
     return azimuth, float(axis), float(slope), [part for part in both if part[0] > 1e-3]
 
 
-def _values(projections: np.ndarray, valid: np.ndarray | None, rows: np.ndarray) -> np.ndarray:
-    """Of some rows, (views, columns, rows) float64, NaN where they are not to be used."""
-    values = np.asarray(projections[:, rows], np.float64)
+def _values(read: np.ndarray, valid: np.ndarray | None, rows: np.ndarray) -> np.ndarray:
+    """What was read of some rows, (views, columns, rows) float64, NaN where they are not to be used."""
+    values = np.asarray(read, np.float64)
     values = np.where(dropped_rays(values), np.nan, values)
     if valid is not None:
         values = np.where(valid[:, rows], values, np.nan)
