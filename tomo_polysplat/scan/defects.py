@@ -70,13 +70,15 @@ def attenuation(
     Returns
     -------
     projections : float32 array, shape of `values`
-        ``-log((values - dark) / (flat - dark))``. An invalid ray is infinite if no light was seen, else 0.
+        ``-log((values - dark) / (flat - dark))``. An invalid ray is infinite if no light was seen, minus infinity if
+        the detector was saturated by less light than the open beam has, else 0.
     valid : bool array, shape of `values`
         False for rays without light, of dead pixels, saturated, or not finite. Nothing is clipped.
     counts : dict
         How many rays of each kind were found.
     """
     usable = np.isfinite(values)
+    bright = None
     counts = {"not_finite": int(values.size - np.count_nonzero(usable))}
     if kind == "attenuation":
         # Values beyond float32 count as infinite.
@@ -95,6 +97,8 @@ def attenuation(
         limit = np.iinfo(values.dtype).max if saturation is None and values.dtype.kind in "iu" else saturation
         if limit is not None:
             counts["saturated"] = _drop(usable, values >= limit)
+            if counts["saturated"] and (flat > limit).any():
+                bright = (values >= limit) & (flat > limit)
         light = flat - dark
         counts["dead_pixel"] = _drop(
             usable, np.broadcast_to(~(np.isfinite(light) & (light > 0)), values.shape)
@@ -105,6 +109,8 @@ def attenuation(
     counts["no_light"] = _drop(usable, dim)
     projections = -np.log(np.where(usable, values, 1)).astype(np.float32)
     projections[dim] = np.inf
+    if bright is not None:
+        projections[bright] = -np.inf
     return projections, usable, counts
 
 
