@@ -7,6 +7,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -296,6 +297,7 @@ def _problem(
         )
         widest = options.settings.surroundings
         problem = Problem.of(values, geometry, grid, unit, spectrum, materials, widest, on, own=True)
+        problem = replace(problem, saturated=True) if "rays_saturated" in counts else problem
         problem = filtered(problem, measured.filter_map, unit, proj_geom["type"] == "cyl_cone_vec")
     # Made larger where the object is, it may have many times the voxels.
     try:

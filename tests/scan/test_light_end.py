@@ -5,7 +5,9 @@ import logging
 import numpy as np
 import pytest
 
+from tomo_polysplat.scan.counts import Counts
 from tomo_polysplat.scan.light_end import lower_end, mend_light_end
+from tomo_polysplat.scan.usable import usable_rays
 
 VIEWS, ROWS, COLUMNS, PHOTONS = 24, 12, 40, 1e4
 
@@ -27,7 +29,7 @@ def test_saturated_rays_pass_beside_the_object_but_at_the_border(caplog):
     light, chord = counts()
     values = logarithms(np.minimum(light, 0.8 * PHOTONS))
     with caplog.at_level(logging.WARNING):
-        assert mend_light_end(values) > 0
+        assert mend_light_end(values) == (np.count_nonzero(light >= 0.8 * PHOTONS), 0)
     assert "saturated" in caplog.text and "less light" in caplog.text
     zero = values == 0
     assert (chord[zero] == 0).mean() > 0.95 and zero.mean() > 0.3
@@ -59,6 +61,39 @@ def test_a_scan_that_is_not_saturated_is_left_alone(kind, caplog):
     elif kind == "one ray":
         values[0, 0, 0] = -1.0
     before = values.copy()
-    assert lower_end(values) is None and mend_light_end(values) == 0
+    assert lower_end(values) is None and mend_light_end(values) == (0, 0)
     assert not caplog.records
     np.testing.assert_array_equal(values, before)
+
+
+def uneven(dead=False):
+    """Counts of a camera whose pixels differ, that saturates below the open field of most, (views, rows, columns)."""
+    light, chord = counts()
+    gains = 1 + 0.15 * np.cos(np.arange(COLUMNS) / 6) * np.ones((ROWS, 1))
+    light = np.minimum(light * gains, 0.9 * PHOTONS)
+    if dead:
+        light[:, 3, 2] = 0
+    return light.astype(np.float32), gains * PHOTONS, chord
+
+
+@pytest.mark.parametrize("dead", [False, True])
+def test_counts_that_reach_the_saturation_that_is_told_are_mended_alike(dead):
+    light, flat, chord = uneven(dead)
+    told = Counts.of(light, flat, saturation=0.9 * PHOTONS)
+    geometry = {"type": "parallel3d", "DetectorRowCount": ROWS, "DetectorColCount": COLUMNS}
+    geometry |= {"DetectorSpacingX": 1.0, "DetectorSpacingY": 1.0}
+    geometry["ProjectionAngles"] = np.linspace(0, 2 * np.pi, VIEWS, endpoint=False)
+    values, found = usable_rays(told, geometry, None)
+    bright = (light >= np.float32(0.9 * PHOTONS)) & (flat > 0.9 * PHOTONS)
+    assert found["rays_saturated"] == bright.sum() > 0.3 * light.size
+    zero = values == 0
+    assert (chord[zero] == 0).mean() > 0.97 and zero.sum() > 0.6 * bright.sum()
+    assert np.isnan(values[~zero & bright]).all() and np.isfinite(values[light < 0.9 * PHOTONS]).sum() > 0
+
+
+def test_dead_pixels_of_no_light_in_the_open_field_are_not_saturated():
+    light, chord = counts()
+    values = logarithms(light)
+    values[::2, 2:8, 2:9] = -np.inf
+    assert mend_light_end(values) == (0, 0)
+    assert np.isnan(values[::2, 2:8, 2:9]).all() and np.isfinite(values[1::2]).all()

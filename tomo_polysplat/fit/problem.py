@@ -88,6 +88,8 @@ class Problem:
         behind it.
     order : (views,) int array or None
         Which of the caller's views each one is; None where they are as the caller has them.
+    saturated : bool
+        Whether rays that hold 0 are saturated ones, which tell no noise.
     """
 
     projections: np.ndarray | HostRays
@@ -105,6 +107,7 @@ class Problem:
     surroundings: str = ""
     order: np.ndarray | None = None
     filter_map: FilterMap | None = None
+    saturated: bool = False
     _known: _Known = field(default_factory=_Known, init=False, repr=False)
 
     # What a caller of reconstruct tells, as it comes.
@@ -273,7 +276,9 @@ class Problem:
     def forget_told(self) -> None:
         """Forget what rays told that have been changed since: their noise, where matter lies, what is texture."""
         known = self._known
-        known.photons = known.agreement = known.closed = None
+        known.agreement = known.closed = None
+        # Less gains and drift saturated rays are not 0 any more.
+        known.photons = known.photons if self.saturated else None
 
     def let_go_of_level(self) -> None:
         """Forget rays made level for physics that is not used: they take as much memory as those measured."""
@@ -306,7 +311,9 @@ class Problem:
     def photons(self, device: torch.device) -> float:
         """Photons of an unattenuated ray, told once a scan; see ``scan.noise``."""
         if self._known.photons is None:
-            self._known.photons = photons_per_ray(self._copied(device), self.dimmed(device))
+            values = self._copied(device)
+            values = torch.where(values == 0, torch.nan, values) if self.saturated else values
+            self._known.photons = photons_per_ray(values, self.dimmed(device))
         return self._known.photons
 
     def closed(self, device: torch.device) -> tuple[bool, str]:

@@ -46,8 +46,8 @@ class Block:
 
     @property
     def marked(self) -> np.ndarray:
-        """Rays that are not to be used; of those without light `reconstruct` tells opaque ones itself."""
-        return ~(self.usable | np.isposinf(self.values))
+        """Rays that are not to be used; of those without light, or saturated, `reconstruct` judges itself."""
+        return ~(self.usable | np.isinf(self.values))
 
 
 class _MadeWhenLookedAt(np.lib.mixins.NDArrayOperatorsMixin, ABC):
@@ -265,7 +265,7 @@ class Marks(_MadeWhenLookedAt):
     ----------
     counts : Counts
     lightless : bool
-        Whether rays without light count as such; see `Scan.usable`.
+        Whether rays without light, or saturated, count as such; see `Scan.usable`.
     """
 
     def __init__(self, counts: Counts, *, lightless: bool) -> None:
@@ -279,7 +279,7 @@ class Marks(_MadeWhenLookedAt):
             return made
         for part, values, usable in self.counts.some(rows, views, columns):
             if self.lightless:
-                usable |= np.isposinf(values)
+                usable |= np.isinf(values)
             made[:, part] = usable.transpose(1, 0, 2)
         return made
 

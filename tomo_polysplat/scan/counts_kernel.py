@@ -38,7 +38,8 @@ def line_integrals_of_counts(counts, flat, dark, limit, made, usable, found):
             if not math.isfinite(value):
                 kind = 1
             elif value >= limit:
-                kind = 2
+                # The open beam has more light than the detector can tell.
+                integral, kind = -math.inf if flat[row, column] > limit else 0.0, 2
             elif not (math.isfinite(light) and light > 0):
                 kind = 3
             elif value - background > 0:

@@ -75,7 +75,8 @@ def attenuation(
     Returns
     -------
     projections : float32 array, shape of `values`
-        ``-log((values - dark) / (flat - dark))``. An invalid ray is infinite if no light was seen, else 0.
+        ``-log((values - dark) / (flat - dark))``. An invalid ray is infinite if no light was seen, minus infinity if
+        the detector was saturated by less light than the open beam has, else 0.
     valid : bool array, shape of `values`
         False for rays without light, of dead pixels, saturated, or not finite. Nothing is clipped.
     counts : dict

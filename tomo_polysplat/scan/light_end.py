@@ -1,7 +1,8 @@
 """Rays at the lower end of the scale: a saturated camera has replaced what is brighter by one value.
 
 The value of such a ray is no measurement, but a bound: there is at least so much light. Where the open field was not
-saturated the value lies above 0, and rays well inside of such an area pass beside the object.
+saturated the bound lies above 0, and rays well inside of such an area pass beside the object. Rays that are known to be
+saturated, as they reach the ``saturation`` that a user names, are minus infinity.
 """
 
 from __future__ import annotations
@@ -22,53 +23,81 @@ _FEWEST, _SHARE = 10, 2e-4
 # Of these, the share that has no other neighbours. Noise cut off at the mean of air, as by ``numpy.maximum``, leaves
 # 2^-9 of them, and a cut at one standard deviation, which does no harm, a quarter.
 _INSIDE = 0.5
+# Of the least that pixels have measured where they were not saturated, what tells the end that all have in common.
+_LOW = 0.25
 
 
-def mend_light_end(values: np.ndarray) -> int:
+def mend_light_end(values: np.ndarray) -> tuple[int, int]:
     """Say that a camera was saturated, whose open field was not; let rays in such areas pass beside the object.
 
     Parameters
     ----------
     values : (views, rows, columns) float32 array
-        -log(I/I0), changed in place; NaN where a ray is not to be used. Saturated rays become 0, and those at the
-        border, which may pass through thin matter, NaN.
+        -log(I/I0), changed in place; NaN where a ray is not to be used, minus infinity where it is known to be
+        saturated. Saturated rays become 0, and those at the border, which may pass through thin matter, NaN. Where
+        there is no such area, minus infinity becomes NaN.
 
     Returns
     -------
-    int
-        Saturated rays.
+    saturated, told : int
+        Saturated rays, and those of them that were minus infinity.
     """
-    low = lower_end(values)
-    if low is None:
-        return 0
-    wide, many, left_out = _width(values, low), 0, 0
+    least = _least(values)
+    end = lower_end(values, least)
+    if end is None:
+        for view in values if least == -np.inf else ():
+            view[np.isneginf(view)] = np.nan
+        return 0, 0
+    wide, many, left_out = _width(values, end), 0, 0
     # View by view: a mark for every ray would be a quarter of all that the rays take.
     for view in values:
-        saturated = view == low
-        near = saturated & _within(~saturated, wide)
+        saturated = view == end
+        near = saturated & _within(~saturated & ~np.isnan(view), wide)
         view[saturated], view[near] = 0.0, np.nan
         many, left_out = many + int(np.count_nonzero(saturated)), left_out + int(np.count_nonzero(near))
-    share = f"{100 * many / values.size:.2g} % of the rays hold the same value, the least of all, {low:.3g}"
+    told = end == -np.inf
+    share = f"{100 * many / values.size:.2g} % of the rays "
+    share += "are saturated" if told else f"hold the same value, the least of all, {end:.3g}"
     words = f"they are taken to pass beside the object, but for {left_out} at the border, which are left out"
     remedy = "measure with less light; where that cannot be, with an open field that is not saturated"
-    logger.warning("%s: the detector was saturated there; %s: %s.", share, words, remedy)
-    return many
+    because = "" if told else ": the detector was saturated there"
+    logger.warning("%s%s; %s: %s.", share, because, words, remedy)
+    return many, many if told else 0
 
 
-def lower_end(values: np.ndarray) -> float | None:
-    """The value (above 0) of rays (views, rows, columns) at the lower end of the scale; None where there is no end.
+def lower_end(values: np.ndarray, least: float | None = None) -> float | None:
+    """What rays (views, rows, columns) at the lower end of the scale hold; None where there is no end above 0.
 
     Of an open field that was saturated, too, air holds 0. So it does without noise, and that is no end: `check` asks.
+    The least value need not be looked for where it is known.
     """
-    # Not the minimum, which NaN would be; nor where values are finite, which takes ten times as long.
-    low = min(of_parts(lambda part: float(np.fmin.reduce(part, axis=None)), values), default=np.inf)
-    if not math.isfinite(low) or low <= 0:
+    low = _least(values) if least is None else least
+    if math.isnan(low) or low == np.inf or -np.inf < low <= 0:
         return None
     numbers = [int(np.count_nonzero(view == low)) for view in values]
-    if min(numbers) == 0 or sum(numbers) <= max(_FEWEST, _SHARE * values.size):
+    if (min(numbers) == 0 and low > 0) or sum(numbers) <= max(_FEWEST, _SHARE * values.size):
         return None
-    inside = sum(int(np.count_nonzero(~_within(view != low, 1))) for view in values)
-    return low if inside >= _INSIDE * sum(numbers) else None
+    inside = sum(int(np.count_nonzero(~_within((view != low) & ~np.isnan(view), 1))) for view in values)
+    if inside < _INSIDE * sum(numbers):
+        return None
+    return low if low > 0 or _above_zero(values) else None
+
+
+def _least(values: np.ndarray) -> float:
+    """The least value, NaN left out."""
+    # Not the minimum, which NaN would be; nor where values are finite, which takes ten times as long.
+    return min(of_parts(lambda part: float(np.fmin.reduce(part, axis=None)), values), default=np.inf)
+
+
+def _above_zero(values: np.ndarray) -> bool:
+    """Whether pixels that are saturated in some views measure more than 0 else; dead ones measure air as well."""
+    ends, least = np.zeros(values.shape[1:], bool), np.full(values.shape[1:], np.nan, values.dtype)
+    for view in values:
+        marked = np.isneginf(view)
+        ends |= marked
+        np.fmin(least, np.where(marked, np.nan, view), out=least)
+    least = least[ends & np.isfinite(least)]
+    return len(least) > 0 and bool(np.quantile(least, _LOW) > 0)
 
 
 def _within(rays: np.ndarray, wide: int) -> np.ndarray:
@@ -78,13 +107,16 @@ def _within(rays: np.ndarray, wide: int) -> np.ndarray:
     return maximum_filter(rays, size=2 * wide + 1, mode="nearest")
 
 
-def _width(values: np.ndarray, low: float) -> int:
-    """Pixels at the border that may see matter: as far as a round edge goes on from the first ray above the end."""
+def _width(values: np.ndarray, end: float) -> int:
+    """Pixels at the border that may see matter: as far as a round edge goes on from the first rays above the end."""
     found = []
     for view in values:
-        ends = view == low
-        found.append(np.abs(np.diff(view, axis=1))[ends[:, 1:] != ends[:, :-1]])
-    steps = np.concatenate(found)
-    steps = steps[np.isfinite(steps)]
-    # The chord of a round edge rises with the root of the depth: half as far as its slope there tells.
-    return max(1, round(0.5 * low / float(np.median(steps)))) if len(steps) else 1
+        for one in (view, view[:, ::-1]):
+            ends = one == end
+            border = ends[:, :-2] & ~ends[:, 1:-1] & ~ends[:, 2:]
+            first, second = one[:, 1:-1][border], one[:, 2:][border]
+            rises = second > first
+            # The square of a chord rises evenly from the edge on.
+            found.append(0.5 * first[rises] / (second - first)[rises])
+    steps = np.concatenate(found) if found else np.zeros(0)
+    return max(1, math.ceil(float(np.median(steps)))) if len(steps) else 1

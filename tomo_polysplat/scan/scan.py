@@ -33,7 +33,7 @@ class Scan:
     projections : array, or Counts, shape (rows, views, columns)
         Line integrals -log(I/I0), stored as float32, or made of `Counts` that stay where they are.
         Values of invalid rays are not used, except that infinity
-        means that no light was seen (:attr:`usable`).
+        means that no light was seen, and minus infinity more than the detector can tell (:attr:`usable`).
     proj_geom, vol_geom : dict
         ASTRA geometries of three-dimensional type (``parallel3d``, ``parallel3d_vec``, ``cone``,
         ``cone_vec``), lengths in `unit`.
@@ -109,13 +109,14 @@ class Scan:
 
     @property
     def usable(self) -> np.ndarray | Marks | None:
-        """Rays to pass as ``valid`` to `tomo_polysplat.reconstruct`: those of :attr:`valid`, and those without light.
+        """Rays to pass as ``valid`` to `tomo_polysplat.reconstruct`: also those without light, and saturated ones.
 
-        `reconstruct` tells rays without light from dead pixels. Add your own mask with ``scan.usable & mask``.
+        `reconstruct` tells rays without light from dead pixels, and saturated rays beside the object from others. Add
+        your own mask with ``scan.usable & mask``.
         """
         if isinstance(self.valid, Marks):
             return Marks(self.valid.counts, lightless=True)
-        return None if self.valid is None else self.valid | np.isposinf(self.projections)
+        return None if self.valid is None else self.valid | np.isinf(self.projections)
 
     @property
     def rows(self) -> int:

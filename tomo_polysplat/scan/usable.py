@@ -74,8 +74,8 @@ def usable_rays(
         raise fail("projections", "at least one usable ray", "none", remedy)
     values = _uncorrected(values, water_correction, spectrum)
     if proj_geom.get("type") == "cyl_cone_vec":
-        # After resampling, a ray that uses any ray without light is infinite.
-        values[np.isposinf(values)] = np.nan
+        # After resampling, a ray that uses any ray without light, or a saturated one, is infinite.
+        values[np.isinf(values)] = np.nan
     if counts["rays_not_finite"] and any(np.isposinf(view).any() for view in values):
         counts["rays_opaque"] = fill_opaque(values, photons_per_ray(values))
         counts["rays_not_finite"] -= counts["rays_opaque"]
@@ -83,8 +83,11 @@ def usable_rays(
     else:
         # A scale that goes to infinity has no end before.
         counts["rays_opaque"] = fill_dark_end(values)
-    if saturated := mend_light_end(values):
+    saturated, told = mend_light_end(values)
+    if saturated:
         counts["rays_saturated"] = saturated
+        counts["rays_not_finite"] -= told
+        used += told
     if used < (1 - _MOST_LEFT_OUT) * values.size:
         _tell_left_out({name: n for name, n in counts.items() if name != "rays_opaque"}, used)
     if counts["rays_opaque"]:
@@ -181,14 +184,16 @@ def _take_out(values: np.ndarray, marked: np.ndarray | None) -> dict[str, int]:
     bad = ~np.isfinite(values)
     counts = {"rays_not_finite": int(np.count_nonzero(bad))}
     if marked is not None:
+        # Of saturated rays it says why they are no number.
+        counts["rays_not_finite"] -= int(np.count_nonzero(marked & np.isneginf(values)))
         counts["rays_marked_invalid"] = int(np.count_nonzero(marked))
         bad |= marked
-    lightless = np.isposinf(values)
+    beyond = np.isinf(values)
     if marked is not None:
-        lightless &= ~marked
-    # Rays without light stay infinite for now: `fill_opaque` judges them.
-    values[bad & ~lightless] = np.nan
-    impossible = (np.abs(values) > _LARGEST_LOGARITHM) & ~lightless
+        beyond &= ~marked
+    # Rays without light, or saturated, stay infinite for now: `fill_opaque` and `mend_light_end` judge them.
+    values[bad & ~beyond] = np.nan
+    impossible = (np.abs(values) > _LARGEST_LOGARITHM) & ~beyond
     counts["rays_out_of_range"] = int(np.count_nonzero(impossible))
     values[impossible] = np.nan
     bad |= impossible

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from tomo_polysplat.scan.light_end import lower_end
 from tomo_polysplat.scan.probes.air import Air
 from tomo_polysplat.scan.probes.finding import DEFECT, OK, UNKNOWN, Finding
 from tomo_polysplat.scan.probes.measured import Measured
@@ -22,7 +23,7 @@ _FRAMES, _SAME = 0.05, 0.3
 _SATURATED = 0.01
 # Rays that tell whether there is noise: 1.4 of noise is new in the next view, and in the next row.
 _FEWEST, _NEW = 50, 0.8
-_LESS_LIGHT = "measure with less light or a shorter exposure; saturation= leaves such rays out"
+_LESS_LIGHT = "measure with less light or a shorter exposure"
 # Largest numbers of cameras with 8 to 16 bits.
 _LIMITS = 2.0 ** np.array([8, 10, 12, 14, 16]) - 1
 
@@ -32,6 +33,12 @@ def probe_beam(measured: Measured) -> Finding:
     told = _frames(measured.scan.notes) or _marked(measured)
     if told:
         return Finding(BEAM, DEFECT, *told)
+    end = lower_end(measured.filled.swapaxes(0, 1))
+    if end is not None:
+        text = f"many rays beside the object hold the very same value, {end:.3g}, the least of all: saturated"
+        return Finding(
+            BEAM, DEFECT, text, f"{_LESS_LIGHT}; a run takes them to pass beside the object", {"end": end}
+        )
     air = measured.air
     if air is None:
         text = "no rays beside the object tell whether the flats belong to the projections"

@@ -49,9 +49,14 @@ def probe_last_view(measured: Measured) -> Finding:
         turn = "the angles want numpy.linspace(..., endpoint=True), or one view is there twice"
         return Finding(LAST_VIEW, DEFECT, text, turn, numbers)
     if same or (other and gap == 1):
-        return Finding(
-            LAST_VIEW, OK, f"{where}{'' if gap == 0 else ' but for one step'}, as told", "", numbers
+        text = (
+            where
+            if gap == 0
+            else "one step before half a turn from the first"
+            if half
+            else "one step before the first"
         )
+        return Finding(LAST_VIEW, OK, f"{text}, as told", "", numbers)
     return Finding(LAST_VIEW, UNKNOWN, unknown, remedy, numbers)
 
 
