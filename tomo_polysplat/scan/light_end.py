@@ -20,6 +20,8 @@ _FEWEST, _SHARE = 10, 2e-4
 # Of these, the share that has no other neighbours. Noise cut off at the mean of air, as by ``numpy.maximum``, leaves
 # 2^-9 of them, and a cut at one standard deviation, which does no harm, a quarter.
 _INSIDE = 0.5
+# Air of no more than this is 0 to rounding, as of simulated scans without noise; a step of 16 bits is 1.5e-5.
+_ROUNDING = 2.0**-20
 
 
 def mend_light_end(values: np.ndarray) -> int:
@@ -60,7 +62,7 @@ def lower_end(values: np.ndarray) -> float | None:
     """
     # Not the minimum, which NaN would be; nor where values are finite, which takes ten times as long.
     low = min((float(np.fmin.reduce(view, axis=None)) for view in values), default=np.inf)
-    if not math.isfinite(low) or low <= 0:
+    if not math.isfinite(low) or low <= _ROUNDING:
         return None
     numbers = [int(np.count_nonzero(view == low)) for view in values]
     if min(numbers) == 0 or sum(numbers) <= max(_FEWEST, _SHARE * values.size):
