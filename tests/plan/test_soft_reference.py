@@ -12,7 +12,7 @@ import tomo_polysplat as tps
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.materials import density, mass_attenuation
 from tomo_polysplat.physics.spectrum import Spectrum
-from tomo_polysplat.plan.decisions.soft_reference import lightness, soft_reference
+from tomo_polysplat.plan.decisions.soft_reference import SoftReference, lightness, soft_reference
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.simulate.orbit import circular_orbit
 from tomo_polysplat.simulate.phantom import Part, Phantom
@@ -79,6 +79,35 @@ def test_without_air_or_matter_nothing_is_light():
 def test_foam_is_matter_and_lighter_than_that_is_only_a_wrong_unit(level, unit):
     found = of(ball(level))
     assert found.value == unit and found.wrong_unit == (unit != 1.0)
+
+
+@pytest.mark.parametrize(
+    "level, noise, told", [(1.0, 0.15, False), (0.1, 0.015, True), (0.1, 0.0, True), (0.0, 0.003, False)]
+)
+def test_a_unit_is_doubted_for_what_stands_out_of_the_noise(level, noise, told):
+    """Of a small object half of the mass of a noisy start is noise, which looks like light matter."""
+    axes = np.meshgrid(*[np.arange(25) - 11] * 3, indexing="ij")
+    inside = sum(a**2 for a in axes) < 20
+    start = level * inside + noise * np.random.default_rng(2).normal(size=inside.shape)
+    # Noise of 0.3, of which a twentieth is above 0.5.
+    rays = np.random.default_rng(3).normal(0, 0.3, (4, 25, 25)) + 3 * (level > 0) * inside[11]
+    problem = SimpleNamespace(
+        depth=1.0,
+        length=1.0,
+        spectrum=HARD,
+        materials=Materials.of(None),
+        polychromatic=True,
+        hardening=None,
+        solid=False,
+        filter_map=None,
+        projections=rays.astype(np.float32),
+        photons=lambda device: 1 / 0.3**2,
+    )
+    words = []
+    lab = SimpleNamespace(start=torch.from_numpy(start), problem=problem, settings=SETTINGS, device="cpu")
+    lab.doubt_lengths = words.append
+    SoftReference().ask(SimpleNamespace(), lab)
+    assert bool(words) == told, words
 
 
 def test_foam_around_water_comes_out_as_dense_as_it_is():

@@ -82,6 +82,17 @@ def test_a_voxel_that_the_solid_hardly_enters_gives_away_a_part_and_the_mass_is_
 
 
 @pytest.mark.parametrize("planar", [True, False])
+def test_a_lighter_metal_beside_a_dense_one_stays_and_loses_its_own_halo(planar):
+    """As titanium does beside steel: it ends at 9 voxels, the dense one at 6."""
+    both = block(planar, 3.0, 9.0)
+    both.attenuation[both.position[:, 0] > 6.0 * VOXEL] = 0.35
+    metal, tail = found(both, box(planar, 13))
+    middle = 0 if planar else 6
+    assert not bool(tail[middle, 6, 3:9].any())
+    assert float(tail[middle, 6, 9]) == 1 and float(tail[middle, 6, 2]) == 1
+
+
+@pytest.mark.parametrize("planar", [True, False])
 def test_without_a_level_or_metal_there_are_no_tails(planar):
     assert not bool(found(block(planar, 3.0, 7.0), box(planar), level=0.0)[1].any())
     empty = block(planar, 3.0, 7.0).select(torch.zeros(0, dtype=torch.int64))

@@ -27,6 +27,7 @@ from tomo_polysplat.plan.first_volume import first_volume
 from tomo_polysplat.plan.lab import Lab
 from tomo_polysplat.plan.means import Means
 from tomo_polysplat.plan.model import rays_of, scene_of
+from tomo_polysplat.plan.no_object import doubt_object
 from tomo_polysplat.plan.order import alternatives, decide, decide_start
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.seeds_in_time import seed_for_time
@@ -172,6 +173,7 @@ def prepare(
         if end is not None:
             seed_for_time(lab, end)
         scene, rays = lab.scene, lab.rays
+        doubt_object(problem, plan, rays.photons)
         decide(lab, When.TRIAL)
         gaussians, facts = lab.seeds(), lab.facts_of_seeds()
     _tell(plan, problem, facts)

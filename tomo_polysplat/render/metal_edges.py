@@ -17,6 +17,9 @@ _AROUND = 2
 # Below the first share of the level a voxel's metal is all tail, from the second on none. Voxels at a surface are near
 # the level: with one share single voxels changed sides from pass to pass, which cost a slice of 64^2 2.8 dB.
 _ALL, _NONE = 0.9, 1.2
+# A tail falls off from voxel to voxel, and a lighter metal beside the dense one does not. The least over the largest
+# metal of two voxels in line, and of what lies beside them: up to the first a tail, from the second on none.
+_FALLS, _LEVEL = 0.3, 0.5
 # A voxel with less metal than this share of its other matter is clean: it shows what lies beside the metal.
 _CLEAN = 0.02
 # Voxels to every side on which a voxel's factor depends: metal around metal that owns tails, next to it.
@@ -34,7 +37,8 @@ def tails(
     """The share of the metal in every voxel that is tails of Gaussians in other voxels.
 
     In a slightly blurred image the surface of a solid is where half of its attenuation is reached. So a voxel is
-    outside if none of its points comes near to ``level`` times the metal around it.
+    outside if none of its points comes near to ``level`` times the metal around it. It is a lighter metal, and not
+    outside, where neighbours hold as much as it does.
 
     Parameters
     ----------
@@ -63,7 +67,19 @@ def tails(
     peaks = voxelise_peaks(gaussians, weights, box.part(tuple(low), shape), kernel)[0]
     reached = torch.maximum(peaks, metal[z, y, x]) / needed[z, y, x].clamp(min=torch.finfo(metal.dtype).tiny)
     share[z, y, x] = ((_NONE - reached) / (_NONE - _ALL)).clamp(0.0, 1.0)
+    share *= ((_LEVEL - _evenness(metal)) / (_LEVEL - _FALLS)).clamp(0.0, 1.0)
     return share.masked_fill(metal <= 0, 0.0)
+
+
+def _evenness(metal: torch.Tensor) -> torch.Tensor:
+    """The least over the largest metal in the most even cube of two voxels an axis that a voxel is part of."""
+    window = tuple(2 if n > 1 else 1 for n in metal.shape)
+    margin = [n - 1 for n in reversed(window) for _ in range(2)]
+    pool = torch.nn.functional.max_pool3d
+    padded = torch.nn.functional.pad(metal, margin)[None]
+    largest, least = pool(padded, window, stride=1), -pool(-padded, window, stride=1)
+    even = least / largest.clamp(min=torch.finfo(metal.dtype).tiny)
+    return pool(even, window, stride=1)[0]
 
 
 def tail_factors(metal: torch.Tensor, rest: torch.Tensor, tail: torch.Tensor) -> torch.Tensor:

@@ -136,6 +136,8 @@ def how_rays_are_missed(plan: Mapping[str, Answer]) -> str:
 def doubts(plan: Mapping[str, Answer]) -> list[str]:
     """What the run itself says is to be distrusted."""
     found = []
+    if "object" in plan:
+        found.append(f"that there is an object ({plan['object'].why})")
     if "returned" in plan:
         found.append(f"whatever is finer than a filtered backprojection shows ({plan['returned'].why})")
     elif "rays" in plan and plan["rays"].evidence.get("far"):

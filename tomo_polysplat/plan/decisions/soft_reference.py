@@ -23,10 +23,12 @@ from tomo_polysplat.physics.water import transmitted_energy
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.decision import Decision, Known, is_number
 from tomo_polysplat.plan.lab import Lab
+from tomo_polysplat.plan.no_object import rays_are_noise
 from tomo_polysplat.plan.plan import adapted_to
 from tomo_polysplat.plan.unit_check import lengths_in_doubt, refuse_lengths
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.start.levels import MAIN_SHARE, main_level, mass_level
+from tomo_polysplat.units import Doubt
 
 __all__ = ["Reference", "SoftReference", "lightness", "soft_reference"]
 
@@ -147,21 +149,26 @@ def soft_reference(
 
 
 def lightness(relative: torch.Tensor, metal_level: float) -> float:
-    """Attenuation in soft references of most matter in a start volume, at most 1.
+    """Attenuation in soft references of most matter in a start volume, at most 1; 1 where it is not told."""
+    level = _above_noise(relative, metal_level)
+    return 1.0 if level is None else min(level, 1.0)
 
-    Matter stands out of the noise, which where there is none goes below zero as far as above; where nothing does, it
-    is not told, and 1.
+
+def _above_noise(relative: torch.Tensor, metal_level: float) -> float | None:
+    """Attenuation of most matter in a start volume that stands out of its noise; None where it is not told.
+
+    Noise goes below zero, where there is no matter, as far as above.
     """
     # As a list: in three dimensions what a mask picks takes 24 bytes a voxel for its indices, here 8.
     mean = box_mean(relative.float(), np.minimum(_ALIKE_VOXELS, relative.shape)).reshape(-1)
     below = mean[mean < 0]
     if not len(below):
-        return 1.0
+        return None
     matter = mean[(mean > _ABOVE_NOISE * below.square().mean().sqrt()) & (mean < metal_level)]
     if not len(matter):
-        return 1.0
+        return None
     # Of foam most voxels show its level; of thin walls hardly any do, and the densest are closest to it.
-    return min(float(matter.kthvalue(int(_UPPER * len(matter)) + 1).values), 1.0)
+    return float(matter.kthvalue(int(_UPPER * len(matter)) + 1).values)
 
 
 def _main_solid(relative: torch.Tensor, settings: Settings, lighter: float) -> float:
@@ -219,9 +226,24 @@ class SoftReference(Decision):
         found = soft_reference(lab.start, lab.problem, lab.settings, lab.problem.solid)
         unit = "g/cm3" if lab.problem.polychromatic else "per unit of length"
         level = found.level or found.value / found.first
-        doubt = lengths_in_doubt(level, lab.problem) if lab.problem.polychromatic else None
+        doubt = _doubt(level, lab) if lab.problem.polychromatic else None
         if doubt is not None and doubt.impossible and lab.settings.density_check == "refuse":
             raise refuse_lengths(doubt)
         if doubt is not None:
             lab.doubt_lengths(f"{doubt.words}: {doubt.remedy}")
         return Answer(found.data(), f"{found.value:.4g} {unit}: {found.why}", Status.ASKED)
+
+
+def _doubt(level: float, lab: Lab) -> Doubt | None:
+    """Whether the unit is in doubt, for half of the mass of the start at that level: noise is no light matter."""
+    if rays_are_noise(lab.problem, lab.problem.photons(lab.device)):
+        return None
+    found = lengths_in_doubt(level, lab.problem)
+    if found is None or level > 1:
+        return found
+    # Beside a small object most of the mass is noise, which is lighter than the object.
+    start = torch.as_tensor(lab.start)
+    clear = _above_noise(start, math.inf)
+    return (
+        found if clear is None else lengths_in_doubt(max(clear / mass_level(start), 1.0) * level, lab.problem)
+    )
