@@ -128,6 +128,8 @@ def test_unexplained_rays_without_a_spectrum_ask_for_one(caplog, monkeypatch):
         with caplog.at_level(logging.WARNING):
             reconstruct(fan(), spectrum=spectrum, settings={"passes": 0.5})
         assert asked in caplog.text
+        # One energy has no pieces of metal.
+        assert ("Metal thinner than a voxel" in caplog.text) == (spectrum is not None)
 
 
 @pytest.mark.parametrize("held_out", [0.05, 0.0])

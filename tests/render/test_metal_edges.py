@@ -93,6 +93,19 @@ def test_a_lighter_metal_beside_a_dense_one_stays_and_loses_its_own_halo(planar)
 
 
 @pytest.mark.parametrize("planar", [True, False])
+@pytest.mark.parametrize("deviation", [0.3, 0.35])
+def test_what_lies_between_two_pieces_of_one_metal_is_tails(planar, deviation):
+    """Of two voxels between them each holds as much as the other, but of the Gaussians of the pieces."""
+    both = block(planar, 3.0, 10.0)
+    both.log_scale += np.log(deviation / DEVIATION)
+    x = both.position[:, 0] / VOXEL
+    metal, tail = found(both.select(((x < 6.0) | (x > 8.0)).nonzero()[:, 0]), box(planar, 13))
+    gap = metal[0 if planar else 6, 6, 6:8]
+    assert float(gap.min()) > 0.7 * float(gap.max())
+    assert bool((tail[0 if planar else 6, 6, 6:8] == 1).all())
+
+
+@pytest.mark.parametrize("planar", [True, False])
 def test_without_a_level_or_metal_there_are_no_tails(planar):
     assert not bool(found(block(planar, 3.0, 7.0), box(planar), level=0.0)[1].any())
     empty = block(planar, 3.0, 7.0).select(torch.zeros(0, dtype=torch.int64))

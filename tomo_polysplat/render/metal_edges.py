@@ -8,7 +8,7 @@ import torch
 
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model.gaussians import Gaussians
-from tomo_polysplat.render.renderer import voxelise_peaks
+from tomo_polysplat.render.renderer import voxelise_means, voxelise_peaks
 
 __all__ = ["HALO", "tail_factors", "tails"]
 
@@ -18,8 +18,8 @@ _AROUND = 2
 # the level: with one share single voxels changed sides from pass to pass, which cost a slice of 64^2 2.8 dB.
 _ALL, _NONE = 0.9, 1.2
 # A tail falls off from voxel to voxel, and a lighter metal beside the dense one does not. The least over the largest
-# metal of two voxels in line, and of what lies beside them: up to the first a tail, from the second on none.
-_FALLS, _LEVEL = 0.3, 0.5
+# metal in a cube of two voxels an axis: up to the first it is a tail, from the second on it may be none.
+_FALLS, _EVEN = 0.3, 0.5
 # A voxel with less metal than this share of its other matter is clean: it shows what lies beside the metal.
 _CLEAN = 0.02
 # Voxels to every side on which a voxel's factor depends: metal around metal that owns tails, next to it.
@@ -37,8 +37,8 @@ def tails(
     """The share of the metal in every voxel that is tails of Gaussians in other voxels.
 
     In a slightly blurred image the surface of a solid is where half of its attenuation is reached. So a voxel is
-    outside if none of its points comes near to ``level`` times the metal around it. It is a lighter metal, and not
-    outside, where neighbours hold as much as it does.
+    outside if none of its points comes near to ``level`` times the metal around it. Where neighbours hold as much as it
+    does, it may be a lighter metal. That is made of weaker Gaussians, and what lies between two pieces of one is not.
 
     Parameters
     ----------
@@ -65,10 +65,20 @@ def tails(
     z, y, x = (slice(*ends) for ends in zip(low, end))
     shape = tuple(b - a for a, b in zip(low, end))
     peaks = voxelise_peaks(gaussians, weights, box.part(tuple(low), shape), kernel)[0]
-    reached = torch.maximum(peaks, metal[z, y, x]) / needed[z, y, x].clamp(min=torch.finfo(metal.dtype).tiny)
-    share[z, y, x] = ((_NONE - reached) / (_NONE - _ALL)).clamp(0.0, 1.0)
-    share *= ((_LEVEL - _evenness(metal)) / (_LEVEL - _FALLS)).clamp(0.0, 1.0)
+    tiny = torch.finfo(metal.dtype).tiny
+    reached = torch.maximum(peaks, metal[z, y, x]) / needed[z, y, x].clamp(min=tiny)
+    found = _outside(reached)
+    even = ((_evenness(metal)[z, y, x] - _FALLS) / (_EVEN - _FALLS)).clamp(0.0, 1.0)
+    if bool((found * even).any()):
+        strength = _strength(metal, gaussians, weights, box, kernel)[z, y, x]
+        found = found + even * (_outside(reached / strength.clamp(min=tiny)) - found)
+    share[z, y, x] = found
     return share.masked_fill(metal <= 0, 0.0)
+
+
+def _outside(reached: torch.Tensor) -> torch.Tensor:
+    """The share that is tails, by the largest metal in voxels over that of a surface."""
+    return ((_NONE - reached) / (_NONE - _ALL)).clamp(0.0, 1.0)
 
 
 def _evenness(metal: torch.Tensor) -> torch.Tensor:
@@ -78,8 +88,20 @@ def _evenness(metal: torch.Tensor) -> torch.Tensor:
     pool = torch.nn.functional.max_pool3d
     padded = torch.nn.functional.pad(metal, margin)[None]
     largest, least = pool(padded, window, stride=1), -pool(-padded, window, stride=1)
-    even = least / largest.clamp(min=torch.finfo(metal.dtype).tiny)
-    return pool(even, window, stride=1)[0]
+    return pool(least / largest.clamp(min=torch.finfo(metal.dtype).tiny), window, stride=1)[0]
+
+
+def _strength(
+    metal: torch.Tensor, gaussians: Gaussians, weights: torch.Tensor, box: VoxelBox, kernel: str
+) -> torch.Tensor:
+    """Attenuation at the centres of the Gaussians that a voxel's metal is of, over that where there is most metal."""
+    own = voxelise_means(gaussians, weights * weights, box, kernel)[0]
+    own = own / metal.clamp(min=torch.finfo(metal.dtype).tiny)
+    window = [2 * _AROUND + 1 if n > 1 else 1 for n in metal.shape]
+    margin = [n // 2 for n in window]
+    _, most = torch.nn.functional.max_pool3d(metal[None], window, 1, margin, return_indices=True)
+    densest = own.reshape(-1)[most[0]]
+    return (own / densest.clamp(min=torch.finfo(metal.dtype).tiny)).clamp(max=1.0)
 
 
 def tail_factors(metal: torch.Tensor, rest: torch.Tensor, tail: torch.Tensor) -> torch.Tensor:
