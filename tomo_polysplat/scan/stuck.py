@@ -88,6 +88,8 @@ def _among_working(values: np.ndarray, told: np.ndarray, same: np.ndarray, axis:
             if (~same[wider] & around).sum() < _WORKING * around.sum():
                 continue
             beside = values[:, wider[0], wider[1]][:, around & ~same[wider]]
+            if not np.isfinite(beside).any():
+                continue
             beside = np.where(np.isfinite(beside), beside, np.nan)
             changes = np.fmax.reduce(beside, axis=0) - np.fmin.reduce(beside, axis=0)
             usual = float(np.nanmedian(beside))
