@@ -1,11 +1,16 @@
 """A saturated camera holds one value in an area beside the object; scans that are not saturated stay as they are."""
 
 import logging
+import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
+from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.scan.counts import Counts
+from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.scan.light_end import lower_end, mend_light_end
 from tomo_polysplat.scan.usable import usable_rays
 
@@ -19,6 +24,12 @@ def counts(seed=0):
     down = np.arange(ROWS)[None, :, None] - 5.5
     chord = 2 * np.sqrt(np.clip(64 - across**2 - down**2, 0, None))
     return np.random.default_rng(seed).poisson(PHOTONS * np.exp(-0.1 * chord)), chord
+
+
+def beam(angles):
+    """A parallel beam of pixels of 1 cm."""
+    about = {"DetectorSpacingX": 1.0, "DetectorSpacingY": 1.0, "ProjectionAngles": angles}
+    return {"type": "parallel3d", "DetectorRowCount": ROWS, "DetectorColCount": COLUMNS} | about
 
 
 def logarithms(light, flat=PHOTONS):
@@ -45,6 +56,8 @@ def test_saturated_rays_pass_beside_the_object_but_at_the_border(caplog):
         "cut at the mean",
         "without noise",
         "without noise, air 0 to rounding",
+        "without noise, air not 0",
+        "8 bits without noise",
         "noise of matter alone",
         "one ray",
     ],
@@ -60,6 +73,8 @@ def test_a_scan_that_is_not_saturated_is_left_alone(kind, caplog):
         # Weights of a spectrum come to 1 but for their rounding.
         values = (0.1 * chord - np.log(np.full(100, 0.01, np.float32).sum() - 3e-7)).astype(np.float32)
         assert 0 < values.min() < 1e-6
+    elif kind == "8 bits without noise":
+        values = logarithms(np.floor(254.9 * np.exp(-0.1 * chord)), 254.9)
     elif kind == "noise of matter alone":
         values = (0.1 * chord * np.random.default_rng(1).normal(1, 0.02, chord.shape)).astype(np.float32)
     elif kind == "one ray":
@@ -84,15 +99,27 @@ def uneven(dead=False):
 def test_counts_that_reach_the_saturation_that_is_told_are_mended_alike(dead):
     light, flat, chord = uneven(dead)
     told = Counts.of(light, flat, saturation=0.9 * PHOTONS)
-    geometry = {"type": "parallel3d", "DetectorRowCount": ROWS, "DetectorColCount": COLUMNS}
-    geometry |= {"DetectorSpacingX": 1.0, "DetectorSpacingY": 1.0}
-    geometry["ProjectionAngles"] = np.linspace(0, 2 * np.pi, VIEWS, endpoint=False)
-    values, found = usable_rays(told, geometry, None)
+    values, found = usable_rays(told, beam(np.linspace(0, 2 * np.pi, VIEWS, endpoint=False)), None)
     bright = (light >= np.float32(0.9 * PHOTONS)) & (flat > 0.9 * PHOTONS)
     assert found["rays_saturated"] == bright.sum() > 0.3 * light.size
     zero = values == 0
     assert (chord[zero] == 0).mean() > 0.97 and zero.sum() > 0.6 * bright.sum()
     assert np.isnan(values[~zero & bright]).all() and np.isfinite(values[light < 0.9 * PHOTONS]).sum() > 0
+
+
+def test_saturated_rays_tell_no_noise():
+    light, _ = counts()
+    values = logarithms(np.minimum(light, 0.8 * PHOTONS))
+    mend_light_end(values)
+    angles = np.linspace(0, 2 * np.pi, VIEWS, endpoint=False)
+    window = {f"Window{end}{axis}": sign * 20.0 for end, sign in (("Min", -1), ("Max", 1)) for axis in "XYZ"}
+    volume = {"GridRowCount": 40, "GridColCount": 40, "GridSliceCount": 40, "option": window}
+    problem = Problem.of(values, *from_astra(beam(angles), volume), "cm", None, None)
+    assert problem.photons(torch.device("cpu")) == math.inf
+    problem = replace(problem, saturated=True)
+    assert 0.3 * PHOTONS < problem.photons(torch.device("cpu")) < 1.5 * PHOTONS
+    problem.forget_told()
+    assert problem.photons(torch.device("cpu")) < math.inf
 
 
 def test_dead_pixels_of_no_light_in_the_open_field_are_not_saturated():

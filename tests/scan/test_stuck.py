@@ -50,6 +50,7 @@ def test_what_may_be_constant_is_left():
     assert not stuck_pixels(np.ones((VIEWS, ROWS, COLUMNS), np.float32)).any(), "all rays alike"
     opaque, missing = scan(), scan()
     opaque[:, :, 11] = 9.0
+    opaque[:, :, [10, 12]] -= np.log(0.7)  # Its edges cover 0.3 of a pixel.
     assert not stuck_pixels(opaque).any(), "a wire on the axis through which no light passes"
     assert not stuck_pixels(opaque, axis=11.0).any() and not stuck_pixels(opaque, axis=12.5).any()
     missing[:, :, 11] = np.nan
@@ -65,7 +66,17 @@ def test_a_column_without_light_beside_the_axis_is_dead():
     wanted[:, 3] = True
     np.testing.assert_array_equal(stuck_pixels(values, axis=11.0), wanted)
     values[:, :, 19] = 14.0
+    values[:, :, [4, 18]] += 0.4  # The rest of the ring, whose edges lie within a pixel.
     assert not stuck_pixels(values, axis=11.0).any()
+
+
+@pytest.mark.parametrize("columns", [[11], [10, 11], [13]])
+def test_a_column_without_light_on_the_axis_that_has_no_edges_is_dead(columns):
+    values = scan()
+    values[:, :, columns] = 14.0
+    wanted = np.zeros((ROWS, COLUMNS), bool)
+    wanted[:, columns] = True
+    np.testing.assert_array_equal(stuck_pixels(values, axis=11.0), wanted)
 
 
 def test_what_lies_between_air_and_where_things_change_is_left():

@@ -21,6 +21,8 @@ _COMMON, _MANY = 1e-3, 0.4
 _CHANGES, _WORKING = 0.1, 0.6
 # A value as large, as a share of the largest, is that of rays without light, unless it is as far above what is around.
 _OPAQUE, _DARK_AROUND = 0.98, 0.6
+# Share of a pixel that the edge of an opaque body covers: it rarely ends between two pixels on both of its sides.
+_EDGE = 0.1
 _AROUND = np.ones((3, 3), bool)
 
 
@@ -35,7 +37,7 @@ def stuck_pixels(values: np.ndarray, axis: float | None = None) -> np.ndarray:
         -log(I/I0); values that are not finite are ignored.
     axis : float, optional
         Column on which the axis of rotation falls. Far from it, and with nothing like it on the other side, what is
-        dark from all around is no object.
+        dark from all around is no object. Nor is what has no edges, wherever it is.
     """
     views, rows, columns = values.shape
     stuck = np.zeros((rows, columns), bool)
@@ -55,10 +57,13 @@ def stuck_pixels(values: np.ndarray, axis: float | None = None) -> np.ndarray:
 
 def _common(first: np.ndarray, working: np.ndarray, same: np.ndarray) -> np.ndarray:
     """Where the value is one that working pixels have as well, (rows, columns)."""
-    shown, counts = np.unique(working, return_counts=True)
+    # By chance counts of air have some value in one view, as 0 where they are those of the open beam, hardly in two.
+    first_two, last = working[:2], working[2]
+    again = np.concatenate([last[(first_two == last).any(axis=0)], working[0][working[0] == working[1]]])
+    shown, counts = np.unique(again, return_counts=True)
     constant, pixels = np.unique(first[same], return_counts=True)
     often = np.concatenate(
-        [shown[counts > max(2, _COMMON * working.size)], constant[pixels > _MANY * first.size]]
+        [shown[counts > max(1, _COMMON * working.shape[1])], constant[pixels > _MANY * first.size]]
     )
     return np.isin(first, often) | ~same
 
@@ -83,6 +88,8 @@ def _among_working(values: np.ndarray, told: np.ndarray, same: np.ndarray, axis:
             if (~same[wider] & around).sum() < _WORKING * around.sum():
                 continue
             beside = values[:, wider[0], wider[1]][:, around & ~same[wider]]
+            if not np.isfinite(beside).any():
+                continue
             beside = np.where(np.isfinite(beside), beside, np.nan)
             changes = np.fmax.reduce(beside, axis=0) - np.fmin.reduce(beside, axis=0)
             usual = float(np.nanmedian(beside))
@@ -91,9 +98,25 @@ def _among_working(values: np.ndarray, told: np.ndarray, same: np.ndarray, axis:
                 apart = max(apart, abs(float(value) - usual))
             elif usual > _DARK_AROUND * value:
                 continue
-            most = working if value < _OPAQUE * largest or _beside(told, box[1], axis) else largest
+            no_body = value < _OPAQUE * largest or _beside(told, box[1], axis) or _sharp(values, *box)
+            most = working if no_body else largest
             stuck[wider] |= area & (apart > _CHANGES * most)
     return stuck
+
+
+def _sharp(values: np.ndarray, rows: slice, columns: slice) -> bool:
+    """Whether columns have as much light next to an area without light as one column farther.
+
+    The edge of an opaque body covers a part of a pixel: so much darker is that. Dead columns have no edges.
+    """
+    sides = []
+    for near, far in ((columns.start - 1, columns.start - 2), (columns.stop, columns.stop + 1)):
+        if min(near, far) < 0 or max(near, far) >= values.shape[2]:
+            continue
+        beside, beyond = (np.exp(-values[:, rows, place].astype(np.float64)) for place in (near, far))
+        both = np.isfinite(beside) & np.isfinite(beyond)
+        sides.append(both.any() and beside[both].mean() >= (1 - _EDGE) * beyond[both].mean())
+    return len(sides) > 0 and all(sides)
 
 
 def _beside(told: np.ndarray, place: slice, axis: float | None) -> bool:
