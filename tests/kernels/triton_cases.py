@@ -207,6 +207,8 @@ def main() -> None:
         except Exception:  # of any kind: its traceback goes to the test of that case, which fails with it
             problems[name] = traceback.format_exc()
     json.dump(problems, sys.stdout)
+    # Else Python looks through all that is loaded once more, to free what ends with the process.
+    gc.freeze()
 
 
 if __name__ == "__main__":
