@@ -57,15 +57,15 @@ class Adam:
     @torch.no_grad()
     def step(self, rates: Mapping[str, float]) -> None:
         """One step at these learning rates, by name; a parameter without a gradient stays."""
-        moved = {name: tensor for name, tensor in self.parameters.items() if tensor.grad is not None}
-        if not moved:
+        slopes = {name: t.grad for name, t in self.parameters.items() if t.grad is not None}
+        if not slopes:
             return
-        torch._foreach_add_([self._counts[name] for name in moved], 1)
-        for name, tensor in moved.items():
+        torch._foreach_add_([self._counts[name] for name in slopes], 1)
+        for name, slope in slopes.items():
             first, second = self.moments[name]
             torch._fused_adam_(
-                [tensor],
-                [tensor.grad],
+                [self.parameters[name]],
+                [slope],
                 [first],
                 [second],
                 [],

@@ -139,11 +139,13 @@ class DetectorViews:
         ray = d + row[:, None] * v + column * u
         return ray.square().sum(dim=1).sqrt()
 
-
     def _squared_lengths(self) -> np.ndarray:
         """Squares of a cone's in float32 by numpy, to the bit: of few pixels torch takes several times as long."""
         matrix = self.matrix.astype(np.float32)
-        column, row = np.arange(self.columns, dtype=np.float32), np.arange(self.rows, dtype=np.float32)[:, None]
+        column, row = (
+            np.arange(self.columns, dtype=np.float32),
+            np.arange(self.rows, dtype=np.float32)[:, None],
+        )
         squares = np.zeros((len(self), self.rows, self.columns), np.float32)
         for axis in range(3):
             u, v, d = (matrix[:, axis, k, None, None] for k in range(3))
