@@ -25,8 +25,10 @@ def pytest_configure(config):
     # A background job of a shell inherits an ignored Ctrl-C, which tests of interruptions would wait for in vain.
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    # As the process ends it would look through all that is loaded once more, for seconds, to free what ends with it.
-    atexit.register(gc.freeze)
+    if hasattr(config, "workerinput"):
+        # One of several workers, which has told all by then. Python would look through all that is loaded once more,
+        # for seconds, to free what ends with the process.
+        atexit.register(os._exit, 0)
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import atexit
 import gc
 import os
+import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -39,6 +40,12 @@ def ending_quickly() -> None:
     """Let this process, which is ours alone, end without a last look through all that is loaded.
 
     Python frees circles of objects once more before it ends, which takes a second with torch's; the system frees all.
+    Triton's would complain that they were not freed.
     """
-    atexit.unregister(gc.freeze)
-    atexit.register(gc.freeze)
+    atexit.unregister(_keep_all)
+    atexit.register(_keep_all)
+
+
+def _keep_all() -> None:
+    if "triton" not in sys.modules:
+        gc.freeze()
