@@ -5,6 +5,7 @@ Torch is imported where it is used: the process that hands tests to others, whic
 
 from __future__ import annotations
 
+import atexit
 import gc
 import os
 import signal
@@ -24,6 +25,10 @@ def pytest_configure(config):
     # A background job of a shell inherits an ignored Ctrl-C, which tests of interruptions would wait for in vain.
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    if hasattr(config, "workerinput"):
+        # One of several workers, which has told all by then. Python would look through all that is loaded once more,
+        # for seconds, to free what ends with the process.
+        atexit.register(os._exit, 0)
 
 
 @pytest.hookimpl(optionalhook=True)

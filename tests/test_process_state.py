@@ -1,5 +1,6 @@
 """Public calls leave environment variables, warning filters and torch's threads as they were, the first ones too."""
 
+import gc
 import os
 import subprocess
 import sys
@@ -67,6 +68,39 @@ def test_the_first_call_of_each_function_changes_nothing_and_loads_nothing_in_va
     )
     assert child.returncode == 0, child.stderr
     assert child.stdout.strip() == ""
+
+
+def test_the_garbage_collector_rests_meanwhile_and_is_then_as_it_was():
+    for before in (True, False):
+        try:
+            (gc.enable if before else gc.disable)()
+            with leaving_no_trace(), leaving_no_trace():
+                assert not gc.isenabled()
+            assert gc.isenabled() == before
+        finally:
+            gc.enable()
+
+
+ENDING = """
+import gc
+from tomo_polysplat.quiet_imports import ending_quickly
+
+class Circle:
+    def __init__(self):
+        self.itself = self
+    def __del__(self):
+        print("looked for")
+
+{}
+circle = Circle()
+del circle
+"""
+
+
+def test_a_process_of_ours_ends_without_looking_for_circles():
+    for call, told in (("", "looked for"), ("ending_quickly()", "")):
+        child = subprocess.run([sys.executable, "-c", ENDING.format(call)], capture_output=True, text=True)
+        assert child.stdout.strip() == told
 
 
 def test_variables_that_are_set_deleted_or_changed_come_back(monkeypatch):

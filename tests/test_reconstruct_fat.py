@@ -23,16 +23,20 @@ def core_error(core, seed=0, **settings):
     return float(result.volume[np.hypot(x, y) < 4].mean()) / true - 1
 
 
+# What the rays decide on the way.
+HELD = {"tv_factor": 1.0, "soft_gain": 0.0}
+
+
 def mean_error(core, **settings):
-    """Over three seeds, of which one moves a mean by up to 0.003; with what the rays decide on the way held."""
-    held = {"tv_factor": 1.0, "soft_gain": 0.0}
-    return np.mean([core_error(core, seed, **held, **settings) for seed in range(3)])
+    """Over three seeds, of which one moves a mean by up to 0.003."""
+    return np.mean([core_error(core, seed, **HELD, **settings) for seed in range(3)])
 
 
 # The number of polyethylene lies beyond the last that settings take.
 @pytest.mark.parametrize(("matter", "number"), [("adipose", -0.056), ("polyethylene", -0.1)])
 def test_fat_is_too_light_by_waters_number_and_right_by_its_own(matter, number):
-    assert mean_error(matter, views_per_step=8) < -0.009
+    # Without a number of its own one seed tells it: three agree to 0.001.
+    assert core_error(matter, views_per_step=8, **HELD) < -0.009
     assert abs(mean_error(matter, light="fat", light_u=number, views_per_step=8)) < 0.007
 
 

@@ -94,7 +94,8 @@ def run_tasks(function: Callable[..., object], tasks: Sequence[tuple]) -> list:
 
     The first exception is raised after the tasks already running have finished.
     """
-    threads = min(cpu_threads(), len(tasks))
+    # To ask for the threads takes as long as many a task.
+    threads = min(cpu_threads(), len(tasks)) if len(tasks) > 1 else 1
     if threads <= 1:
         return [function(*task) for task in tasks]
     waiting = deque(enumerate(tasks))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
+from functools import lru_cache
 from typing import Any
 
 from tomo_polysplat.checks import did_you_mean, fail, require_choice, require_number
@@ -210,7 +211,9 @@ class Settings:
             elif field.name in _CHOICES:
                 require_choice(name, value, _CHOICES[field.name])
             else:
-                object.__setattr__(self, field.name, _number(name, value, str(field.type)))
+                # Made anew with another value two dozen times a run: what was right is not looked at twice.
+                number = _seen_number if type(value) in (int, float) else _number
+                object.__setattr__(self, field.name, number(name, value, str(field.type)))
         if self.curves not in (None, 1, 3):
             raise fail("settings['curves']", "1, 3, or None for the plan to decide", repr(self.curves))
         if self.curves == 1 and self.soft_u:
@@ -235,6 +238,10 @@ def _number(name: str, value: Any, kind: str) -> float | int:
     if number != int(number):
         raise fail(name, "a whole number", repr(value))
     return int(number)
+
+
+# By type as well: a whole number and the same one with a point are not the same to every setting.
+_seen_number = lru_cache(maxsize=512, typed=True)(_number)
 
 
 def _require_switch(name: str, value: Any) -> None:

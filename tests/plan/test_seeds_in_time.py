@@ -65,6 +65,20 @@ def test_no_time_at_all_times_nothing(clock):
     assert clock[0] == 0.0 and "seeds_in_time" not in lab.plan.facts
 
 
+def test_no_time_that_the_seeds_leave_times_nothing(clock, monkeypatch):
+    lab = lab_of(scan())
+    seeds = lab.seeds()
+
+    def slowly():
+        clock[0] += 1.0
+        return seeds
+
+    monkeypatch.setattr(lab, "seeds", slowly)
+    for short in (0.0, 0.5):
+        seed_for_time(lab, working_time() + 1.0 - short)
+    assert clock[0] == 2.0 and "seeds_in_time" not in lab.plan.facts
+
+
 def test_an_outline_is_left_however_short_the_time_is(clock):
     lab = lab_of(scan())
     seed_for_time(lab, working_time() + 3 * A_STEP * len(lab.seeds()) + 1e-6)

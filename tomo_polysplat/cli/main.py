@@ -12,6 +12,7 @@ from tomo_polysplat.checks import visible
 from tomo_polysplat.cli import bench, check, completion, demo, doctor, import_scan, recon, simulate, view
 from tomo_polysplat.cli.options import INTERRUPTED, in_options
 from tomo_polysplat.cli.parser import Parser
+from tomo_polysplat.quiet_imports import ending_quickly
 
 __all__ = ["main"]
 
@@ -32,6 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         0 when all went well, 1 for a failure of ours, 2 for bad input, 130 when interrupted, 141 when nobody reads
         what is printed.
     """
+    ending_quickly()
     arguments = build_parser().parse_all(argv)
     level = logging.DEBUG if arguments.debug else logging.INFO if arguments.verbose else logging.WARNING
     handler = logging.StreamHandler(sys.stderr)

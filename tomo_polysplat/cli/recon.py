@@ -25,6 +25,7 @@ from tomo_polysplat.cli.recon_outputs import require_outputs, require_room_of, w
 from tomo_polysplat.fit.stopping import StopReason
 from tomo_polysplat.interrupts import postponed_interrupts
 from tomo_polysplat.progress import progress_reports
+from tomo_polysplat.quiet_imports import leaving_no_trace
 from tomo_polysplat.settings import make_settings
 
 if TYPE_CHECKING:
@@ -161,7 +162,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Reconstruct, and write what was asked for; of torchrun's processes the first one does, and the others help."""
-    from tomo_polysplat.rank_processes import TORCHRUN, started_by_torchrun
+    with leaving_no_trace():  # torch is loaded here
+        from tomo_polysplat.rank_processes import TORCHRUN, started_by_torchrun
 
     if not started_by_torchrun():
         return _reconstruct(arguments)

@@ -21,6 +21,7 @@ from tomo_polysplat.fit.step import Step
 from tomo_polysplat.kernels.device import one_torch_thread, pick_device, usual_modes
 from tomo_polysplat.model.gaussians import OF_ALL, Gaussians
 from tomo_polysplat.parallel import kept_threads
+from tomo_polysplat.quiet_imports import ending_quickly
 from tomo_polysplat.rank_processes import here, rank_of_torchrun
 from tomo_polysplat.ranks import Ranks, join, join_here, leave
 from tomo_polysplat.start.astra_pair import astra_has_gpu
@@ -156,6 +157,7 @@ def follow_torchrun(device: str) -> None:
 
 def main(folder: str, rank: str, count: str, device: str) -> int:
     """A process that rank 0 has started, which it does not outlive."""
+    ending_quickly()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     store = dist.FileStore(os.path.join(folder, "store"), int(count))

@@ -110,18 +110,33 @@ class Rays:
         device, shape = self.target, self.projections.shape[1:]
         if not self.held_out:
             return torch.zeros((len(chosen), *shape), dtype=torch.bool, device=device)
-        pixel = torch.arange(shape.numel(), device=device, dtype=torch.int64).reshape(shape) * 2654435761
         # One round of a multiplicative hash (Knuth) over the pair, to 16 even bits.
+        if device.type == "cpu":
+            return torch.from_numpy(_hashed(shape, chosen) < self.threshold)
+        pixel = torch.arange(shape.numel(), device=device, dtype=torch.int64).reshape(shape) * 2654435761
         view = _chosen(torch.arange(int(chosen.max(initial=-1)) + 1, device=device), chosen)[:, None, None]
         mixed = (pixel + (view * 40503 + 12345)) & 0xFFFFFFFF
         mixed = ((mixed ^ (mixed >> 15)) * 2246822519) & 0xFFFFFFFF
         return (mixed >> 16) < self.threshold
 
 
+def _hashed(shape: torch.Size, views: np.ndarray) -> np.ndarray:
+    """(n, rows, columns) the hash of `Rays.aside`, in whole numbers that drop what goes beyond 32 bits."""
+    pixel = np.arange(shape.numel(), dtype=np.uint32).reshape(shape) * np.uint32(2654435761)
+    view = views.astype(np.uint32) * np.uint32(40503) + np.uint32(12345)
+    mixed = pixel + view[:, None, None]
+    mixed ^= mixed >> np.uint32(15)
+    mixed *= np.uint32(2246822519)
+    mixed >>= np.uint32(16)
+    return mixed
+
+
 def _chosen(tensor: torch.Tensor, chosen: np.ndarray) -> torch.Tensor:
     """Those along the first axis. An index tensor would have to travel to a GPU, which waits for it."""
     if len(chosen) and (np.diff(chosen) == 1).all():
         return tensor[chosen[0] : chosen[-1] + 1]
+    if tensor.device.type == "cpu":
+        return tensor[torch.from_numpy(chosen)]
     return torch.stack([tensor[k] for k in chosen.tolist()])
 
 

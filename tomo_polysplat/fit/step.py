@@ -152,7 +152,7 @@ class EagerStep:
         self._add_up()
         self._hold_materials(share)
         if (moved := self.gaussians.position.grad) is not None:
-            self.pull += moved.norm(dim=1)
+            self.pull += torch.linalg.vector_norm(moved, dim=1)
         self.adam.step(rates)
         self._done += 1
         self._bound()

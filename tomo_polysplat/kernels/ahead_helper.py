@@ -7,12 +7,14 @@ import sys
 import threading
 
 from tomo_polysplat.kernels.ahead import STOP, compile_voxelise
+from tomo_polysplat.quiet_imports import ending_quickly
 
 __all__ = ["main"]
 
 
 def main() -> None:
     """Compile the projection, and the volume unless told to stop; end at once when the other process does."""
+    ending_quickly()
     stopped = threading.Event()
 
     def listen() -> None:

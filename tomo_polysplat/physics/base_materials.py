@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -61,11 +62,12 @@ class Materials:
         """Whether they are the same matter, however it is spelt: of the same elements and the same density."""
         if not isinstance(other, Materials):
             return NotImplemented
-        return self._matter() == other._matter()
+        return self._matter == other._matter
 
     def __hash__(self) -> int:
-        return hash(self._matter())
+        return hash(self._matter)
 
+    @cached_property
     def _matter(self) -> tuple[Any, ...]:
         return tuple((composition(material), known_density(material)) for material in self)
 

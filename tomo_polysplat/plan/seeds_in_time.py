@@ -50,9 +50,10 @@ def seed_for_time(lab: Lab, end: float) -> None:
     if lab.settings.max_gaussians or lab.settings.seed_spacing or end <= working_time():
         return
     seeds = lab.seeds()
-    if not len(seeds):
+    # The seeds may have taken what was left, and no step can be timed then.
+    if not len(seeds) or (left := end - working_time()) <= 0:
         return
-    needed = _seconds_of_run(lab, seeds, end - working_time())
+    needed = _seconds_of_run(lab, seeds, left)
     room = max(end - working_time(), 0.0) / needed
     if room >= 1:
         return

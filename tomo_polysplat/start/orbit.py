@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -68,6 +69,8 @@ def find_orbit(geometry: Geometry) -> tuple[Orbit | None, str]:
     return orbit, reason
 
 
+# A run asks a dozen times, of a few geometries.
+@lru_cache(maxsize=8)
 def find_turns(geometry: Geometry) -> tuple[Orbit | None, str]:
     """The circle that the source moves on as seen along the axis, at any height, or None and why there is none."""
     reason = _tilt(geometry)

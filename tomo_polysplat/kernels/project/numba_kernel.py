@@ -274,12 +274,13 @@ def forward(position, scale, rotation, weight, views: DetectorViews, cutoff: flo
     span = np.empty((len(views), groups, 4 * GROUP), np.int32)
     inverse = views.inverse
     scene = (position, scale, rotation, views.cone, views.planar, views.origin, inverse, views.matrix)
-    parts = shares(groups, 4, cpu_threads())
+    threads = cpu_threads()
+    parts = shares(groups, 4, threads)
     skipped = sum(
         run_tasks(lambda a, b: set_up(a, b, *scene, cutoff, views.rows, views.columns, record, span), parts)
     )
     image = np.zeros((len(views), views.rows, len(weight), views.columns + LANES), np.float32)
-    bands = split_range(views.rows, max(1, -(-2 * cpu_threads() // max(1, len(views)))))
+    bands = split_range(views.rows, max(1, -(-2 * threads // max(1, len(views)))))
     tasks = [(v, a, b) for v in range(len(views)) for a, b in bands]
     run_tasks(lambda v, a, b: _splat(v, a, b, record, span, weight, cutoff, image), tasks)
     return image[..., :channels, : views.columns].transpose(2, 0, 1, 3), skipped, (record, span, inverse)

@@ -210,9 +210,10 @@ def forward(position, scale, rotation, weight, box: VoxelBox, cutoff: float) -> 
     (nz, ny, nx), channels, weight = box.shape, len(weight), in_threes(weight)
     record = np.empty((len(position), NUMBERS), np.float32)
     scene = (position, scale, rotation, box.first, box.spacing, cutoff, nz, nx)
-    run_tasks(lambda a, b: set_up(a, b, *scene, record), shares(len(position), 4, cpu_threads()))
+    threads = cpu_threads()
+    run_tasks(lambda a, b: set_up(a, b, *scene, record), shares(len(position), 4, threads))
     volume = np.zeros((nz, ny, len(weight), nx + LANES), np.float32)
-    tasks = shares(nz, 2, cpu_threads())
+    tasks = shares(nz, 2, threads)
     run_tasks(lambda a, b: _fill(a, b, record, weight, cutoff, ny, volume), tasks)
     return volume[..., :channels, :nx].transpose(2, 0, 1, 3)
 
