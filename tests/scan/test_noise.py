@@ -82,7 +82,7 @@ def test_of_many_rays_every_so_many_rows_tell_as_well(monkeypatch):
 def test_the_noise_of_a_scan_is_looked_at_once(monkeypatch):
     seen = []
     monkeypatch.setattr(
-        "tomo_polysplat.fit.problem.photons_per_ray", lambda rays, dimmed: seen.append(rays) or 5e4
+        "tomo_polysplat.fit.problem.photons_per_ray", lambda rays, dimmed, **options: seen.append(rays) or 5e4
     )
     result = reconstruct(fan(), calibrate=True)
     assert len(seen) == 1 and result.plan["photons_per_ray"].value == pytest.approx(5e4)

@@ -311,9 +311,8 @@ class Problem:
     def photons(self, device: torch.device) -> float:
         """Photons of an unattenuated ray, told once a scan; see ``scan.noise``."""
         if self._known.photons is None:
-            values = self._copied(device)
-            values = torch.where(values == 0, torch.nan, values) if self.saturated else values
-            self._known.photons = photons_per_ray(values, self.dimmed(device))
+            told = self._copied(device), self.dimmed(device)
+            self._known.photons = photons_per_ray(*told, zeros_tell=not self.saturated)
         return self._known.photons
 
     def closed(self, device: torch.device) -> tuple[bool, str]:
