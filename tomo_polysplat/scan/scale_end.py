@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from tomo_polysplat.parallel import of_parts
+from tomo_polysplat.scan.extremes import largest
 from tomo_polysplat.scan.noise import photons_per_ray
 from tomo_polysplat.scan.opaque import fill_opaque, is_dark
 
@@ -71,13 +72,13 @@ def dark_end(values: np.ndarray) -> tuple[np.ndarray | None, float, float]:
 
 def _at_the_end(values: np.ndarray) -> tuple[np.ndarray | None, float]:
     """Which rays have the largest value, where that is the end of the scale (None otherwise), and that value."""
-    end = _largest(values)
+    end = largest(values, below=math.inf)
     if not end > 0:
         return None, end
     number = sum(of_parts(lambda part: int(np.count_nonzero(part == end)), values))
     if number <= max(_FEWEST, _SHARE * values.size):
         return None, end
-    if abs(end - _largest(values, below=end) - math.log(2)) < ONE_PHOTON:
+    if abs(end - largest(values, below=end) - math.log(2)) < ONE_PHOTON:
         return None, end
     step = -(-values.size // _LOOKED_AT)
     some = values.reshape(-1)[::step]
@@ -86,14 +87,3 @@ def _at_the_end(values: np.ndarray) -> tuple[np.ndarray | None, float]:
     if number <= _OFTEN * step * often and np.count_nonzero(some == end) <= _OFTEN * often:
         return None, end
     return values == end, end
-
-
-def _largest(values: np.ndarray, below: float = np.inf) -> float:
-    """The largest value below another one, finite; a few views at a time, so that nothing large is made."""
-
-    def largest(part: np.ndarray) -> float:
-        # Of what is not left out, in a tenth of the time; NaN counts as nothing.
-        most = float(np.fmax.reduce(part, axis=None))
-        return most if most < below else float(part.max(initial=-np.inf, where=part < below))
-
-    return max(of_parts(largest, values), default=-np.inf)
