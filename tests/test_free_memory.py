@@ -170,7 +170,7 @@ def test_a_mask_takes_no_copies_of_the_size_of_the_projections():
     usable_rays(scan.projections, scan.proj_geom, mask)
     tracemalloc.start()
     try:
-        values, counts = usable_rays(scan.projections, scan.proj_geom, mask)
+        values, counts, _ = usable_rays(scan.projections, scan.proj_geom, mask)
         most = tracemalloc.get_traced_memory()[1] / mask.size
     finally:
         tracemalloc.stop()

@@ -292,12 +292,12 @@ def _problem(
     require_machine(math.prod(np.shape(measured.projections)), math.prod(grid.shape), energies, on)
     # What torch adds up depends on how many threads it has.
     with one_torch_thread(on):
-        values, counts = usable_rays(
+        values, counts, given = usable_rays(
             measured.projections, proj_geom, measured.valid, measured.water_correction, spectrum
         )
         widest = options.settings.surroundings
         problem = Problem.of(values, geometry, grid, unit, spectrum, materials, widest, on, own=True)
-        problem = replace(problem, saturated=True) if "rays_saturated" in counts else problem
+        problem = replace(problem, given=given)
         problem = filtered(problem, measured.filter_map, unit, proj_geom["type"] == "cyl_cone_vec")
     # Made larger where the object is, it may have many times the voxels.
     try:

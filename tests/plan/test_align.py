@@ -91,7 +91,7 @@ def test_a_move_that_held_out_rays_do_not_confirm_is_not_made(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "part, words", [("axis_offset", "comparing them failed"), ("_held_out", "not be asked")]
+    "part, words", [("offset_of", "comparing them failed"), ("_held_out", "not be asked")]
 )
 def test_a_probe_that_fails_moves_nothing_and_ends_no_run(monkeypatch, caplog, part, words):
     def failing(*_):
@@ -119,7 +119,7 @@ def test_a_user_who_interrupts_the_probe_is_heard(monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(axis, "axis_offset", interrupted)
+    monkeypatch.setattr(axis, "offset_of", interrupted)
     with pytest.raises(KeyboardInterrupt):
         axis.find_axis(*problem_off(0.0))
 

@@ -157,7 +157,7 @@ def lab_of_scan(scan, held_out):
     from tomo_polysplat.scan.geometry import from_astra
     from tomo_polysplat.scan.usable import usable_rays
 
-    values, _ = usable_rays(scan.projections, scan.proj_geom, None, None, scan.spectrum)
+    values, _, _ = usable_rays(scan.projections, scan.proj_geom, None, None, scan.spectrum)
     problem = Problem.of(values, *from_astra(scan.proj_geom, scan.vol_geom), scan.unit, scan.spectrum, None)
     settings = Settings(held_out=held_out, **UNASKED)
     lab = Lab(problem, first_volume(problem, CPU, settings)[0], settings, CPU, short_fit=fit_start)

@@ -204,7 +204,7 @@ def test_no_hardening_leaves_one_energy():
 def test_metal_is_seen_in_a_start_and_noise_is_not_taken_for_it(views, photons):
     for metal, curves in ((True, 3), (False, 1)):
         scan = simulate_scan("pins", 20, views, metal=metal, photons=photons)
-        values, _ = usable_rays(scan.projections, scan.proj_geom, scan.valid)
+        values, _, _ = usable_rays(scan.projections, scan.proj_geom, scan.valid)
         of = Problem.of(values, *from_astra(scan.proj_geom, scan.vol_geom), "cm", scan.spectrum, None)
         start, _ = first_volume(of, torch.device("cpu"), Settings())
         assert plan(of, start).curves == curves, (metal, why(plan(of, start), "curves"))

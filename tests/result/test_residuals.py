@@ -131,6 +131,17 @@ def test_scatter_of_the_plan_belongs_to_the_model():
     assert residuals_of(ball(), scan).rms > 3
 
 
+def test_saturated_rays_are_no_measurement():
+    """They hold 0 without noise: their residuals would say that the model is better than it is."""
+    values = scan_of(line_integrals()).projections
+    result = ball()
+    result.gains = np.zeros((ROWS, COLUMNS))
+    whole = residuals_of(result, scan_of(line_integrals()))
+    found = residuals_of(result, Scan(np.maximum(values, 0.08), CONE, VOLUME, name="ball"))
+    assert 0 < found.rays <= np.count_nonzero(values > 0.08) < 0.2 * whole.rays
+    assert found.photons == pytest.approx(PHOTONS, rel=0.5) and found.rms == pytest.approx(1, abs=0.3)
+
+
 def test_rays_that_are_not_valid_do_not_count():
     values = line_integrals()
     values[3] += 1.0

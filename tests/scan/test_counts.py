@@ -82,11 +82,11 @@ def test_looked_at_as_an_array_is(both, key):
 def test_the_rays_of_a_fit_are_the_same(both, monkeypatch):
     """Also where a block holds few views, and a part of one few rows."""
     whole, stays = both()
-    expected, counts = usable_rays(whole.projections, whole.proj_geom, whole.usable)
+    expected, counts, _ = usable_rays(whole.projections, whole.proj_geom, whole.usable)
     for block, part in ((1 << 24, 1 << 18), (7 * ROWS * COLUMNS, COLUMNS)):
         monkeypatch.setattr("tomo_polysplat.scan.counts._BLOCK", block)
         monkeypatch.setattr("tomo_polysplat.scan.counts._PART", part)
-        values, found = usable_rays(stays.projections, stays.proj_geom, stays.usable)
+        values, found, _ = usable_rays(stays.projections, stays.proj_geom, stays.usable)
         assert found == counts and counts["rays_opaque"] == 3
         np.testing.assert_array_equal(values, expected)
 
@@ -95,10 +95,10 @@ def test_a_mask_comes_on_top(both):
     whole, stays = both()
     mask = np.ones(whole.projections.shape, bool)
     mask[:, 5] = False
-    expected, _ = usable_rays(whole.projections, whole.proj_geom, whole.usable & mask)
-    values, _ = usable_rays(stays.projections, stays.proj_geom, mask)
+    expected, _, _ = usable_rays(whole.projections, whole.proj_geom, whole.usable & mask)
+    values, _, _ = usable_rays(stays.projections, stays.proj_geom, mask)
     np.testing.assert_array_equal(values, expected)
-    values, _ = usable_rays(stays.projections, stays.proj_geom, stays.usable & mask)
+    values, _, _ = usable_rays(stays.projections, stays.proj_geom, stays.usable & mask)
     np.testing.assert_array_equal(values, expected)
 
 

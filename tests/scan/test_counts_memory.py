@@ -36,7 +36,7 @@ def told(path, rays):
     before = peak()
     scan = tps.load_scan(path, centre=scan_side / 2, pixel_size=0.1, unit="mm")
     loaded = peak()
-    values, _ = usable_rays(scan.projections, scan.proj_geom, scan.usable)
+    values, _, _ = usable_rays(scan.projections, scan.proj_geom, scan.usable)
     assert values.nbytes == 4 * rays and scan.valid is not None
     return (loaded - before) / rays, (peak() - before) / rays
 

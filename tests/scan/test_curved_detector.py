@@ -50,7 +50,7 @@ def test_what_is_not_valid_leaks_into_no_ray_that_is(radius, column, kind):
     covered = np.isfinite(usable_rays(projections, proj_geom, None)[0]).sum()
     projections[:, :, column], valid[:, :, column] = 5000.0, 0
     projections[4, 1, 20], valid[4, 1, 20] = -7.0, 0
-    values, counts = usable_rays(projections, proj_geom, valid)
+    values, counts, _ = usable_rays(projections, proj_geom, valid)
     usable = np.isfinite(values)
     np.testing.assert_allclose(values[usable], 1.0, rtol=1e-6)
     # Between neighbours of a column lie at most three of the flat detector, of a pixel nine.

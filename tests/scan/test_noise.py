@@ -5,6 +5,14 @@ import pytest
 from small_scans import fan, reconstruct
 
 from tomo_polysplat.scan.noise import photons_per_ray
+from tomo_polysplat.scan.usable import usable_rays
+
+PARALLEL = {"type": "parallel3d", "DetectorSpacingX": 1.0, "DetectorSpacingY": 1.0}
+PARALLEL |= {
+    "DetectorRowCount": 9,
+    "DetectorColCount": 97,
+    "ProjectionAngles": np.linspace(0, np.pi, 40, False),
+}
 
 
 def disc(peak, views=40, rows=9, columns=97):
@@ -39,6 +47,24 @@ def test_gains_of_pixels_are_no_noise():
         scan = poisson(disc(1.0), photons)
         gained = scan + np.random.default_rng(2).normal(0, 0.03, (1, *scan.shape[1:]))
         assert photons_per_ray(gained) == pytest.approx(photons_per_ray(scan), rel=0.15)
+
+
+def test_values_that_rays_were_given_tell_no_noise():
+    """A third of the rays are opaque: what they were given has no scatter at all."""
+    with np.errstate(divide="ignore"):
+        counts = np.random.default_rng(0).poisson(2e3 * np.exp(-disc(14.0)))
+        values, found, given = usable_rays(-np.log(counts / 2e3).swapaxes(0, 1), PARALLEL, None)
+    assert found["rays_opaque"] > 0.25 * values.size and (values == given[0]).sum() == found["rays_opaque"]
+    assert photons_per_ray(values, given=given) == pytest.approx(2e3, rel=0.15) != photons_per_ray(values)
+
+
+@pytest.mark.parametrize("limit", [0.004, 0.5])
+def test_an_end_of_the_scale_tells_no_noise(limit):
+    """Whether rays there are taken for opaque or left as they are."""
+    values = np.minimum(poisson(disc(9.0), 1e5), np.float32(-np.log(limit)))
+    told, found, given = usable_rays(values.swapaxes(0, 1), PARALLEL, None)
+    assert (found["rays_opaque"] == 0) == (limit == 0.5) and set(given) & set(np.unique(told))
+    assert photons_per_ray(told, given=given) == pytest.approx(1e5, rel=0.2)
 
 
 def test_an_order_of_magnitude_in_exposure_is_an_order_of_magnitude_found():

@@ -154,8 +154,8 @@ def test_rays_clipped_to_one_value_are_opaque(limit):
     """Programs clip counts before the logarithm; the value of such rays is a bound, however far down it lies."""
     projections, geometry, _, _ = rod(0.5)
     darker = (projections >= -np.log(limit))[:, None]
-    told, counts = usable_rays(np.minimum(projections, np.float32(-np.log(limit))), geometry, None)
-    clear, _ = usable_rays(np.where(darker[:, 0], np.inf, projections), geometry, None)
+    told, counts, _ = usable_rays(np.minimum(projections, np.float32(-np.log(limit))), geometry, None)
+    clear, _, _ = usable_rays(np.where(darker[:, 0], np.inf, projections), geometry, None)
     np.testing.assert_array_equal(told[~darker], clear[~darker])
     # Single dark rays beside a bright one are left as they are.
     same = told[darker] == clear[darker]
@@ -166,7 +166,7 @@ def test_rays_clipped_to_one_value_are_opaque(limit):
 def test_rays_clipped_to_less_than_a_photon_keep_their_value():
     projections, geometry, _, _ = rod(0.5)
     value = np.float32(np.log(2.5 * 2e3))
-    told, counts = usable_rays(np.minimum(projections, value), geometry, None)
+    told, counts, _ = usable_rays(np.minimum(projections, value), geometry, None)
     assert told.max() == value and 0.9 < counts["rays_opaque"] / np.isinf(projections).sum() <= 1
 
 
@@ -181,7 +181,7 @@ def test_what_is_not_at_the_end_of_the_scale_stays_as_it_is():
     smooth = np.minimum(np.linspace(0, 4, finite.size), 3.0).reshape(finite.shape)
     bright = np.minimum(finite, 0.3)
     for values in (finite, few, smooth, bright):
-        told, counts = usable_rays(values.astype(np.float32), geometry, None)
+        told, counts, _ = usable_rays(values.astype(np.float32), geometry, None)
         np.testing.assert_array_equal(told[:, 0], values.astype(np.float32))
         assert counts["rays_opaque"] == 0
 

@@ -96,6 +96,33 @@ def test_counts_of_few_values_are_left():
     assert not stuck_pixels(values).any()
 
 
+@pytest.mark.parametrize("photons", [10, 100, 1000])
+def test_a_gap_of_the_value_of_air_is_found_among_counts(photons):
+    """Counts of air come back as well, but not in the next view; rays that a mask leaves out tell nothing."""
+    random = np.random.default_rng(2)
+    views, columns = 40, 31
+    place = np.arange(columns) - 15 - 3 * np.sin(2 * np.pi * np.arange(views) / views)[:, None]
+    light = np.exp(-0.25 * np.sqrt(np.maximum(81 - place**2, 0)))
+    counts = random.poisson(photons * np.repeat(light[:, None], 5, axis=1))
+    values = -np.log(np.maximum(counts, 0.5) / photons).astype(np.float32)
+    assert not stuck_pixels(values).any()
+    values[:, :, 12:15] = 0.0
+    values[random.random(values.shape) < 0.1] = np.nan
+    wanted = np.zeros((5, columns), bool)
+    wanted[:, 12:15] = True
+    np.testing.assert_array_equal(stuck_pixels(values), wanted)
+
+
+def test_a_gap_beside_what_is_the_same_from_all_around_is_found():
+    """Above a plate nothing changes beside the gap, which shows air where the plate is."""
+    values = 0.01 * np.random.default_rng(4).standard_normal((VIEWS, 8, COLUMNS)).astype(np.float32)
+    values[:, 5:] += 2.0
+    values[:, :, 8:11] = 0.0
+    wanted = np.zeros(values.shape[1:], bool)
+    wanted[:, 8:11] = True
+    np.testing.assert_array_equal(stuck_pixels(values), wanted)
+
+
 def test_a_reconstruction_leaves_them_out_and_says_so(caplog):
     made = tps.simulate_scan("pins", 24, 40, geometry="fan")
     values = made.projections.copy()

@@ -143,7 +143,7 @@ def _result(
     if spectrum is not None and (spectrum.is_monochromatic or scan.unit == "pixel"):
         spectrum = None
     correction = None if spectrum is None else scan.water_correction
-    values, counts = usable_rays(scan.projections, scan.proj_geom, scan.usable, correction, spectrum)
+    values, counts, _ = usable_rays(scan.projections, scan.proj_geom, scan.usable, correction, spectrum)
     geometry, grid = from_astra(scan.proj_geom, scan.vol_geom)
     if spectrum is not None and scan.filter_map is not None:
         behind = FilterMap.of(scan.filter_map, scan.unit, *values.shape[1:])

@@ -88,8 +88,8 @@ class Problem:
         behind it.
     order : (views,) int array or None
         Which of the caller's views each one is; None where they are as the caller has them.
-    saturated : bool
-        Whether rays that hold 0 are saturated ones, which tell no noise.
+    given : tuple of float
+        Values that opaque and saturated rays were given, which tell no noise.
     """
 
     projections: np.ndarray | HostRays
@@ -107,7 +107,7 @@ class Problem:
     surroundings: str = ""
     order: np.ndarray | None = None
     filter_map: FilterMap | None = None
-    saturated: bool = False
+    given: tuple[float, ...] = ()
     _known: _Known = field(default_factory=_Known, init=False, repr=False)
 
     # What a caller of reconstruct tells, as it comes.
@@ -277,8 +277,8 @@ class Problem:
         """Forget what rays told that have been changed since: their noise, where matter lies, what is texture."""
         known = self._known
         known.agreement = known.closed = None
-        # Less gains and drift saturated rays are not 0 any more.
-        known.photons = known.photons if self.saturated else None
+        # Less gains and drift rays do not hold what they were given any more.
+        known.photons = known.photons if self.given else None
 
     def let_go_of_level(self) -> None:
         """Forget rays made level for physics that is not used: they take as much memory as those measured."""
@@ -312,7 +312,7 @@ class Problem:
         """Photons of an unattenuated ray, told once a scan; see ``scan.noise``."""
         if self._known.photons is None:
             told = self._copied(device), self.dimmed(device)
-            self._known.photons = photons_per_ray(*told, zeros_tell=not self.saturated)
+            self._known.photons = photons_per_ray(*told, given=self.given)
         return self._known.photons
 
     def closed(self, device: torch.device) -> tuple[bool, str]:

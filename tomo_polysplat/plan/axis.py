@@ -15,9 +15,10 @@ from tomo_polysplat.plan.first_volume import first_volume
 from tomo_polysplat.plan.means import Means
 from tomo_polysplat.plan.short_fit import short_fit
 from tomo_polysplat.ranks import current_ranks
-from tomo_polysplat.scan.axis_offset import AxisOffset, axis_offset
+from tomo_polysplat.scan.axis_offset import AxisOffset, offset_of
 from tomo_polysplat.scan.moves import Scanner, moved_geometry
 from tomo_polysplat.scan.opposite_geometry import opposite_rays_of
+from tomo_polysplat.scan.opposite_rays import OppositeRays
 from tomo_polysplat.scan.probes.direction import runs_backwards
 
 __all__ = ["aligned", "axis_of", "find_axis", "is_known"]
@@ -53,11 +54,11 @@ def find_axis(problem: Problem, means: Means, report: Callable[[float, str], Any
         not tell, or two fits, as told and moved, do not confirm it by rays held out of them.
     """
     report(0.0, "axis of rotation")
-    found = _told_by_rays(problem)
+    found, rays = _told_by_rays(problem)
     evidence = {} if found.doubt else {"offset": found.columns, "error": found.error}
     moves: dict[str, Any] = {}
-    if found.doubt or found.error > _AGREED:
-        _warn_of_angles(problem, found)
+    if rays is not None and (found.doubt or found.error > _AGREED):
+        _warn_of_angles(rays, found)
     needed = _SURE if means.time_budget is None else _SURE_ALONE
     words = _in_words(found)
     if not found.doubt and abs(found.columns) > _TOLERATED + needed * found.error:
@@ -114,25 +115,24 @@ def _moved_by(found: AxisOffset) -> str:
     return f"u {found.columns:+.3f} px (standard error {found.error:.2g})"
 
 
-def _told_by_rays(problem: Problem) -> AxisOffset:
-    """What opposite rays tell: nothing where their comparison fails, for the run does not need it."""
+def _told_by_rays(problem: Problem) -> tuple[AxisOffset, OppositeRays | None]:
+    """What opposite rays tell, and these of a fan or a cone: nothing where that fails, for the run does not need it."""
     try:
         # Of rays that are on a device the rows that tell are fetched alone.
-        return axis_offset(cast("np.ndarray", problem.projections), problem.geometry)
+        rays = opposite_rays_of(cast("np.ndarray", problem.projections), problem.geometry)
+        return offset_of(rays), None if problem.geometry.beam == "parallel" else rays
+    except ValueError as why:
+        return AxisOffset(0.0, np.inf, str(why)), None
     except Exception as error:
         logger.warning("Comparing opposite rays failed, so the axis stays as told: %r", error)
-        return AxisOffset(0.0, np.inf, f"comparing them failed: {error!r}")
+        return AxisOffset(0.0, np.inf, f"comparing them failed: {error!r}"), None
 
 
-def _warn_of_angles(problem: Problem, told: AxisOffset) -> None:
+def _warn_of_angles(rays: OppositeRays, told: AxisOffset) -> None:
     """Say that a fan or a cone went the other way round, where opposite rays that do not tell an axis tell that."""
-    if problem.geometry.beam == "parallel":
-        return
     try:
-        rays = opposite_rays_of(cast("np.ndarray", problem.projections), problem.geometry)
         better = runs_backwards(rays, told)
     except Exception as error:
-        # Where the place of the axis is not told either, that has been said.
         logger.debug("Which way the angles go is not told: %r", error)
         return
     if better:

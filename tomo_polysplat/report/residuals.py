@@ -49,7 +49,7 @@ def residuals_of(
     """Project the Gaussians of a result along the rays of its scan, and compare.
 
     The variance of -log(I/I0) of Poisson counts is exp(P)/I0, with P as the model has it and I0 from the scatter of
-    neighbouring pixels. The detector's blur and scatter count as the plan tells of them.
+    neighbouring pixels. The detector's blur and scatter count as the plan tells of them. Saturated rays are left out.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def residuals_of(
     model = _Model(result, detector_views(some, planar), pick_fast_device(device), behind)
     share = float(result.settings.get("held_out", 0.0))
     unseen = HeldOut(geometry, grid, values, share, model.device)
-    photons = photons_per_ray(values.array, model.dimmed, model.device)
+    photons = photons_per_ray(values.array, model.dimmed, model.device, values.given)
     return _collected(model, values[chosen], chosen, photons, MisfitMap(some, grid), unseen)
 
 
@@ -102,12 +102,19 @@ class _OfViews:
         valid = None if usable is None else usable[:, views]
         told = {name: np.asarray(scan.proj_geom[name])[views] for name in _BY_VIEW if name in scan.proj_geom}
         some = dict(scan.proj_geom) | told
-        self.array, _ = usable_rays(scan.projections[:, views], some, valid, correction, spectrum)
+        self.array, _, self.given = usable_rays(scan.projections[:, views], some, valid, correction, spectrum)
+        if 0.0 in self.given:
+            # A saturated camera tells a bound, which is no measurement.
+            self.array[self.array == 0] = np.nan
+        measured = np.ones(self.array.shape, bool) if self.given else True
+        for value in self.given:
+            measured &= self.array != value
         self._views = views
         drift = None if result.drift is None else np.asarray(result.drift)[views]
         for part, shape in ((result.gains, self.array.shape[1:]), (drift, (len(views), 1, 1))):
             if part is not None:
-                self.array -= np.asarray(part, self.array.dtype).reshape(shape)
+                taken = np.asarray(part, self.array.dtype).reshape(shape)
+                np.subtract(self.array, taken, out=self.array, where=measured)
 
     def __getitem__(self, views: Any) -> np.ndarray:
         return self.array[np.searchsorted(self._views, views)]

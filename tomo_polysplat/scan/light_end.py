@@ -8,11 +8,10 @@ saturated, as they reach the ``saturation`` that a user names, are minus infinit
 from __future__ import annotations
 
 import logging
-import math
 
 import numpy as np
 
-from tomo_polysplat.parallel import of_parts
+from tomo_polysplat.scan.extremes import least
 
 __all__ = ["lower_end", "mend_light_end"]
 
@@ -47,10 +46,10 @@ def mend_light_end(values: np.ndarray) -> tuple[int, int]:
     saturated, told : int
         Saturated rays, and those of them that were minus infinity.
     """
-    least = _least(values)
-    end = lower_end(values, least)
+    low = least(values)
+    end = lower_end(values, low)
     if end is None:
-        for view in values if least == -np.inf else ():
+        for view in values if low == -np.inf else ():
             view[np.isneginf(view)] = np.nan
         return 0, 0
     wide, many, left_out = _width(values, end), 0, 0
@@ -70,14 +69,14 @@ def mend_light_end(values: np.ndarray) -> tuple[int, int]:
     return many, many if told else 0
 
 
-def lower_end(values: np.ndarray, least: float | None = None) -> float | None:
+def lower_end(values: np.ndarray, low: float | None = None) -> float | None:
     """What rays (views, rows, columns) at the lower end of the scale hold; None where there is no end above air.
 
     Of an open field that was saturated, too, air holds 0. So it does without noise, and that is no end: `check` asks.
     The least value need not be looked for where it is known.
     """
-    low = _least(values) if least is None else least
-    if math.isnan(low) or low == np.inf or -np.inf < low <= _ROUNDED:
+    low = least(values) if low is None else low
+    if low == np.inf or -np.inf < low <= _ROUNDED:
         return None
     numbers = [int(np.count_nonzero(view == low)) for view in values]
     if (min(numbers) == 0 and low > 0) or sum(numbers) <= max(_FEWEST, _SHARE * values.size):
@@ -87,27 +86,19 @@ def lower_end(values: np.ndarray, least: float | None = None) -> float | None:
         return None
     if low > 0:
         # Grey values of air in pictures without noise are within one of the open beam.
-        return low if low > _least(values, low) - low else None
+        return low if low > least(values, above=low) - low else None
     return low if _above_air(values) else None
-
-
-def _least(values: np.ndarray, above: float | None = None) -> float:
-    """The least value, or that above another, NaN left out."""
-    if above is not None:
-        return min((float(view.min(initial=np.inf, where=view > above)) for view in values), default=np.inf)
-    # Not the minimum, which NaN would be; nor where values are finite, which takes ten times as long.
-    return min(of_parts(lambda part: float(np.fmin.reduce(part, axis=None)), values), default=np.inf)
 
 
 def _above_air(values: np.ndarray) -> bool:
     """Whether pixels that are saturated in some views measure more than air else; dead ones measure air as well."""
-    ends, least = np.zeros(values.shape[1:], bool), np.full(values.shape[1:], np.nan, values.dtype)
+    ends, lowest = np.zeros(values.shape[1:], bool), np.full(values.shape[1:], np.nan, values.dtype)
     for view in values:
         marked = np.isneginf(view)
         ends |= marked
-        np.fmin(least, np.where(marked, np.nan, view), out=least)
-    least = least[ends & np.isfinite(least)]
-    return len(least) > 0 and bool(np.quantile(least, _LOW) > _ROUNDED)
+        np.fmin(lowest, np.where(marked, np.nan, view), out=lowest)
+    lowest = lowest[ends & np.isfinite(lowest)]
+    return len(lowest) > 0 and bool(np.quantile(lowest, _LOW) > _ROUNDED)
 
 
 def _within(rays: np.ndarray, wide: int) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -22,7 +23,7 @@ def photons_per_ray(
     projections: np.ndarray | torch.Tensor,
     dimmed: np.ndarray | torch.Tensor | None = None,
     device: torch.device | None = None,
-    zeros_tell: bool = True,
+    given: Sequence[float] = (),
 ) -> float:
     """Photons of an unattenuated ray, from the scatter of neighbouring pixels.
 
@@ -40,8 +41,8 @@ def photons_per_ray(
         -log of the share of the beam that reaches each pixel through a filter of its own.
     device : torch.device, optional
         Where to compute it; where the projections are by default.
-    zeros_tell : bool
-        Whether values of exactly 0 were measured; saturated rays that were given 0 have no noise.
+    given : sequence of float
+        Values that opaque and saturated rays were given: these have no noise.
 
     Returns
     -------
@@ -55,8 +56,8 @@ def photons_per_ray(
     some = some[:, ::rows]
     some = torch.from_numpy(np.array(some)) if isinstance(some, np.ndarray) else some
     some = some.to(device).double()
-    if not zeros_tell:
-        some = torch.where(some == 0, torch.nan, some)
+    for value in given:
+        some = torch.where(some == value, torch.nan, some)
     difference = some[..., 3:-1] - 2 * some[..., 2:-2] + some[..., 1:-3]
     # Bins go by the pixels beside the three: if they went by a pixel's own value, its noise would be sorted away.
     middle = 0.5 * (some[..., 4:] + some[..., :-4])

@@ -16,7 +16,7 @@ from scipy import ndimage
 from tomo_polysplat.parallel import run_tasks
 from tomo_polysplat.scan.shadows import moving_shadows
 
-__all__ = ["fill_opaque", "is_dark"]
+__all__ = ["fill_opaque", "is_dark", "opaque_value"]
 
 # Photons of an opaque ray. dB without metal / everywhere with 0.1, with 0.5, and with opaque rays left out:
 # jaw with amalgam 39.9 / 35.3, 39.8 / 32.9, 37.4 / 35.1; two hips 29.0 / 35.4, 28.1 / 34.0, 28.6 / 30.6;
@@ -35,6 +35,11 @@ _STEPS = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
 def is_dark(value: float, photons: float) -> bool:
     """Whether a ray with this -log(I/I0) is as dark as those beside opaque rays; never where noise is not known."""
     return 1 < photons < math.inf and value >= _DARK * math.log(photons)
+
+
+def opaque_value(photons: float) -> float:
+    """What `fill_opaque` gives an opaque ray, as rays hold it."""
+    return float(np.float32(math.log(photons / _PHOTONS)))
 
 
 def fill_opaque(values: np.ndarray, photons: float) -> int:
@@ -74,7 +79,7 @@ def fill_opaque(values: np.ndarray, photons: float) -> int:
         pieces &= ~dead
         view[np.isposinf(view)] = np.nan
         if known:
-            view[pieces] = math.log(photons / _PHOTONS)
+            view[pieces] = opaque_value(photons)
         filled += int(np.count_nonzero(pieces))
     return filled
 

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from tomo_polysplat.parallel import of_parts
+from tomo_polysplat.scan.extremes import largest
 from tomo_polysplat.scan.noise import photons_per_ray
 from tomo_polysplat.scan.opaque import fill_opaque, is_dark
 
@@ -24,7 +25,7 @@ _LOOKED_AT = 1 << 18
 ONE_PHOTON = 1e-4
 
 
-def fill_dark_end(values: np.ndarray) -> int:
+def fill_dark_end(values: np.ndarray) -> tuple[int, list[float]]:
     """Give rays at the upper end of the scale that of opaque ones, in place, where no light can have come.
 
     An end at less than a photon stays: it is as good a guess as that of opaque rays.
@@ -36,43 +37,48 @@ def fill_dark_end(values: np.ndarray) -> int:
 
     Returns
     -------
-    int
+    number : int
         How many there were; others at the end stay as they are.
+    given : list of float
+        What rays at an end hold now: none has noise.
     """
-    opaque, value = dark_end(values)
+    opaque, value, end = dark_end(values)
     if opaque is None:
-        return 0
+        return 0, [end] if math.isfinite(end) else []
     values[opaque] = value
-    return int(np.count_nonzero(opaque))
+    return int(np.count_nonzero(opaque)), sorted({value, end})
 
 
-def dark_end(values: np.ndarray) -> tuple[np.ndarray | None, float]:
-    """Which rays `fill_dark_end` gives which value; None where there are none. Parameters are its own."""
+def dark_end(values: np.ndarray) -> tuple[np.ndarray | None, float, float]:
+    """Which rays `fill_dark_end` gives which value, and the end of the scale; None and infinity where there is none.
+
+    Parameters are its own.
+    """
     ended, end = _at_the_end(values)
     if ended is None:
-        return None, end
+        return None, end, math.inf
     clipped = np.where(ended, np.float32(np.inf), values)
     # Without the rays at the end, which all have the same value, and so no noise.
     photons = photons_per_ray(clipped)
     if not is_dark(end, photons):
-        return None, end
+        return None, end, end
     fill_opaque(clipped, photons)
     opaque = ended & np.isfinite(clipped)
     if not opaque.any():
-        return None, end
+        return None, end, end
     value = float(clipped[opaque][0])
-    return opaque, end if math.log(photons) <= end <= value else value
+    return opaque, end if math.log(photons) <= end <= value else value, end
 
 
 def _at_the_end(values: np.ndarray) -> tuple[np.ndarray | None, float]:
     """Which rays have the largest value, where that is the end of the scale (None otherwise), and that value."""
-    end = _largest(values)
+    end = largest(values, below=math.inf)
     if not end > 0:
         return None, end
     number = sum(of_parts(lambda part: int(np.count_nonzero(part == end)), values))
     if number <= max(_FEWEST, _SHARE * values.size):
         return None, end
-    if abs(end - _largest(values, below=end) - math.log(2)) < ONE_PHOTON:
+    if abs(end - largest(values, below=end) - math.log(2)) < ONE_PHOTON:
         return None, end
     step = -(-values.size // _LOOKED_AT)
     some = values.reshape(-1)[::step]
@@ -81,14 +87,3 @@ def _at_the_end(values: np.ndarray) -> tuple[np.ndarray | None, float]:
     if number <= _OFTEN * step * often and np.count_nonzero(some == end) <= _OFTEN * often:
         return None, end
     return values == end, end
-
-
-def _largest(values: np.ndarray, below: float = np.inf) -> float:
-    """The largest value below another one, finite; a few views at a time, so that nothing large is made."""
-
-    def largest(part: np.ndarray) -> float:
-        # Of what is not left out, in a tenth of the time; NaN counts as nothing.
-        most = float(np.fmax.reduce(part, axis=None))
-        return most if most < below else float(part.max(initial=-np.inf, where=part < below))
-
-    return max(of_parts(largest, values), default=-np.inf)

@@ -12,9 +12,11 @@ __all__ = ["stuck_pixels"]
 
 # In fewer views a value may come again by chance.
 _FEWEST_VIEWS = 8
-# A value that so many rays of working pixels show, or so many of all pixels, is what the scan holds for air without
-# noise, or for no light.
-_COMMON, _MANY = 1e-3, 0.4
+# A value that working pixels hold in the next view in so many cases, or so many of all pixels always, is what the scan
+# holds for air without noise, or for no light. No count comes again so often from five photons a ray on.
+_AGAIN, _MANY = 0.2, 0.4
+# Rays of some views, each with the next one, that tell what comes again.
+_TELLING = 4000
 # Beside a stuck pixel values change by so much of the largest where it changes most, or are as far from its own; real
 # ones of few different counts may be constant where hardly anything changes. So many of the pixels around must work:
 # what lies on the axis looks the same from all around, and so does all that is round about it, where there is no noise.
@@ -43,42 +45,47 @@ def stuck_pixels(values: np.ndarray, axis: float | None = None) -> np.ndarray:
     stuck = np.zeros((rows, columns), bool)
     if views < _FEWEST_VIEWS or columns < 3:
         return stuck
-    # Three views leave few pixels to look at in all of them.
-    some = values[[0, views // 2, -1]]
-    first = some[0]
-    same = np.isfinite(first) & (some == first).all(axis=0)
+    # A few views leave few pixels to look at in all of them.
+    pairs = min(views // 2, max(3, -(-_TELLING // (rows * columns))))
+    before = np.linspace(0, views - 2, pairs).round().astype(int)
+    some = values[np.stack([before, before + 1], 1).reshape(-1)]
+    first = np.fmax.reduce(some, axis=0)
+    same = np.isfinite(first) & (np.isnan(some) | (some == first)).all(axis=0)
     told = same & ~_common(first, some[:, ~same], same)
     place = np.nonzero(told)
-    told[place] = (values[:, place[0], place[1]] == first[place]).all(axis=0)
+    there = values[:, place[0], place[1]]
+    enough = np.count_nonzero(np.isfinite(there), axis=0) >= _FEWEST_VIEWS
+    told[place] = enough & (np.isnan(there) | (there == first[place])).all(axis=0)
     if not told.any():
         return stuck
-    return _among_working(values, told, same, axis)
+    return _among_working(values, np.where(told, first, np.nan), same, axis)
 
 
 def _common(first: np.ndarray, working: np.ndarray, same: np.ndarray) -> np.ndarray:
     """Where the value is one that working pixels have as well, (rows, columns)."""
-    # By chance counts of air have some value in one view, as 0 where they are those of the open beam, hardly in two.
-    first_two, last = working[:2], working[2]
-    again = np.concatenate([last[(first_two == last).any(axis=0)], working[0][working[0] == working[1]]])
-    shown, counts = np.unique(again, return_counts=True)
+    # By chance counts of air have some value in one view, as 0 if they are those of the open beam, hardly in the next.
+    before, after = working[::2], working[1::2]
     constant, pixels = np.unique(first[same], return_counts=True)
+    shown, counts = np.unique(before, return_counts=True)
+    again, times = np.unique(before[before == after], return_counts=True)
+    of_shown = counts[np.searchsorted(shown, again)]
     often = np.concatenate(
-        [shown[counts > max(1, _COMMON * working.shape[1])], constant[pixels > _MANY * first.size]]
+        [again[(times > 1) & (times > _AGAIN * of_shown)], constant[pixels > _MANY * first.size]]
     )
     return np.isin(first, often) | ~same
 
 
-def _among_working(values: np.ndarray, told: np.ndarray, same: np.ndarray, axis: float | None) -> np.ndarray:
-    """The areas of pixels told of that have the same value, and around which pixels work."""
+def _among_working(values: np.ndarray, held: np.ndarray, same: np.ndarray, axis: float | None) -> np.ndarray:
+    """The areas of pixels that held the same value in all views, and around which pixels work; NaN is not told of."""
     from scipy import ndimage
 
-    finite = np.isfinite(values)
+    finite, told = np.isfinite(values), np.isfinite(held)
     largest = float(np.max(values, where=finite, initial=0.0))
     # That of a pixel without light has nothing to do with how much others change.
     working = float(np.max(values, where=finite & ~told, initial=0.0))
     stuck = np.zeros(told.shape, bool)
-    for value in np.unique(values[0][told]):
-        areas, count = ndimage.label(told & (values[0] == value), _AROUND)
+    for value in np.unique(held[told]):
+        areas, _ = ndimage.label(held == value, _AROUND)
         for number, box in enumerate(ndimage.find_objects(areas), 1):
             wider = tuple(slice(max(part.start - 1, 0), part.stop + 1) for part in box)
             area = areas[wider] == number
@@ -92,11 +99,11 @@ def _among_working(values: np.ndarray, told: np.ndarray, same: np.ndarray, axis:
                 continue
             beside = np.where(np.isfinite(beside), beside, np.nan)
             changes = np.fmax.reduce(beside, axis=0) - np.fmin.reduce(beside, axis=0)
-            usual = float(np.nanmedian(beside))
+            usual = np.nanmedian(beside, axis=0)
             apart = float(np.nanmax(changes, initial=0.0))
             if value < _OPAQUE * largest:
-                apart = max(apart, abs(float(value) - usual))
-            elif usual > _DARK_AROUND * value:
+                apart = max(apart, float(np.nanmax(np.abs(value - usual))))
+            elif np.nanmedian(usual) > _DARK_AROUND * value:
                 continue
             no_body = value < _OPAQUE * largest or _beside(told, box[1], axis) or _sharp(values, *box)
             most = working if no_body else largest

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,11 +22,11 @@ from tomo_polysplat.scan.geometry import (
 from tomo_polysplat.scan.light_end import mend_light_end
 from tomo_polysplat.scan.line_integrals import require_line_integrals
 from tomo_polysplat.scan.noise import photons_per_ray
-from tomo_polysplat.scan.opaque import fill_opaque
+from tomo_polysplat.scan.opaque import fill_opaque, opaque_value
 from tomo_polysplat.scan.scale_end import fill_dark_end
 from tomo_polysplat.scan.stuck import stuck_pixels
 
-__all__ = ["usable_rays"]
+__all__ = ["UsableRays", "usable_rays"]
 
 logger = logging.getLogger(__name__)
 
@@ -38,6 +38,24 @@ _MOST_LEFT_OUT = 0.2
 _AT_ONCE = 1 << 20
 
 
+class UsableRays(NamedTuple):
+    """What a reconstruction takes of a scan.
+
+    Attributes
+    ----------
+    values : (views, rows, columns) float32 array
+        -log(I/I0); NaN where a ray is not to be used.
+    counts : dict
+        How many rays there are of which kind.
+    given : tuple of float
+        Values that opaque and saturated rays were given.
+    """
+
+    values: np.ndarray
+    counts: dict[str, int]
+    given: tuple[float, ...]
+
+
 # One step after another, each of which takes rays out and counts them.
 def usable_rays(
     projections: Any,
@@ -45,7 +63,7 @@ def usable_rays(
     valid: Any,
     water_correction: Sequence[float] | None = None,
     spectrum: Spectrum | None = None,
-) -> tuple[np.ndarray, dict[str, int]]:
+) -> UsableRays:
     """Projections (views, rows, columns) with NaN for every ray that is not to be used, and their counts.
 
     A water correction is undone, and opaque rays have a value (`scan.opaque`). Parameters and errors are those of
@@ -77,14 +95,17 @@ def usable_rays(
         # After resampling, a ray that uses any ray without light, or a saturated one, is infinite.
         values[np.isinf(values)] = np.nan
     if counts["rays_not_finite"] and any(np.isposinf(view).any() for view in values):
-        counts["rays_opaque"] = fill_opaque(values, photons_per_ray(values))
+        photons = photons_per_ray(values)
+        counts["rays_opaque"] = fill_opaque(values, photons)
+        given = [opaque_value(photons)] if counts["rays_opaque"] else []
         counts["rays_not_finite"] -= counts["rays_opaque"]
         used += counts["rays_opaque"]
     else:
         # A scale that goes to infinity has no end before.
-        counts["rays_opaque"] = fill_dark_end(values)
+        counts["rays_opaque"], given = fill_dark_end(values)
     saturated, told = mend_light_end(values)
     if saturated:
+        given.append(0.0)
         counts["rays_saturated"] = saturated
         counts["rays_not_finite"] -= told
         used += told
@@ -94,7 +115,7 @@ def usable_rays(
         logger.info(
             "Rays that no light came through, opaque by what is around them: %d.", counts["rays_opaque"]
         )
-    return values, counts
+    return UsableRays(values, counts, tuple(given))
 
 
 def _axis_column(proj_geom: Mapping[str, Any]) -> float | None:

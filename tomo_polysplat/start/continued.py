@@ -13,6 +13,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 
+from tomo_polysplat.physics.typical import typical_value
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.fdk import fits_fdk
 from tomo_polysplat.start.orbit import Orbit, find_orbit
@@ -50,10 +51,9 @@ def cut_rows(projections: torch.Tensor) -> torch.Tensor | None:
         -log(I/I0); what is not finite sees nothing.
     """
     values = projections.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
-    top = float(values.max()) if values.numel() else 0.0
-    if top <= 0:
+    typical = typical_value(values)
+    if typical is None:
         return None
-    typical = float(values[values > _NOTHING * top].median())
     rows = values[values.amax(dim=-1) > _OBJECT * typical].clamp(max=_DENSE * typical)
     both = _ends(rows).amin(dim=-1) > _NOTHING * typical
     return rows if len(rows) and both.float().mean() > _MOST else None

@@ -98,7 +98,7 @@ def _starved(projections: np.ndarray, valid: np.ndarray, level: float) -> np.nda
 def _dark_end(projections: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Rays clipped to one value that a reconstruction takes for opaque."""
     values = np.where(valid, projections, np.nan).astype(np.float32).swapaxes(0, 1)
-    opaque, _ = dark_end(values)
+    opaque = dark_end(values)[0]
     return np.zeros(valid.shape, bool) if opaque is None else opaque.swapaxes(0, 1)
 
 
