@@ -15,6 +15,7 @@ import numpy as np
 
 from tomo_polysplat.fit.inside import NOTHING, typical_ray
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.spread import evenly_spread
 from tomo_polysplat.start.orbit import Orbit
 from tomo_polysplat.start.weights import ray_offsets
 
@@ -147,9 +148,7 @@ def _looks(projections: np.ndarray, together: bool) -> _Looks:
     from scipy.ndimage import uniform_filter1d
 
     views, rows, columns = projections.shape
-    at_rows, at_columns = (
-        np.unique(np.linspace(0, n - 1, min(n, _LINES)).round().astype(int)) for n in (rows, columns)
-    )
+    at_rows, at_columns = (evenly_spread(n, _LINES) for n in (rows, columns))
     number = np.arange(0, views, max(1, views // _VIEWS))
     some = np.stack([projections[view][np.ix_(at_rows, at_columns)] for view in number])
     good = np.isfinite(some)
