@@ -35,7 +35,7 @@ _TOLD, _PIXELS, _COMMON = 0.1, 0.1, 3.0
 _MOST_A_PIXEL = 2.0
 # Moves are kept where the misfit of held-out rays falls below this share of that without. 19 perfect scans of six
 # scenes came to 0.970 and more for the whole scanner; an axis off by 0.25 pixels to 0.84 to 0.95, views shifted by as
-# much to 0.94. By pixels that are not joined shifts of views explain thin metal, too: 0.95 (docs/alignment.md).
+# much to 0.94. By pixels that are not joined shifts of views explain thin metal, too: 0.95.
 _MARGIN = 0.96
 # Memories of the mean gradient and of its mean square; single views are seen once a pass only. Steps beyond _STEEPEST
 # deviations of the gradient are cut.
