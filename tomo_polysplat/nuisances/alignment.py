@@ -209,19 +209,6 @@ class Alignment(Nuisance):
                 self.values[name] = self.values[name] + offset
         self.values["views"] = without_gauge(self.values["views"], self._gauge)
 
-    def put_back(self, *names: str) -> None:
-        """Undo moves, all by default: what the rays did not confirm."""
-        for name in names or tuple(self.values):
-            self.values[name] = torch.zeros_like(self.values[name])
-
-    def largest_shift(self) -> float:
-        """Root mean square over the moves, of the worst of them, of the shift of what is seen, in pixels."""
-        shifts = [0.0]
-        for name, value in self.values.items():
-            per_unit = 1.0 if name == "views" else 1 / self._units.get(name, 1.0)
-            shifts.append(per_unit * float(value.square().mean().sqrt()))
-        return max(shifts)
-
     @classmethod
     def gate(cls, evidence: Mapping[str, float]) -> Verdict:
         """By the misfits of held-out rays of fits alike: ``without`` the moves, and ``moved``."""

@@ -25,7 +25,6 @@ from tomo_polysplat.result.residuals import Residuals
 from tomo_polysplat.scan.geometry import from_astra, is_planar_geometry
 from tomo_polysplat.scan.noise import photons_per_ray
 from tomo_polysplat.scan.usable import usable_rays
-from tomo_polysplat.spread import evenly_spread
 from tomo_polysplat.units import cm_per
 
 if TYPE_CHECKING:
@@ -74,7 +73,8 @@ def residuals_of(
         raise fail("scan", wanted, got)
     spectrum = result.spectrum if result.materials is not None else None
     geometry, grid = from_astra(scan.proj_geom, scan.vol_geom)
-    chosen = evenly_spread(geometry.views, most_views)
+    count = min(most_views, geometry.views)
+    chosen = np.unique(np.linspace(0, geometry.views - 1, count).round().astype(int))
     values = _OfViews(result, scan, np.union1d(chosen, HeldOut.views_told_by_values(geometry, grid)))
     # Where the scanner stood, if the fit has moved it.
     seen = geometry if result.geometry is None else from_astra(result.geometry, scan.vol_geom)[0]
