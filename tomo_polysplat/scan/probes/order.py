@@ -87,7 +87,7 @@ def _in_order(numbers: dict[str, float], doubt: float, shows: bool) -> Finding:
         Whether misplaced views would be seen.
     """
     ratio, rank = numbers["ratio"], numbers["rank"]
-    text = f"views from neighbouring places differ {100 * max(ratio, 0):.2g} % as much as any two views"
+    text = f"neighbouring views differ by {100 * max(ratio, 0):.2g} % of what any two views differ by"
     if ratio < _UNLIKE and rank < _RANDOM and not shows:
         text += ", but many would not stand out elsewhere either"
         return Finding(ORDER, UNKNOWN, text, "more light, or an object that is not round", numbers, doubt)
