@@ -1,4 +1,4 @@
-"""A run made both ways for a few passes over the views, where its rays are to say which one explains them."""
+"""A run that goes on both ways for a few passes, so that the rays tell which model explains them."""
 
 from __future__ import annotations
 

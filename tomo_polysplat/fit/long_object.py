@@ -1,4 +1,4 @@
-"""An object that is longer than the volume: what of it rays meet above and below.
+"""An object that is longer than the volume: what the rays meet of it above and below.
 
 A ray of a cone beam that crosses the volume runs on above or below it, and meets there what the object goes on with. In
 a volume that ends, Gaussians at its ends have to stand for that. Rays that cross nothing of the volume, but matter
@@ -101,7 +101,7 @@ def long_object(
 
 
 def _near(radius: float, orbit: Orbit) -> float:
-    """Share of its height at the axis at which a ray enters the object; it leaves it at 2 less this."""
+    """Height at which a ray enters the object, over its height at the axis. It leaves the object at 2 less this."""
     return 1.0 if math.isinf(orbit.radius) else 1.0 - min(radius / orbit.radius, _WIDEST)
 
 

@@ -1,8 +1,8 @@
-"""How thick a filter in front of each pixel is, as a fit by joined pixels tells in which it goes along with the object.
+"""The thickness of the filter in front of each pixel, fitted together with the object to joined pixels.
 
 An object makes up for most of a bowtie: it becomes too light at its rim. So the misfit of a fit hardly tells whether
-there is one, and what a rough fit leaves tells it no better. Where the filter goes on from pass to pass by what is
-left, the object gives way, and both come to where they are.
+there is one, and what a rough fit leaves tells it no better. If the filter is moved after each pass by what is
+left, the object gives way, and both come to where they belong.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Moves of the scanner that opposite rays do not tell, by default: roll, tilt, single views, and an axis they miss.
+"""Moves of the scanner that opposite rays do not tell, by default: roll, single views, and an axis they miss.
 
-What a fit of a pass leaves of the rays tells them: one that the questions of the run ask for, too, or of joined pixels.
-Where there are any, three or four more fits find them to hundredths of a pixel, and rays held out of these have to
-confirm them.
+What a fit of a pass leaves of the rays tells them. The questions of the run ask for that fit as well; a large detector
+is fitted by joined pixels. If there are moves, three or four more fits find them to hundredths of a pixel, and rays
+held out of these have to confirm them.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def realigned(
     means: Means,
     report: Callable[[float, str], Any],
 ) -> Answer:
-    """Where the scanner stood, as a fit of one pass tells it; a few more find it out where it says that it moved.
+    """Where the scanner stood: a fit of one pass tells whether it moved, and a few more find out by how much.
 
     Parameters
     ----------

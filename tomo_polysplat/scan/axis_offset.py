@@ -194,7 +194,7 @@ def _elsewhere(rays: OppositeRays, columns: np.ndarray) -> float:
 
 
 def _least(weight: np.ndarray, like: np.ndarray, slope: np.ndarray) -> float:
-    """What the sum of the slopes' weighted product must be more than, for noise alone seldom is."""
+    """The least sum of the slopes' weighted product that noise alone seldom reaches."""
     size = float((weight * like**2).sum() * (weight * slope**2).sum())
     return _CORRELATED * np.sqrt(_ALIKE * size / max(int(np.count_nonzero(weight)), 1))
 
