@@ -134,13 +134,13 @@ def step_in_parts(problem, batch):
         ("fan", True, {"pixel_rays": 2}),
     ],
 )
-@pytest.mark.parametrize("kept", [None, False, True])
+@pytest.mark.parametrize("kept", [None, 0, 1, 99])
 def test_a_graph_in_parts_steps_like_autograd(kind, polychromatic, changes, kept, monkeypatch):
-    """Also by portions of the Gaussians, with what is made of them kept or made twice."""
+    """Also by portions of the Gaussians, with what is made of none, some or all of them kept."""
     if kept is not None:
         monkeypatch.setattr(portions, "FOOTPRINTS", 8)
         monkeypatch.setattr(portions, "_WHOLE", 4)
-        monkeypatch.setattr("tomo_polysplat.fit.fused_step._room_to_keep", lambda *_: kept)
+        monkeypatch.setattr("tomo_polysplat.fit.fused_step._kept", lambda _, many, *__: min(kept, many))
     compare_steps(step_in_parts, "cuda", ("cuda", "triton"), kind, polychromatic, **changes)
 
 

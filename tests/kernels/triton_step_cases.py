@@ -39,9 +39,9 @@ def a_step_of_our_kernels_is_that_of_autograd(device):
 
 @case
 def a_step_of_a_large_cloud_portion_by_portion(device):
-    """With what is made of Gaussians made twice, and kept; with what the detector makes of rays, and sharp ones."""
+    """With what is made of some Gaussians made twice, and kept of all; with a detector that blurs, and a sharp one."""
     with mock.patch.object(portions, "FOOTPRINTS", 8), mock.patch.object(portions, "_WHOLE", 4):
-        with mock.patch("tomo_polysplat.fit.fused_step._room_to_keep", lambda *_: False):
+        with mock.patch("tomo_polysplat.fit.fused_step._kept", lambda *_: 1):
             compare_steps(_fused, device, ("cpu", "reference"), steps=1)
         compare_steps(_fused, device, ("cpu", "reference"), blurring=False, steps=1)
 

@@ -5,6 +5,7 @@ import pytest
 
 from tomo_polysplat.fit.residual_sums import ResidualSums
 from tomo_polysplat.nuisances.gains import Gains
+from tomo_polysplat.nuisances.light_factor import WORTH
 from tomo_polysplat.plan import light_told
 from tomo_polysplat.settings import Settings
 
@@ -36,11 +37,11 @@ class _Scan:
         return ResidualSums(weight, total, by_view, by_view, *parts)
 
 
-def asked(monkeypatch, gain, **options):
+def asked(monkeypatch, gain, worth=WORTH, **options):
     scan = _Scan(gain)
     monkeypatch.setattr(light_told, "residual_sums", scan.sums)
     monkeypatch.setattr(light_told, "_axis_column", lambda problem: np.nan)
-    told = light_told.ask_light(scan, None, None, scan, None, Settings(**options))
+    told = light_told.ask_light(scan, None, None, scan, None, Settings(**options), worth)
     return scan.asked, told["gains"]
 
 
@@ -55,6 +56,13 @@ def test_what_all_views_tell_is_not_missed_by_some(monkeypatch, gain):
     looks, gains = asked(monkeypatch, gain)
     assert looks == [128, VIEWS]
     assert gain < NOISE or gains.kept
+
+
+def test_what_is_worth_less_than_is_asked_for_is_told_by_some_views(monkeypatch):
+    faint, strong = 0.05 * NOISE, 2 * NOISE
+    assert asked(monkeypatch, faint, worth=0.05)[0] == [128]
+    looks, gains = asked(monkeypatch, strong, worth=0.05)
+    assert looks == [128, VIEWS] and gains.kept
 
 
 def test_what_a_caller_asks_for_is_told_by_all_views(monkeypatch):

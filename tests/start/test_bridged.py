@@ -1,5 +1,7 @@
 """A start beside opaque metal: discs and spheres, whose line integrals are chords."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -7,8 +9,9 @@ from start_phantoms import chords, distance
 
 from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.scan.moves import Scanner, moved_geometry
-from tomo_polysplat.start.bridged import bridged_start
+from tomo_polysplat.start.bridged import box_around, bridged_start
 from tomo_polysplat.start.initial import initial_volume_on
+from tomo_polysplat.start.voxel_projector import projector_pair
 
 astra = pytest.importorskip("astra")
 
@@ -68,6 +71,25 @@ def test_matter_between_opaque_metal_is_not_lost(scan):
     assert float(volume[where].mean()) < 0.6 * BODY
     assert float(bridged[where].mean()) == pytest.approx(BODY, rel=0.15)
     assert "bridged, which misses" in why
+
+
+@pytest.mark.parametrize("scan", [fan, cone, rolled])
+def test_rays_through_the_box_around_metal_are_those_through_the_volume(scan):
+    geometry, grid = scan()
+    generator, mask = torch.Generator().manual_seed(2), torch.zeros(grid.shape, dtype=torch.bool)
+    depth = grid.shape[0] // 3
+    # Up to one of the volume's ends, and away from the others.
+    mask[depth : 2 * depth + 1, :9, 7:20] = torch.rand((depth + 1, 9, 13), generator=generator) > 0.7
+    within, views = box_around(mask), np.arange(geometry.shape[0])
+    assert within[1].start == 0 and int(mask[within].sum()) == int(mask.sum()) > 5
+    assert math.prod(mask[within].shape) < 0.3 * mask.numel()
+    box = grid.box(within)
+    np.testing.assert_allclose(box.voxel_size, grid.voxel_size, rtol=1e-12)
+    lines = []
+    for part, voxels in ((grid, mask), (box, mask[within])):
+        with projector_pair(geometry, part, mask.device) as pair:
+            lines.append(pair.forward(voxels.float(), views))
+    torch.testing.assert_close(*lines, rtol=1e-5, atol=1e-4)
 
 
 def test_metal_itself_stays():

@@ -63,13 +63,13 @@ _Thing = TypeVar("_Thing")
 
 
 class _Made(Generic[_Thing]):
-    """What is made of a portion of the Gaussians, by its number: once if kept, else as often as it is asked for."""
+    """What is made of a portion of the Gaussians, by its number: once if below ``keeps``, else each time."""
 
-    def __init__(self, make: Callable[[int], _Thing], kept: bool) -> None:
-        self._make, self._kept = make, dict[int, _Thing]() if kept else None
+    def __init__(self, make: Callable[[int], _Thing], keeps: int) -> None:
+        self._make, self._keeps, self._kept = make, keeps, dict[int, _Thing]()
 
     def __call__(self, number: int) -> _Thing:
-        if self._kept is None:
+        if number >= self._keeps:
             return self._make(number)
         if number not in self._kept:
             self._kept[number] = self._make(number)
@@ -106,7 +106,8 @@ class FusedStep:
         # Only the shape of these views counts.
         self._views = fine.select(np.arange(batch))
         self._portions = portions(len(gaussians), batch)
-        self._keeps = len(self._portions) == 1 or _room_to_keep(len(gaussians), batch, device)
+        # Of so many portions what a step makes on its way is kept, of the others it is made twice.
+        self._keeps = _kept(len(gaussians), len(self._portions), batch, device)
         self._parts = (fine.rows // rays.views.rows, fine.columns // rays.views.columns)
         self._sums = torch.zeros(3, dtype=torch.float64, device=device)
         self._skipped = torch.zeros((), dtype=torch.int64, device=device)
@@ -223,7 +224,7 @@ class FusedStep:
         drawn = _Made(self._activated, keeps)
         seen = _Made(lambda number: self._footprints(drawn(number), table), keeps)
         boxed = _Made(lambda number: self._ellipsoids(drawn(number)), keeps)
-        for number in numbers if keeps else ():
+        for number in numbers[:keeps]:
             # Here, as both streams use them.
             drawn(number)
         lent: tuple[torch.Tensor, ...] = ()
@@ -235,7 +236,7 @@ class FusedStep:
                 else:
                     slope = self._slope(volume, smooth)
                     del volume
-        image, skipped = self._image(seen), None if keeps else self._skipped.clone()
+        image, skipped = self._image(seen), None if keeps == len(numbers) else self._skipped.clone()
         if part is not None:
             self._join()
             yield (image, *lent)
@@ -384,6 +385,9 @@ class FusedStep:
         return (*(zeros[:count] for zeros in of_shape), of_weight[:, :count])
 
 
-def _room_to_keep(gaussians: int, views: int, device: torch.device) -> bool:
-    """Whether what a step makes of each Gaussian on its way is kept, or made a second time: the result is the same."""
-    return device.type == "cpu" or gaussians * (_PASSING + _RECORD * views) <= _KEPT * free_bytes(device)
+def _kept(gaussians: int, many: int, views: int, device: torch.device) -> int:
+    """Of how many of ``many`` portions what a step makes on its way is kept. The result is the same."""
+    if device.type == "cpu" or many == 1:
+        return many
+    needed = gaussians * (_PASSING + _RECORD * views)
+    return min(many, int(many * _KEPT * free_bytes(device) / needed))

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 
 from tomo_polysplat.nuisances.nuisance import Found, Nuisance, Verdict
 
-__all__ = ["LightFactor"]
+__all__ = ["WORTH", "LightFactor"]
 
 # In standard errors of the mean difference, each ray with the correction and without.
 _SURE = 3.0
 # Of the misfit: a smaller gain is worth no correction, however sure it is (of 3.6e9 rays a drift of 0.002 % is).
-_WORTH = 1e-3
+WORTH = 1e-3
 
 
 class LightFactor(Nuisance):
@@ -34,13 +34,13 @@ class LightFactor(Nuisance):
         better, error = evidence["better"], evidence["error"]
         way = "rises" if better < 0 else "falls"
         words = f"the misfit of held-out rays {way} by {abs(better):.1%} (standard error {error:.1%})"
-        return Verdict(better > max(_SURE * error, _WORTH), f"{evidence['rms']:.2%} rms; {words}")
+        return Verdict(better > max(_SURE * error, WORTH), f"{evidence['rms']:.2%} rms; {words}")
 
     @classmethod
-    def ruled_out(cls, evidence: Mapping[str, float], part: float) -> bool:
-        """Whether the gate would stay shut with all views, of which this ``part`` gave the evidence.
+    def ruled_out(cls, evidence: Mapping[str, float], part: float, worth: float = WORTH) -> bool:
+        """Whether all views, of which this ``part`` gave the evidence, would take away no more than ``worth``.
 
         A mean over m of n views has n / m times the variance of noise, and so much less of it is believed: what all
         of them confirm takes away at least m / n of that here. NaN, of too few rays, rules nothing out.
         """
-        return evidence["better"] + _SURE * evidence["error"] <= part * _WORTH
+        return evidence["better"] + _SURE * evidence["error"] <= part * worth

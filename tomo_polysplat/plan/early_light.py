@@ -40,7 +40,7 @@ def take_out_early(look: Look, settings: Settings) -> dict[str, Answer]:
     if all(one is False for one in wanted.values()):
         return {}
     lab = look.lab
-    told = ask_light(lab.problem, look.gaussians, lab.scene, lab.rays, look.settings, settings)
+    told = ask_light(lab.problem, look.gaussians, lab.scene, lab.rays, look.settings, settings, _WORTH)
     for name, one in told.items():
         logger.debug("%s before the questions: %s", name, one.why)
     kept = {name: one for name, one in told.items() if one.kept and _is_worth(one, wanted[name])}

@@ -16,7 +16,7 @@ from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.nuisances.drift import Drift
 from tomo_polysplat.nuisances.gain_estimate import drift_of_views, gains_of_pixels, less_rings
 from tomo_polysplat.nuisances.gains import Gains
-from tomo_polysplat.nuisances.light_factor import LightFactor
+from tomo_polysplat.nuisances.light_factor import WORTH, LightFactor
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.settings import Settings
 
@@ -64,6 +64,7 @@ def wanted_light(settings: Settings) -> dict[str, Any]:
     return {kind.name: getattr(settings, kind.name) for kind in _KINDS}
 
 
+# Of a fit all that its residuals are made of.
 def ask_light(
     problem: Problem,
     gaussians: Gaussians,
@@ -71,6 +72,7 @@ def ask_light(
     rays: Rays,
     settings: Settings,
     options: Settings,
+    worth: float = WORTH,
 ) -> dict[str, LightTold]:
     """By name, what the rays tell: some views first, and all where these show anything.
 
@@ -82,13 +84,17 @@ def ask_light(
         As `light_told` takes them.
     gaussians, scene, rays, settings
         As `fit.residual_sums` takes them.
+    worth : float
+        What takes away less of the misfit of held-out rays is not looked for in all views.
     """
     views = len(rays.views)
     if views >= 2 * _FIRST and not problem.taken.steps and True not in wanted_light(options).values():
         some = np.arange(_FIRST) * views // _FIRST
         told = light_told(problem, residual_sums(gaussians, scene, rays, settings, some), options)
         if all(
-            kind.ruled_out(told[kind.name].evidence, _FIRST / views) for kind in _KINDS if kind.name in told
+            kind.ruled_out(told[kind.name].evidence, _FIRST / views, worth)
+            for kind in _KINDS
+            if kind.name in told
         ):
             return told
     return light_told(problem, residual_sums(gaussians, scene, rays, settings), options)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,6 +86,14 @@ class VolumeGrid:
         size = self.voxel_size
         x, y, z = (self.lower[k] + (np.arange(self.shape[2 - k]) + 0.5) * size[k] for k in range(3))
         return x, y, z
+
+    def box(self, within: Sequence[slice]) -> VolumeGrid:
+        """The voxels of these slices of z, y and x, each with a first and a last one of its own."""
+        first, last = np.array([(one.start, one.stop) for one in within][::-1]).T
+        at_end = last == np.array(self.shape[::-1])
+        upper = np.where(at_end, self.upper, self.lower + last * self.voxel_size)
+        nx, ny, nz = last - first
+        return VolumeGrid((nz, ny, nx), self.lower + first * self.voxel_size, upper)
 
     def shifted(self, by: np.ndarray) -> VolumeGrid:
         """The same voxels with the window moved by the vector ``by``."""

@@ -23,7 +23,7 @@ from tomo_polysplat.start.on_gpu import fill_rows
 from tomo_polysplat.start.projected import projected
 from tomo_polysplat.start.voxel_projector import ProjectorPair, projector_pair
 
-__all__ = ["THIN", "bridged_start", "normalising_volume"]
+__all__ = ["THIN", "box_around", "bridged_start", "normalising_volume"]
 
 _log = logging.getLogger(__name__)
 
@@ -115,8 +115,7 @@ def _better(
 
     The rays are overwritten: copies of all of a large scan would not fit on a GPU.
     """
-    dense = projected(mask.float(), pair, geometry, grid, _portions(rays))
-    covered = _blank(rays, dense, 0.5 * float(grid.voxel_size.min()))
+    covered = _blanked(rays, mask, geometry, grid)
     if covered > _MOST_OF_RAYS:
         return volume, f"; metal not bridged: {covered:.0%} of the object's rays pass through it"
     views = np.unique(np.linspace(0, len(rays) - 1, min(_JUDGES, len(rays))).astype(int))
@@ -132,10 +131,29 @@ def _better(
     return volume, f"; metal not bridged, which {words}"
 
 
-def _blank(rays: torch.Tensor, dense: Iterable[tuple[np.ndarray, torch.Tensor]], wide: float) -> float:
-    """Make rays through metal NaN, and tell which share of the object's rays they are.
+def _blanked(rays: torch.Tensor, mask: torch.Tensor, geometry: Geometry, grid: VolumeGrid) -> float:
+    """Make rays through metal NaN, and tell which share of the object's rays they are."""
+    # Metal is a small part of the volume: no ray is followed outside of the box around it.
+    within = box_around(mask)
+    box = grid.box(within)
+    with projector_pair(geometry, box, mask.device) as pair:
+        dense = projected(mask[within].float(), pair, geometry, box, _portions(rays))
+        return _blank(rays, dense, 0.5 * float(grid.voxel_size.min()))
 
-    ``dense`` has how far each ray goes through metal, by portions of the views. ``wide`` is half a voxel: less is the
+
+def box_around(mask: torch.Tensor) -> tuple[slice, slice, slice]:
+    """Slices of z, y and x that hold all of a mask (nz, ny, nx), and a voxel around where there is one."""
+    found = []
+    for lines in (mask.any(dim=2).any(dim=1), mask.any(dim=2).any(dim=0), mask.any(dim=1).any(dim=0)):
+        first, last = lines.nonzero()[[0, -1], 0].tolist()
+        found.append(slice(max(first - 1, 0), min(last + 2, len(lines))))
+    return found[0], found[1], found[2]
+
+
+def _blank(rays: torch.Tensor, dense: Iterable[tuple[np.ndarray, torch.Tensor]], wide: float) -> float:
+    """What `_blanked` does, with how far each ray goes through metal, by portions of the views.
+
+    ``wide`` is half a voxel: less is the
     blur of the threshold's edge, and a wider trace loses more than it heals.
     """
     least, through, known = THIN * float(largest_finite(rays)), 0, 0

@@ -40,9 +40,8 @@ def slabs(slices: int, depth: int, halo: int = 0) -> Iterator[tuple[slice, int, 
 
 def slab_of(grid: VolumeGrid, first: int, last: int) -> VolumeGrid:
     """The slices of a grid from the first up to, and without, the last."""
-    lower, upper, height = grid.lower.copy(), grid.upper.copy(), grid.voxel_size[2]
-    lower[2], upper[2] = grid.lower[2] + first * height, grid.lower[2] + last * height
-    return VolumeGrid((last - first, *grid.shape[1:]), lower, upper)
+    _, rows, columns = grid.shape
+    return grid.box((slice(first, last), slice(0, rows), slice(0, columns)))
 
 
 def rows_of(geometry: Geometry, grid: VolumeGrid) -> tuple[int, int]:
