@@ -67,7 +67,7 @@ def plugin_class() -> type:
     import astra
 
     class PolySplat(astra.plugin.base):
-        """Polychromatic reconstruction with Gaussians of matter, without metal artefacts.
+        """Polychromatic reconstruction with Gaussians, for scans with metal and beam hardening.
 
         ``astra.algorithm.run(id, n)`` uses every view n times; 0 or 1, what ASTRA passes when told nothing,
         leaves that to the quality. ``astra.algorithm.get_plugin_object(id).result`` is the ``Result``.

@@ -181,10 +181,12 @@ def test_a_mask_takes_no_copies_of_the_size_of_the_projections():
 
 def test_a_cloud_that_a_cpu_cannot_hold_is_refused(monkeypatch):
     monkeypatch.setattr(free_memory, "available_memory", lambda: int(1e9))
-    scene = {"views": 4, "pixels": 100, "voxels": 1000, "projections": 0}
-    assert "GB" in memory.require_room(torch.device("cpu"), gaussians=100_000, **scene)
+    small, large = (
+        memory.StepSize(count, views=4, pixels=100, voxels=1000) for count in (100_000, 1_000_000)
+    )
+    assert "GB" in memory.require_room(torch.device("cpu"), small, 0)
     with pytest.raises(MemoryError, match=r"settings: .*1\.00 GB.*1\.2. GB.*max_gaussians"):
-        memory.require_room(torch.device("cpu"), gaussians=1_000_000, **scene)
+        memory.require_room(torch.device("cpu"), large, 0)
 
 
 def test_a_simulation_that_memory_cannot_hold_is_refused_at_once():

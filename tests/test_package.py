@@ -27,6 +27,7 @@ BASICS = (
     "plain_file",
     "units",
     "settings",
+    "spread",
     "progress",
     "interrupts",
     "transfer",

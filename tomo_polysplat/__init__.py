@@ -1,4 +1,4 @@
-"""Polychromatic Gaussian-splatting CT reconstruction that leaves no metal artefacts.
+"""CT reconstruction of scans with metal and beam hardening, by Gaussians under the spectrum of the tube.
 
 The names below are the public interface; each is imported when first used, so that importing the package
 is quick and loads neither a GPU stack nor a compiler.

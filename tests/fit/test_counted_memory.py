@@ -77,11 +77,11 @@ def test_a_step(taken):
     found, voxels, pixels = taken
     most, step = found["step"]
     gaussians = len(step.gaussians)
-    told = memory.step_bytes(CPU, gaussians=gaussians, views=4, pixels=pixels, voxels=voxels)
+    told = memory.step_bytes(CPU, memory.StepSize(gaussians, views=4, pixels=pixels, voxels=voxels))
     # Samples of thin Gaussians are for the volume; parameters and their moments are there before.
     counted = sum(told.values()) - min(memory._SAMPLES, 27 * 12 * voxels)
     assert 0.5 * counted < most + 132 * gaussians <= counted
-    smoothed = memory.step_bytes(CPU, gaussians=0, views=0, pixels=0, voxels=voxels)["volumes"]
+    smoothed = memory.step_bytes(CPU, memory.StepSize(0, 0, 0, voxels))["volumes"]
     assert smoothed > 0.5 * counted, "mostly voxels"
 
 

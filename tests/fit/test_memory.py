@@ -1,6 +1,7 @@
 """What is said about memory, and when a run is refused or its projections stay on the host."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +16,8 @@ sys.path.append(str(Path(__file__).parents[1] / "kernels"))
 from step_scenes import fit_problem
 
 CPU, GPU = torch.device("cpu"), torch.device("cuda", 0)
-SCENE = {
-    "gaussians": 300_000,
-    "views": 4,
-    "pixels": 384**2,
-    "voxels": 256**3,
-    "projections": 360 * 384**2 * 4,
-}
+SCENE = memory.StepSize(gaussians=300_000, views=4, pixels=384**2, voxels=256**3)
+PROJECTIONS = 360 * 384**2 * 4
 
 
 def with_free(monkeypatch, size):
@@ -38,7 +34,7 @@ def test_projections_stay_where_the_start_has_room_for_its_copies(monkeypatch):
 def test_too_little_memory_is_refused_with_a_remedy(monkeypatch):
     with_free(monkeypatch, 1e9)
     with pytest.raises(ValueError, match="max_gaussians") as problem:
-        memory.require_room(GPU, **SCENE)
+        memory.require_room(GPU, SCENE, PROJECTIONS)
     assert "1.00 GB" in str(problem.value)
 
 
@@ -48,7 +44,7 @@ def test_more_of_anything_needs_more(monkeypatch):
     for size in np.geomspace(1e8, 1e11, 200):
         with_free(monkeypatch, size)
         try:
-            memory.require_room(GPU, **SCENE)
+            memory.require_room(GPU, SCENE, PROJECTIONS)
         except ValueError:
             continue
         enough = size
@@ -56,39 +52,38 @@ def test_more_of_anything_needs_more(monkeypatch):
     assert enough is not None
     for name in ("gaussians", "views", "pixels", "voxels"):
         with pytest.raises(ValueError, match="GPU"):
-            memory.require_room(GPU, **(SCENE | {name: SCENE[name] * 20}))
+            memory.require_room(GPU, replace(SCENE, **{name: getattr(SCENE, name) * 20}), PROJECTIONS)
 
 
 def test_room_for_gaussians_is_what_would_not_be_refused(monkeypatch):
     with_free(monkeypatch, 5e9)
-    all_else = {name: SCENE[name] for name in ("views", "pixels", "voxels")}
-    most = memory.room_for_gaussians(GPU, **all_else)
-    memory.require_room(GPU, **(SCENE | {"gaussians": int(most)}))
+    most = memory.room_for_gaussians(GPU, SCENE)
+    memory.require_room(GPU, replace(SCENE, gaussians=int(most)), PROJECTIONS)
     with pytest.raises(ValueError, match="GPU"):
-        memory.require_room(GPU, **(SCENE | {"gaussians": int(most) + 1}))
-    assert memory.room_for_gaussians(GPU, **(all_else | {"voxels": 4096**3})) == 0.0
+        memory.require_room(GPU, replace(SCENE, gaussians=int(most) + 1), PROJECTIONS)
+    assert memory.room_for_gaussians(GPU, replace(SCENE, voxels=4096**3)) == 0.0
     # As many bytes fewer as the voxels take more.
-    fewer = 13 * (512**3 - SCENE["voxels"]) / memory._GAUSSIAN
-    assert memory.room_for_gaussians(GPU, **(all_else | {"voxels": 512**3})) == pytest.approx(most - fewer)
+    fewer = 13 * (512**3 - SCENE.voxels) / memory._GAUSSIAN
+    assert memory.room_for_gaussians(GPU, replace(SCENE, voxels=512**3)) == pytest.approx(most - fewer)
     monkeypatch.setattr(memory, "available_memory", lambda: int(5e9))
     # A CPU holds the footprints of all Gaussians, a GPU those of a portion.
-    assert 0 < memory.room_for_gaussians(CPU, **all_else) < most
+    assert 0 < memory.room_for_gaussians(CPU, SCENE) < most
     monkeypatch.setattr(memory, "available_memory", lambda: None)
-    assert memory.room_for_gaussians(CPU, **all_else) == np.inf
+    assert memory.room_for_gaussians(CPU, SCENE) == np.inf
 
 
 def test_counts_beyond_32_bits_are_counted(monkeypatch):
     with_free(monkeypatch, 1e13)
-    said = memory.require_room(GPU, **(SCENE | {"voxels": 4096**3, "projections": 2**33}))
+    said = memory.require_room(GPU, replace(SCENE, voxels=4096**3), 2**33)
     assert f"{(4096**3 * 13 + (12 << 25)) / 1e9:.2f} GB" in said and "on the GPU, 8.59 GB" in said
-    assert "streamed" in memory.require_room(GPU, **(SCENE | {"projections": 0}))
+    assert "streamed" in memory.require_room(GPU, SCENE, 0)
 
 
 def test_a_step_takes_what_was_measured_on_a_gpu():
     """On an H100: 2.77 GB while a step is made and tried for the first time, besides the Gaussians themselves."""
     count, voxels = 9_576_542, 400**3
     taken = 2.77e9 + 56 * count
-    told = memory.step_bytes(GPU, gaussians=count, views=6, pixels=600**2, voxels=voxels)
+    told = memory.step_bytes(GPU, memory.StepSize(count, views=6, pixels=600**2, voxels=voxels))
     counted = sum(told.values()) - min(memory._SAMPLES, 27 * 12 * voxels)
     assert taken <= counted < 1.5 * taken
 
@@ -98,7 +93,7 @@ def test_a_larger_cloud_never_takes_less(monkeypatch):
     scene = {"views": 12, "pixels": 0, "voxels": 0}
 
     def taken(count, runs=1):
-        return sum(memory.step_bytes(GPU, gaussians=count, runs=runs, **scene).values())
+        return sum(memory.step_bytes(GPU, memory.StepSize(count, runs=runs, **scene)).values())
 
     counts = [100_000, 600_000, 999_999, 1_000_001, 1_500_000, 3_000_000]
     one = [taken(count) for count in counts]
@@ -112,7 +107,8 @@ def test_ranks_part_what_gaussians_take(monkeypatch):
     taken = {}
     for ranks in (1, 2, 8):
         monkeypatch.setattr(memory, "current_ranks", lambda ranks=ranks: Ranks(0, ranks))
-        taken[ranks] = [sum(memory.step_bytes(GPU, gaussians=count, **scene).values()) for count in counts]
+        sizes = [memory.StepSize(count, **scene) for count in counts]
+        taken[ranks] = [sum(memory.step_bytes(GPU, size).values()) for size in sizes]
         assert sorted(taken[ranks]) == taken[ranks]
     assert all(0.5 * one < two < 1.4 * one for one, two in zip(taken[1], taken[2]))
     assert all(1 / 8 * one < eight < one and eight < two for one, two, eight in zip(*taken.values()))

@@ -53,7 +53,7 @@ def test_a_known_object_tells_where_the_scanner_is(beam):
     alignment.hold_gauge()
     true = {"u": number(1.5), "roll": number(2.0), "skew": number(-1.0), "views": alignment.values["views"]}
     measured = images(moved_geometry(Scanner(told), true), scene)
-    alignment.put_back()
+    alignment = Alignment(told, 1.0)
     views = detector_views(told, False)
     for step in range(90):
         chosen = np.arange(step % 3, 21, 3)
@@ -146,8 +146,6 @@ def test_a_start_is_kept_where_it_is_not_fitted():
     alignment.step(np.arange(3), gradient, 0.1)
     assert float(alignment.values["u"]) == 2.0 and float(alignment.values["roll"]) != 0.0
     assert alignment.units == {"roll": "deg", "u": "px"}
-    alignment.put_back("roll")
-    assert alignment.report() == {"u": 2.0, "roll": 0.0}
 
 
 def test_moves_held_and_views_not_chosen_stay():
@@ -179,7 +177,7 @@ def test_a_checkpoint_goes_on_with_the_same_values():
     first.values["views"] += torch.randn((21, 2)).double()
     second = Alignment(orbit(), 1.0)
     second.restore(first.state())
-    assert second.report() == first.report() and second.largest_shift() == first.largest_shift() > 1.0
+    assert second.report() == first.report()
 
 
 @pytest.mark.parametrize("beam", ["cone", "parallel"])

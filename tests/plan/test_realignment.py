@@ -105,7 +105,7 @@ def test_a_fit_that_fails_moves_nothing_and_ends_no_run(monkeypatch, caplog):
     def failing(*_, **__):
         raise RuntimeError("broken")
 
-    monkeypatch.setattr(realignment, "first_volume", failing)
+    monkeypatch.setattr(realignment, "lab_of", failing)
     assert ask(True) is AXIS and "broken" in caplog.text
     monkeypatch.setattr(Lab, "trial", failing)
     assert first_look(lab_of(problem(False), Plan(), MEANS), 1.0) is None and caplog.text.count("broken") == 2

@@ -8,9 +8,9 @@ from small_scans import cone, fan, reconstruct
 
 import tomo_polysplat as tps
 from tomo_polysplat.plan.answer import Answer, Status
-from tomo_polysplat.quality.again import fit_again, settings_of
 from tomo_polysplat.quality.halves import compared
 from tomo_polysplat.quality.inserts import ball_in_voxels, paths_through_balls, places_for_balls, with_balls
+from tomo_polysplat.quality.refit import fit_again, settings_of
 from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.start.joseph import JosephProjector
 
@@ -64,7 +64,7 @@ def test_the_scanner_is_the_one_that_the_result_was_made_with(result, monkeypatc
         told.update(options, proj_geom=proj_geom)
         return result
 
-    monkeypatch.setattr("tomo_polysplat.quality.again.reconstruct", remember)
+    monkeypatch.setattr("tomo_polysplat.quality.refit.reconstruct", remember)
     scan = replace(fan(), filter_map=("Al", np.full((1, fan().projections.shape[2]), 0.1)))
     fit_again(result, scan)
     assert told["filter_map"] is scan.filter_map and told["proj_geom"] is scan.proj_geom

@@ -223,12 +223,12 @@ def test_the_file_is_data_exchange_with_where_and_what(tmp_path):
 
 
 def test_an_existing_file_is_kept_unless_told(tmp_path):
-    path = tmp_path / "result.h5"
-    path.write_text("mine")
-    for write in (polychromatic().save, polychromatic().save_npy):
+    path, other = tmp_path / "result.h5", tmp_path / "result.npy"
+    for there in (path, other):
+        there.write_text("mine")
         with pytest.raises(FileExistsError, match="overwrite=True"):
-            write(path)
-    assert path.read_text() == "mine"
+            polychromatic().save(there)
+        assert there.read_text() == "mine"
     polychromatic().save(path, overwrite=True)
     assert Result.load(path).seconds == 1.25
     with pytest.raises(FileNotFoundError, match="existing folder"):
@@ -277,7 +277,7 @@ def test_tiff_slices(tmp_path):
 
 
 def test_npy(tmp_path):
-    polychromatic().save_npy(tmp_path / "volume.npy")
+    polychromatic().save(tmp_path / "volume.npy")
     np.testing.assert_array_equal(np.load(tmp_path / "volume.npy"), polychromatic().volume)
 
 

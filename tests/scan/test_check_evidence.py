@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from ellipsoids import BODY, chords, cone_scan, noisy, orbit, whole_turn
 
+from tomo_polysplat.scan.assumptions import compare
 from tomo_polysplat.scan.centre import find_centre
 from tomo_polysplat.scan.check import DEFECT, OK, UNKNOWN, check_scan
-from tomo_polysplat.scan.evidence import compare
 
 ROWS, COLUMNS, VIEWS = 25, 47, 60
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -82,15 +83,9 @@ def fewer_views(scan: Scan, least: int) -> Scan:
     step = max(1, scan.views // least)
     views = np.arange(0, scan.views, step)
     key = "Vectors" if "Vectors" in scan.proj_geom else "ProjectionAngles"
-    return Scan(
+    return replace(
+        scan,
         projections=scan.projections[:, views],
         proj_geom={**scan.proj_geom, key: scan.proj_geom[key][views]},
-        vol_geom=scan.vol_geom,
-        unit=scan.unit,
-        spectrum=scan.spectrum,
-        truth=scan.truth,
-        metal_mask=scan.metal_mask,
-        truth_energy_kev=scan.truth_energy_kev,
-        name=scan.name,
         valid=None if scan.valid is None else scan.valid[:, views],
     )

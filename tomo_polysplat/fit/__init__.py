@@ -1,1 +1,1 @@
-"""Losses, held-out rays, the plan of what a scene needs, and the optimiser."""
+"""The problem as data, losses, held-out rays, and the optimiser."""

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.by_views import by_views, portions_of, views_at_once
+from tomo_polysplat.fit.by_views import Walk, by_views, views_at_once
+from tomo_polysplat.fit.clipped import allowed_error, clipped, usual_error
 from tomo_polysplat.fit.loss import misfit_by_view
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
@@ -19,8 +20,6 @@ __all__ = ["FilterSums", "filter_sums"]
 
 # Views looked at together, and rays, of which there are as many for each node of the spectrum.
 _AT_ONCE, _RAYS = 8, 1 << 21
-# Residuals beyond so many usual ones of some views, or of what a model is allowed, count as so many.
-_FAR, _LEAST_ERROR = 4.0, 1e-3
 
 
 @dataclass(frozen=True)
@@ -62,42 +61,28 @@ def filter_sums(
     grams : float
         Its density in g/cm3.
     """
-    at_once, fit = views_at_once(rays, _AT_ONCE, _RAYS), (gaussians, scene, rays, settings)
-    parts = by_views(_of_part, len(rays.views), at_once, *fit, quadrature, grams)
+    numbers, at_once = np.arange(len(rays.views)), views_at_once(rays, _AT_ONCE, _RAYS)
+    walk = Walk(gaussians, scene, rays, settings, numbers, at_once)
+    parts = by_views(_of_part, walk, quadrature, grams)
     (first, *more), held_out = zip(*parts)
     return FilterSums(sum(more, first).cpu().numpy(), torch.cat(held_out).cpu().numpy())
 
 
-# As `fit.by_views` calls it.
-def _of_part(
-    part: slice,
-    at_once: int,
-    gaussians: Gaussians,
-    scene: FitScene,
-    rays: Rays,
-    settings: Settings,
-    quadrature: Quadrature,
-    grams: float,
-) -> list[torch.Tensor]:
+def _of_part(walk: Walk, quadrature: Quadrature, grams: float) -> list[torch.Tensor]:
     """Of a part of the views what `FilterSums` has."""
-    shape = rays.views.rows, rays.views.columns
-    sums = torch.zeros((5, *shape), dtype=torch.float64, device=rays.target)
-    held_out = torch.full((part.stop - part.start,), torch.nan, dtype=torch.float64, device=rays.target)
-    allowed = max(settings.model_error, _LEAST_ERROR)
-    for now, here in portions_of(part, at_once):
-        seen, measured, fitted, aside = rays.batch(np.arange(now.start, now.stop))
-        predicted, _ = scene.projections(gaussians, seen)
-        slopes = scene.filter_slopes(gaussians, seen, quadrature) * grams
-        left = _clipped(measured - predicted, fitted, allowed)
+    shape, device = (walk.rays.views.rows, walk.rays.views.columns), walk.rays.target
+    sums = torch.zeros((5, *shape), dtype=torch.float64, device=device)
+    held_out = torch.full((len(walk),), torch.nan, dtype=torch.float64, device=device)
+    for some in walk:
+        slopes = walk.scene.filter_slopes(walk.gaussians, some.views, quadrature) * grams
+        left = _left(some.measured - some.predicted, some.fitted, allowed_error(walk.settings))
         parts = torch.stack([torch.ones_like(left), slopes, slopes.square(), left, slopes * left])
-        sums += (parts * fitted.square()).double().sum(dim=1)
-        held_out[here] = misfit_by_view(predicted, measured, aside, settings)
+        sums += (parts * some.fitted.square()).double().sum(dim=1)
+        held_out[some.here] = misfit_by_view(some.predicted, some.measured, some.aside, walk.settings)
     return [sums, held_out]
 
 
-def _clipped(residual: torch.Tensor, fitted: torch.Tensor, allowed: float) -> torch.Tensor:
+def _left(residual: torch.Tensor, fitted: torch.Tensor, allowed: float) -> torch.Tensor:
     """What is left of the fitted rays; those far off count as less far ones."""
     used = (fitted > 0).to(residual.dtype)
-    usual = ((residual * fitted).square().sum() / used.sum().clamp(min=1)).sqrt().clamp(min=allowed)
-    far = _FAR * usual / fitted.clamp(min=1e-12)
-    return residual.maximum(-far).minimum(far) * used
+    return clipped(residual, fitted, usual_error(residual, fitted, allowed)) * used

@@ -233,5 +233,5 @@ def steps_of_a_run(passes: float, rays: Rays, batch: int) -> int:
 
 
 def _views_of_a_pass(rays: Rays) -> int:
-    """As many as its steps have views in all."""
+    """Views that the steps of a pass use: a scan of few views is seen more than once in it."""
     return max(len(rays.views), _FEWEST_VIEWS)

@@ -1,4 +1,4 @@
-"""A run made both ways for a few passes over the views, where its rays are to say which one explains them."""
+"""A run that goes on both ways for a few passes, so that the rays tell which model explains them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,15 @@ _PASSES = 2
 
 @dataclass(frozen=True)
 class Fork:
-    """What both ways came to: that of the run as it was, and the other."""
+    """What both ways came to.
+
+    Attributes
+    ----------
+    late : bool
+        Whether time ran out before the other way was done.
+    was, other : Made or None
+        Errors of the last pass of the run as it was, and of the other way.
+    """
 
     late: bool
     was: Made | None
@@ -46,9 +54,9 @@ def passes_of_a_fork(fitter: Fitter, passes: float, steps: int, most: float) -> 
 def fork(
     fitter: Fitter, other: Fitter, clock: Clock, passes: int, enough: Callable[[], bool] | None = None
 ) -> Fork:
-    """Go both ways for so many passes; the clock goes on with the first, and late is who had no time for the second.
+    """Go both ways for so many passes, or for one if ``enough`` says so after it.
 
-    Where ``enough`` says so after the first pass of each, that is all.
+    The run's clock goes on with the first way. The second has a copy of it, which tells whether it came too late.
     """
     its_clock = copy.copy(clock)
     first = passes if enough is None else 1

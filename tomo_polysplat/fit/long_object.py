@@ -1,4 +1,4 @@
-"""An object that is longer than the volume: what of it rays meet above and below.
+"""An object that is longer than the volume: what the rays meet of it above and below.
 
 A ray of a cone beam that crosses the volume runs on above or below it, and meets there what the object goes on with. In
 a volume that ends, Gaussians at its ends have to stand for that. Rays that cross nothing of the volume, but matter
@@ -15,6 +15,7 @@ import numpy as np
 
 from tomo_polysplat.fit.inside import NOTHING, typical_ray
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.spread import evenly_spread
 from tomo_polysplat.start.orbit import Orbit
 from tomo_polysplat.start.weights import ray_offsets
 
@@ -100,7 +101,7 @@ def long_object(
 
 
 def _near(radius: float, orbit: Orbit) -> float:
-    """Share of its height at the axis at which a ray enters the object; it leaves it at 2 less this."""
+    """Height at which a ray enters the object, over its height at the axis. It leaves the object at 2 less this."""
     return 1.0 if math.isinf(orbit.radius) else 1.0 - min(radius / orbit.radius, _WIDEST)
 
 
@@ -147,9 +148,7 @@ def _looks(projections: np.ndarray, together: bool) -> _Looks:
     from scipy.ndimage import uniform_filter1d
 
     views, rows, columns = projections.shape
-    at_rows, at_columns = (
-        np.unique(np.linspace(0, n - 1, min(n, _LINES)).round().astype(int)) for n in (rows, columns)
-    )
+    at_rows, at_columns = (evenly_spread(n, _LINES) for n in (rows, columns))
     number = np.arange(0, views, max(1, views // _VIEWS))
     some = np.stack([projections[view][np.ix_(at_rows, at_columns)] for view in number])
     good = np.isfinite(some)

@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import torch
 
@@ -15,6 +16,7 @@ from tomo_polysplat.kernels.portions import FOOTPRINTS
 from tomo_polysplat.ranks import current_ranks
 
 __all__ = [
+    "StepSize",
     "free_bytes",
     "has_room",
     "projections_stay",
@@ -127,44 +129,47 @@ def require_machine(rays: int, voxels: int, energies: int, device: torch.device)
         raise fail("vol_geom", expected, got, remedy, MemoryError)
 
 
-def step_bytes(
-    device: torch.device, *, gaussians: int, views: int, pixels: int, voxels: int, runs: int = 1
-) -> dict[str, int]:
-    """Bytes that the steps of a fit take on a device, by what takes them; parameters as for `require_room`."""
-    return {"Gaussians": _of_gaussians(gaussians, views, runs, device)} | _of_all(
-        views, pixels, voxels, runs, device
-    )
+@dataclass(frozen=True)
+class StepSize:
+    """What the memory of a step goes with.
 
-
-def has_room(device: torch.device, **needed: int) -> bool:
-    """Whether a CUDA device has the memory that `step_bytes` tells; others are not asked."""
-    return device.type == "cpu" or sum(step_bytes(device, **needed).values()) <= _SHARE * free_bytes(device)
-
-
-# All that a step takes, and the words of two kinds of device.
-def require_room(
-    device: torch.device,
-    *,
-    gaussians: int,
-    views: int,
-    pixels: int,
-    voxels: int,
-    projections: int,
-    runs: int = 1,
-) -> str:
-    """The estimate in words.
-
-    Parameters
+    Attributes
     ----------
     gaussians : int
         Of a run.
     views, pixels : int
         Of a step, and of a view, in all runs.
     voxels : int
-    projections : int
-        Bytes of them on the device already; 0 where they stay on the host.
     runs : int
         That there are at once.
+    """
+
+    gaussians: int
+    views: int
+    pixels: int
+    voxels: int
+    runs: int = 1
+
+
+def step_bytes(device: torch.device, size: StepSize) -> dict[str, int]:
+    """Bytes that the steps of a fit take on a device, by what takes them."""
+    return {"Gaussians": _of_gaussians(size, device)} | _of_all(size, device)
+
+
+def has_room(device: torch.device, size: StepSize) -> bool:
+    """Whether a CUDA device has the memory that `step_bytes` tells; others are not asked."""
+    return device.type == "cpu" or sum(step_bytes(device, size).values()) <= _SHARE * free_bytes(device)
+
+
+def require_room(device: torch.device, size: StepSize, projections: int) -> str:
+    """The estimate in words.
+
+    Parameters
+    ----------
+    device : torch.device
+    size : StepSize
+    projections : int
+        Bytes of them on the device already; 0 where they stay on the host.
 
     Raises
     ------
@@ -173,9 +178,9 @@ def require_room(
     MemoryError
         If the host has too little memory left for the Gaussians of a fit on a CPU.
     """
-    parts = step_bytes(device, gaussians=gaussians, views=views, pixels=pixels, voxels=voxels, runs=runs)
+    parts = step_bytes(device, size)
     need = sum(parts.values())
-    words = ", ".join(f"{name} {in_gigabytes(size)}" for name, size in parts.items())
+    words = ", ".join(f"{name} {in_gigabytes(taken)}" for name, taken in parts.items())
     words = f"about {in_gigabytes(need)} ({words})"
     if device.type == "cpu":
         # The volumes are there in part already.
@@ -190,7 +195,7 @@ def require_room(
     where = f"on the GPU, {in_gigabytes(projections)}" if projections else "streamed from the host"
     if need > _SHARE * free:
         remedy = "lower settings max_gaussians or views_per_step, take fewer voxels, or device='cpu'"
-        if runs > 1:
+        if size.runs > 1:
             remedy = f"say settings pixel_rays and light, which saves a second run beside the first, {remedy}"
         raise fail("device", f"a GPU with {words} free", f"{in_gigabytes(free)} on {device}", remedy)
     words = f"{words} of {in_gigabytes(free)} free; projections {where}"
@@ -198,18 +203,16 @@ def require_room(
     return words
 
 
-def room_for_gaussians(device: torch.device, *, views: int, pixels: int, voxels: int, runs: int = 1) -> float:
+def room_for_gaussians(device: torch.device, size: StepSize) -> float:
     """How many Gaussians of a run there is memory for, on a CPU too; infinity where nobody tells how much is free.
 
-    Parameters
-    ----------
-    views, pixels, voxels, runs : int
-        As for `require_room`.
+    Those of the ``size`` do not count.
     """
+    views, runs = size.views, size.runs
     free = available_memory() if device.type == "cpu" else free_bytes(device)
     if free is None:
         return math.inf
-    left = max(_SHARE * free - sum(_of_all(views, pixels, voxels, runs, device).values()), 0.0)
+    left = max(_SHARE * free - sum(_of_all(size, device).values()), 0.0)
     if device.type == "cpu":
         return left / (runs * _of_a_gaussian(views))
     ranks = current_ranks().count
@@ -240,12 +243,13 @@ def told_of_lack() -> Iterator[None]:
         raise fail("device", "a GPU with room for the fit", got, remedy, MemoryError) from full
 
 
-def _of_gaussians(count: int, views: int, runs: int, device: torch.device) -> int:
-    """Bytes of so many Gaussians in each run, on the first rank."""
+def _of_gaussians(size: StepSize, device: torch.device) -> int:
+    """Bytes of the Gaussians of all runs, on the first rank."""
     if device.type == "cpu":
-        return math.ceil(runs * count * _of_a_gaussian(views))
-    portion = min(count / current_ranks().count, FOOTPRINTS / views)
-    return math.ceil(runs * (count * _that_stays() + portion * (_PASSING + _FOOTPRINT * views)))
+        return math.ceil(size.runs * size.gaussians * _of_a_gaussian(size.views))
+    portion = min(size.gaussians / current_ranks().count, FOOTPRINTS / size.views)
+    passing = portion * (_PASSING + _FOOTPRINT * size.views)
+    return math.ceil(size.runs * (size.gaussians * _that_stays() + passing))
 
 
 def _that_stays() -> float:
@@ -259,11 +263,11 @@ def _of_a_gaussian(views: int) -> float:
     return _GAUSSIAN + _PASSING + _FOOTPRINT * views
 
 
-def _of_all(views: int, pixels: int, voxels: int, runs: int, device: torch.device) -> dict[str, int]:
+def _of_all(size: StepSize, device: torch.device) -> dict[str, int]:
     """Bytes that a fit takes whatever the number of Gaussians."""
     # On a CPU runs take turns and keep nothing of a step.
-    times = 1 if device.type == "cpu" else runs
+    times = 1 if device.type == "cpu" else size.runs
     return {
-        "images of a step": views * pixels * _PIXEL,
-        "volumes": times * voxels * _SMOOTHED[device.type] + min(_SAMPLES, 27 * 12 * voxels),
+        "images of a step": size.views * size.pixels * _PIXEL,
+        "volumes": times * size.voxels * _SMOOTHED[device.type] + min(_SAMPLES, 27 * 12 * size.voxels),
     }

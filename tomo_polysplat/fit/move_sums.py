@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.by_views import by_views, portions_of, views_at_once
+from tomo_polysplat.fit.by_views import Walk, by_views, views_at_once
+from tomo_polysplat.fit.clipped import allowed_error, clipped, usual_error
 from tomo_polysplat.fit.loss import misfit_by_view
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
@@ -19,9 +20,6 @@ __all__ = ["MoveSums", "move_sums"]
 
 # Views looked at together, and rays, beside a step's memory, which a GPU keeps.
 _AT_ONCE, _RAYS = 24, 1 << 23
-# Residuals beyond so many usual ones of some views, or of what a model is allowed, count as so many.
-_FAR = 4.0
-_LEAST_ERROR = 1e-3
 # Weights of a Gaussian of one pixel. Both sides are smoothed with it, so that noise has less of a part in the slopes.
 _BLUR = (0.0545, 0.2442, 0.4026, 0.2442, 0.0545)
 
@@ -60,48 +58,36 @@ def move_sums(
     """
     falls = falls.to(rays.target, torch.float32)
     at_once = views_at_once(rays, _AT_ONCE, _RAYS, len(falls) + 1)
-    parts = by_views(_of_part, len(rays.views), at_once, gaussians, scene, rays, settings, falls)
+    walk = Walk(gaussians, scene, rays, settings, np.arange(len(rays.views)), at_once)
+    parts = by_views(_of_part, walk, falls)
     normal, told, held_out = (torch.cat(of_each).cpu().numpy() for of_each in zip(*parts))
     return MoveSums(normal.swapaxes(0, 1), told.swapaxes(0, 1), held_out)
 
 
-# One walk over the views, as in `fit.residual_sums`.
-def _of_part(
-    part: slice,
-    at_once: int,
-    gaussians: Gaussians,
-    scene: FitScene,
-    rays: Rays,
-    settings: Settings,
-    falls: torch.Tensor,
-) -> list[torch.Tensor]:
+def _of_part(walk: Walk, falls: torch.Tensor) -> list[torch.Tensor]:
     """Of a part of the views, by these, what `MoveSums` has; sides come second."""
-    views, columns = part.stop - part.start, rays.views.columns
-    device, many = rays.target, len(falls) + 1
-    normal = torch.zeros((views, 2, many, many), dtype=torch.float64, device=device)
-    told = torch.zeros((views, 2, many), dtype=torch.float64, device=device)
-    held_out = torch.full((views,), torch.nan, dtype=torch.float64, device=device)
-    for now, here in portions_of(part, at_once):
-        seen, measured, fitted, aside = rays.batch(np.arange(now.start, now.stop))
-        predicted, _ = scene.projections(gaussians, seen)
-        held_out[here] = misfit_by_view(predicted, measured, aside, settings)
-        left = _left(measured - predicted, fitted, max(settings.model_error, _LEAST_ERROR))
-        slopes, trust = _slopes(predicted, falls[:, now]), fitted.square()
+    views, columns, many = len(walk), walk.rays.views.columns, len(falls) + 1
+    double = torch.zeros((), dtype=torch.float64, device=walk.rays.target)
+    normal, told = double.new_zeros((views, 2, many, many)), double.new_zeros((views, 2, many))
+    held_out = double.new_full((views,), torch.nan)
+    for some in walk:
+        held_out[some.here] = misfit_by_view(some.predicted, some.measured, some.aside, walk.settings)
+        left = _left(some.measured - some.predicted, some.fitted, allowed_error(walk.settings))
+        slopes, trust = _slopes(some.predicted, falls[:, some.now]), some.fitted.square()
         for side, half in enumerate((slice(0, columns // 2), slice(columns // 2, columns))):
             # Row by row: a GPU would make the products of a whole view on a single multiprocessor.
             one = slopes[..., half].double().transpose(1, 2)
             weighed = one * trust[:, :, None, half].double()
-            normal[here, side] = (weighed @ one.transpose(2, 3)).sum(dim=1)
-            told[here, side] = (weighed @ left[..., half, None].double())[..., 0].sum(dim=1)
+            normal[some.here, side] = (weighed @ one.transpose(2, 3)).sum(dim=1)
+            told[some.here, side] = (weighed @ left[..., half, None].double())[..., 0].sum(dim=1)
     return [normal, told, held_out]
 
 
 def _left(residual: torch.Tensor, fitted: torch.Tensor, allowed: float) -> torch.Tensor:
     """What is left of the fitted rays, (views, rows, columns), smoothed; those far off count as less far ones."""
     used = (fitted > 0).to(residual.dtype)
-    usual = ((residual * fitted).square().sum() / used.sum().clamp(min=1)).sqrt().clamp(min=allowed)
-    far = _FAR * usual / fitted.clamp(min=1e-12)
-    return _smoothed(residual.maximum(-far).minimum(far) * used) / _smoothed(used).clamp(min=1e-6)
+    near = clipped(residual, fitted, usual_error(residual, fitted, allowed))
+    return _smoothed(near * used) / _smoothed(used).clamp(min=1e-6)
 
 
 def _slopes(predicted: torch.Tensor, falls: torch.Tensor) -> torch.Tensor:

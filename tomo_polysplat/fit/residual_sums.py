@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.by_views import by_views, portions_of, views_at_once
+from tomo_polysplat.fit.by_views import Walk, by_views, views_at_once
+from tomo_polysplat.fit.clipped import allowed_error, clipped
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
@@ -19,9 +20,6 @@ __all__ = ["ResidualSums", "residual_sums"]
 _BLOCKS, _DEPTHS = 8, (0.01, 0.05, 0.15, 0.3, 0.6, 1.0, 1.5, 2.0, 3.0, 4.0)
 # Views looked at together, and rays, beside a step's memory, which a GPU keeps.
 _AT_ONCE, _RAYS = 24, 1 << 24
-# Residuals beyond so many allowed deviations count as so many.
-_FAR = 4.0
-_LEAST_ERROR = 1e-3
 # Of view, pixel, residual and deviation of a ray held out.
 _OF_ASIDE = (torch.int64, torch.int64, torch.float32, torch.float32)
 
@@ -72,8 +70,8 @@ def residual_sums(
 ) -> ResidualSums:
     """Those of all views, or of ``some`` by their numbers; each rank adds up a part of them."""
     numbers = np.arange(len(rays.views)) if some is None else some
-    at_once = views_at_once(rays, _AT_ONCE, _RAYS)
-    parts = by_views(_of_part, len(numbers), at_once, gaussians, scene, rays, settings, numbers)
+    walk = Walk(gaussians, scene, rays, settings, numbers, views_at_once(rays, _AT_ONCE, _RAYS))
+    parts = by_views(_of_part, walk)
     weights, totals, counts, *aside = zip(*parts)
     count, by_depth = torch.cat(counts).permute(1, 2, 0, 3).cpu().numpy()
     view, pixel, residual, deviation = (torch.cat(of_each).numpy() for of_each in aside)
@@ -82,33 +80,20 @@ def residual_sums(
 
 
 # One walk over the views fills all sums: cut up, each part would be handed all of them.
-def _of_part(
-    part: slice,
-    at_once: int,
-    gaussians: Gaussians,
-    scene: FitScene,
-    rays: Rays,
-    settings: Settings,
-    numbers: np.ndarray,
-) -> list[torch.Tensor]:
+def _of_part(walk: Walk) -> list[torch.Tensor]:
     """Sums by pixel, those by view, (views, 2, halves, depths), and the rays held out, of a part of the views."""
-    allowed = max(settings.model_error, _LEAST_ERROR)
-    views, rows, columns = len(numbers), rays.views.rows, rays.views.columns
-    blocks = min(_BLOCKS, views)
+    allowed, rays, views = allowed_error(walk.settings), walk.rays, len(walk.numbers)
+    rows, columns, blocks = rays.views.rows, rays.views.columns, min(_BLOCKS, views)
     double = torch.zeros((), dtype=torch.float64, device=rays.target)
     block = _blocks(views, blocks)
     weight, total = double.new_zeros((2, blocks, rows, columns))
     ends, many = torch.tensor(_DEPTHS, device=rays.target), len(_DEPTHS) + 1
-    counts = double.new_zeros((part.stop - part.start, 2, 2, many))
+    counts = double.new_zeros((len(walk), 2, 2, many))
     # The right half's depths come after the left one's, and what is not fitted after both.
     right = many * (torch.arange(columns, device=rays.target) >= columns // 2)
     held: list[list[torch.Tensor]] = [[torch.empty(0, dtype=kind) for kind in _OF_ASIDE]]
-    for now, here in portions_of(part, at_once):
-        seen, measured, fitted, aside = rays.batch(numbers[now])
-        predicted, _ = scene.projections(gaussians, seen)
-        far = _FAR * allowed / fitted.clamp(min=1e-12)
-        left = (measured - predicted).maximum(-far).minimum(far)
-        trust = fitted.square()
+    for now, here, _, measured, fitted, aside, predicted in walk:
+        left, trust = clipped(measured - predicted, fitted, allowed), fitted.square()
         # Block by block, in an order that a GPU keeps.
         for of_block in np.unique(block[now]).tolist():
             start, stop = np.searchsorted(block[now], (of_block, of_block + 1)).tolist()

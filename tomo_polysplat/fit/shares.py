@@ -136,7 +136,7 @@ class Part:
 
 
 class _Total(torch.autograd.Function):
-    """A sum from which each rank goes on: its gradient by one of the summands is that by the sum."""
+    """The sum over ranks of what each has a part of; the gradient by a part is the gradient by the sum."""
 
     @staticmethod
     def forward(ctx, own, add_up):

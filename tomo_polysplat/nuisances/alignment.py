@@ -35,7 +35,7 @@ _TOLD, _PIXELS, _COMMON = 0.1, 0.1, 3.0
 _MOST_A_PIXEL = 2.0
 # Moves are kept where the misfit of held-out rays falls below this share of that without. 19 perfect scans of six
 # scenes came to 0.970 and more for the whole scanner; an axis off by 0.25 pixels to 0.84 to 0.95, views shifted by as
-# much to 0.94. By pixels that are not joined shifts of views explain thin metal, too: 0.95 (docs/alignment.md).
+# much to 0.94. By pixels that are not joined shifts of views explain thin metal, too: 0.95.
 _MARGIN = 0.96
 # Memories of the mean gradient and of its mean square; single views are seen once a pass only. Steps beyond _STEEPEST
 # deviations of the gradient are cut.
@@ -208,19 +208,6 @@ class Alignment(Nuisance):
             if name in self.names and name not in hold:
                 self.values[name] = self.values[name] + offset
         self.values["views"] = without_gauge(self.values["views"], self._gauge)
-
-    def put_back(self, *names: str) -> None:
-        """Undo moves, all by default: what the rays did not confirm."""
-        for name in names or tuple(self.values):
-            self.values[name] = torch.zeros_like(self.values[name])
-
-    def largest_shift(self) -> float:
-        """Root mean square over the moves, of the worst of them, of the shift of what is seen, in pixels."""
-        shifts = [0.0]
-        for name, value in self.values.items():
-            per_unit = 1.0 if name == "views" else 1 / self._units.get(name, 1.0)
-            shifts.append(per_unit * float(value.square().mean().sqrt()))
-        return max(shifts)
 
     @classmethod
     def gate(cls, evidence: Mapping[str, float]) -> Verdict:

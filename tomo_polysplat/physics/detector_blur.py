@@ -10,7 +10,7 @@ image is continued by its border. Averaging over a pixel's own area alone has v 
 
 Light is spread before the logarithm, and -log of mixed light is less than this. But mixed light can hide any amount of
 metal at the edges of opaque metal. A model that mixes light then adds metal where that mends another error of its edges
-(docs/detector_blur.md). This one does not.
+(docs/decisions/detector_blur.md). This one does not.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ __all__ = ["aligned", "axis_of", "find_axis", "is_known"]
 logger = logging.getLogger(__name__)
 
 # An axis is moved that is off by more than this, in columns, beyond so many standard errors; by so many where a time
-# budget leaves no room for fits. 158 perfect scans of 10 kinds came to 3.3 at most (docs/alignment.md).
+# budget leaves no room for fits. 158 perfect scans of 10 kinds came to 3.3 at most (docs/decisions/alignment.md).
 _TOLERATED, _SURE, _SURE_ALONE = 0.03, 4.0, 8.0
 # An error below this is as good as none: it costs less than a tenth of a decibel.
 _KNOWN = 0.05

@@ -1,8 +1,8 @@
-"""How thick a filter in front of each pixel is, as a fit by joined pixels tells in which it goes along with the object.
+"""The thickness of the filter in front of each pixel, fitted together with the object to joined pixels.
 
 An object makes up for most of a bowtie: it becomes too light at its rim. So the misfit of a fit hardly tells whether
-there is one, and what a rough fit leaves tells it no better. Where the filter goes on from pass to pass by what is
-left, the object gives way, and both come to where they are.
+there is one, and what a rough fit leaves tells it no better. If the filter is moved after each pass by what is
+left, the object gives way, and both come to where they belong.
 """
 
 from __future__ import annotations
@@ -33,11 +33,9 @@ from tomo_polysplat.physics.materials import density
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.coarse import coarse_problem, coarse_settings
 from tomo_polysplat.plan.fall_of_misfits import fall_of_misfits
-from tomo_polysplat.plan.first_gaussians import first_gaussians
-from tomo_polysplat.plan.first_volume import first_volume
 from tomo_polysplat.plan.means import Means
-from tomo_polysplat.plan.model import rays_of, scene_of
-from tomo_polysplat.plan.order import plan_from_start
+from tomo_polysplat.plan.plan import Plan
+from tomo_polysplat.plan.preparation import lab_of
 
 __all__ = ["behind_bowtie", "find_bowtie"]
 
@@ -103,19 +101,17 @@ class _Search:
         self.names, self.shape = tuple(Bowtie.parameters), (rows, columns)
         self.shapes, self.grams = filter_shapes(rows, columns, self.names), density("Al")
         settings = replace(coarse_settings(means.settings), passes=float(_PASSES))
-        nothing, device = np.zeros(self.shape, np.float32), means.device
+        nothing = np.zeros(self.shape, np.float32)
         problem = problem.behind(FilterMap("Al", nothing, self.grams, _THICKEST * self.grams))
-        start, _ = first_volume(problem, device, settings)
-        plan = plan_from_start(start, problem, settings, device)
-        self.scene = scene_of(problem, plan, settings, device)
-        self.rays = rays_of(problem, plan, settings, device)
+        lab = lab_of(problem, Plan(), replace(means, settings=settings))
+        self.scene, self.rays = lab.scene, lab.rays
         if self.scene.quadrature is None:
             raise fail("filter_map", "a scan whose rays are hardened beside 'fit'", "one of thin rays")
-        self.seeds, _ = first_gaussians(start, plan, problem, settings, device)
-        self.spacing, self.seed = plan.spacing * problem.voxel, means.seed
+        self.seeds = lab.seeds()
+        self.spacing, self.seed = lab.plan.spacing * problem.voxel, means.seed
         self.batch = min(_BATCH, len(self.rays.views))
         self.steps_of_a_pass = max(1, round(len(self.rays.views) / self.batch))
-        self.settings = hurried(plan.adapted(settings), _PASSES * self.steps_of_a_pass)
+        self.settings = hurried(lab.plan.adapted(settings), _PASSES * self.steps_of_a_pass)
 
     def fit(self, *, moving: bool) -> tuple[FilterSums, dict[str, float]]:
         """What a fit leaves, and the coefficients with which it ends, which go along where they are ``moving``."""

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from tomo_polysplat.spread import evenly_spread
+
 __all__ = ["edge_rise"]
 
 # Voxels on either side of an edge between which its height is taken.
@@ -40,7 +42,7 @@ def edge_rise(relative: torch.Tensor) -> float:
     float
         0 where there are too few edges.
     """
-    planes = np.unique(np.linspace(0, len(relative) - 1, min(_PLANES, len(relative))).round().astype(int))
+    planes = evenly_spread(len(relative), _PLANES)
     # Noise would look like edges of its own: three planes and three lines together have a third of it.
     rises = [
         _rises(relative[max(z - 1, 0) : z + 2].float().mean(dim=0).movedim(axis, 0))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.memory import has_room, require_room, room_for_gaussians, start_stays
+from tomo_polysplat.fit.memory import StepSize, has_room, require_room, room_for_gaussians, start_stays
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.free_memory import MUCH, give_back, keeps_more_than
 from tomo_polysplat.model.gaussians import Gaussians
@@ -58,12 +58,8 @@ def first_gaussians(
     values = problem.measured(device)
     many = math.ceil(_times(settings.growth or 1.0, plan) * len(gaussians))
     runs = 1 if why_one_run(many, plan, problem, device) else _runs(plan)
-    memory = require_room(
-        device,
-        gaussians=many,
-        **_all_else(plan, problem, runs),
-        projections=values.nbytes if values.device.type == device.type else 0,
-    )
+    there = values.nbytes if values.device.type == device.type else 0
+    memory = require_room(device, _step_size(many, plan, problem, runs), there)
     if (ranks := current_ranks().count) > 1:
         memory = f"on the first of {ranks} devices {memory}"
     return gaussians, {
@@ -110,7 +106,7 @@ def room_to_grow(gaussians: int, plan: Plan, problem: Problem, device: torch.dev
     problem : Problem
     device : torch.device
     """
-    room = room_for_gaussians(device, **_all_else(plan, problem, _runs(plan)))
+    room = room_for_gaussians(device, _step_size(0, plan, problem, _runs(plan)))
     room /= _GROWING if _runs(plan) == 1 else 1.0
     if device.type != "cpu":
         room = min(room, _OF_SEEDS * most_seeds(problem))
@@ -125,19 +121,18 @@ def room_for_seeds(views: int, problem: Problem, device: torch.device) -> float:
     if device.type == "cpu" or not torch.cuda.is_available():
         return math.inf
     pixels, voxels = problem.geometry.rows * problem.geometry.columns, math.prod(problem.grid.shape)
-    return room_for_gaussians(device, views=views, pixels=pixels, voxels=voxels)
+    return room_for_gaussians(device, StepSize(0, views, pixels, voxels))
 
 
 def why_one_run(gaussians: int, plan: Plan, problem: Problem, device: torch.device) -> str:
     """Why no second run is made beside the first, to ask the rays which of two models explains them, if so."""
-    needed = _all_else(plan, problem, _runs(plan))
-    if has_room(device, gaussians=gaussians, **needed):
+    if has_room(device, _step_size(gaussians, plan, problem, _runs(plan))):
         return ""
     return "there is no room on the GPU for a second run beside it"
 
 
 def _times(growth: float, plan: Plan) -> float:
-    """For how many times as many Gaussians a cloud that grows so many times needs memory."""
+    """Memory of a cloud that grows so many times, over that of the seeds alone."""
     return growth * _GROWING if growth > 1 and _runs(plan) == 1 else max(growth, 1.0)
 
 
@@ -150,17 +145,13 @@ def _runs(plan: Plan) -> int:
     return 1 if plan.pixel_rays and plan.fat is not None else 2
 
 
-def _all_else(plan: Plan, problem: Problem, runs: int) -> dict[str, int]:
-    """What memory is needed for besides Gaussians, as `fit.memory` asks.
+def _step_size(gaussians: int, plan: Plan, problem: Problem, runs: int) -> StepSize:
+    """What the memory of a step goes with.
 
-    On each rank that is for all images of a step, and the voxels that its Gaussians reach, which may be all.
+    On each rank that is all images of a step, and the voxels that its Gaussians reach, which may be all.
     """
     rays = runs * (plan.pixel_rays or 1) ** 2
     if runs > 1 and not plan.pixel_rays:
         rays = 1 + AVERAGED_RAYS**2
-    return {
-        "views": plan.views_per_step,
-        "pixels": rays * problem.geometry.rows * problem.geometry.columns,
-        "voxels": math.prod(problem.grid.shape),
-        "runs": runs,
-    }
+    pixels = rays * problem.geometry.rows * problem.geometry.columns
+    return StepSize(gaussians, plan.views_per_step, pixels, math.prod(problem.grid.shape), runs)

@@ -1,4 +1,4 @@
-"""What a question may use: the scan, its start volume, and the one recipe of a short fit."""
+"""What a question may use: the scan, its start volume, and short fits."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Moves of the scanner that opposite rays do not tell, by default: roll, tilt, single views, and an axis they miss.
+"""Moves of the scanner that opposite rays do not tell, by default: roll, single views, and an axis they miss.
 
-What a fit of a pass leaves of the rays tells them: one that the questions of the run ask for, too, or of joined pixels.
-Where there are any, three or four more fits find them to hundredths of a pixel, and rays held out of these have to
-confirm them.
+What a fit of a pass leaves of the rays tells them. The questions of the run ask for that fit as well; a large detector
+is fitted by joined pixels. If there are moves, three or four more fits find them to hundredths of a pixel, and rays
+held out of these have to confirm them.
 """
 
 from __future__ import annotations
@@ -28,13 +28,10 @@ from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.axis import axis_of
 from tomo_polysplat.plan.coarse import coarse_problem, coarse_settings
 from tomo_polysplat.plan.fall_of_misfits import fall_of_misfits
-from tomo_polysplat.plan.first_gaussians import first_gaussians
 from tomo_polysplat.plan.first_look import Look
-from tomo_polysplat.plan.first_volume import first_volume
 from tomo_polysplat.plan.means import Means
-from tomo_polysplat.plan.model import rays_of, scene_of
-from tomo_polysplat.plan.order import plan_from_start
-from tomo_polysplat.plan.trial import fitted_shortly
+from tomo_polysplat.plan.plan import Plan
+from tomo_polysplat.plan.preparation import lab_of
 from tomo_polysplat.ranks import ALONE, current_ranks, led_by
 from tomo_polysplat.scan.gauges import effects, view_gauge
 from tomo_polysplat.scan.moved_rays import falls_of
@@ -98,7 +95,7 @@ def realigned(
     means: Means,
     report: Callable[[float, str], Any],
 ) -> Answer:
-    """Where the scanner stood, as a fit of one pass tells it; a few more find it out where it says that it moved.
+    """Where the scanner stood: a fit of one pass tells whether it moved, and a few more find out by how much.
 
     Parameters
     ----------
@@ -257,16 +254,11 @@ class _Realignment:
 
     def _fitted(self, values: dict[str, torch.Tensor]) -> tuple[Gaussians, FitScene, Rays]:
         """A fit by the scanner as it stood."""
-        settings, device = self.settings, self.means.device
         # What is told of one start is not kept for another.
         geometry = moved_geometry(self.scanner, values) if values else self.problem.geometry
-        problem = self.problem.seen_by(geometry)
-        start, _ = first_volume(problem, device, settings)
-        plan = plan_from_start(start, problem, settings, device)
-        scene, rays = scene_of(problem, plan, settings, device), rays_of(problem, plan, settings, device)
-        seeds, _ = first_gaussians(start, plan, problem, settings, device)
-        outcome = fitted_shortly(seeds, plan, problem, scene, rays, replace(self.means, settings=settings))
-        return outcome.gaussians, scene, rays
+        means = replace(self.means, settings=self.settings)
+        lab = lab_of(self.problem.seen_by(geometry), Plan(), means)
+        return lab.trial(self.settings).gaussians, lab.scene, lab.rays
 
 
 def _secant(left: np.ndarray, left_before: np.ndarray, step: np.ndarray) -> np.ndarray:

@@ -1,4 +1,7 @@
-"""A fit of a few passes over the views, to see what becomes of a scan under some physics."""
+"""What a short fit tells of assumed physics: how well it explains the rays, and how dense matter comes out.
+
+A question of the plan, which asks how to fit and not what is true, makes its short fits by `Lab.trial`.
+"""
 
 from __future__ import annotations
 

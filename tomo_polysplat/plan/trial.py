@@ -1,4 +1,4 @@
-"""The one recipe of a short fit: seeds fitted for a few passes, or for a share of the time there is."""
+"""How every short fit is made: seeds are fitted for a few passes, or for a share of the time there is."""
 
 from __future__ import annotations
 

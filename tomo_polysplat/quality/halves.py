@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.quality.again import fit_again, levels_of, require_scan_of, voxel_edge
 from tomo_polysplat.quality.fourier_shell import HALVES, first_below, shell_correlation
+from tomo_polysplat.quality.refit import fit_again, levels_of, require_scan_of, voxel_edge
 from tomo_polysplat.result.detail import Resolution
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import from_astra

@@ -13,7 +13,7 @@ from tomo_polysplat.checks import require_number
 from tomo_polysplat.physics.beer_lambert import projection
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.physics.water import areal_density
-from tomo_polysplat.quality.again import fit_again, geometry_of, levels_of, require_scan_of, voxel_edge
+from tomo_polysplat.quality.refit import fit_again, geometry_of, levels_of, require_scan_of, voxel_edge
 from tomo_polysplat.result.detail import Contrast
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, from_astra

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from tomo_polysplat.report.page import data_uri, text
+from tomo_polysplat.spread import evenly_spread
 
 __all__ = ["browser"]
 
@@ -58,7 +59,7 @@ def browser(
         Of length.
     """
     count = volumes[0][1].shape[0]
-    chosen = np.unique(np.append(np.linspace(0, count - 1, min(count, _SLICES)).round().astype(int), first))
+    chosen = np.union1d(evenly_spread(count, _SLICES), first)
     pictures = [[_picture(volume[k], window) for k in chosen] for _, volume in volumes]
     # The middle may be at 1e-17.
     places = np.where(np.abs(heights) < 1e-6 * np.ptp(heights), 0.0, heights)

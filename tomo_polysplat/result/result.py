@@ -139,13 +139,6 @@ class Result(ResultData):
 
         write_tiff_slices(image_of(self, hu=hu, bits=bits), folder, overwrite=overwrite)
 
-    def save_npy(self, path: str | os.PathLike, *, overwrite: bool = False) -> None:
-        """Write :attr:`volume` as a NumPy array file; parameters and errors are those of :meth:`save`."""
-        from tomo_polysplat.result.files import write_npy
-        from tomo_polysplat.result.image import image_of
-
-        write_npy(image_of(self), path, overwrite=overwrite)
-
     def explain(self, scan: Scan, *, device: str = "auto") -> Residuals:
         """How well the rays are explained, by view and by pixel, in units of their noise; kept in `residuals`.
 

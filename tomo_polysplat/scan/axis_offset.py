@@ -9,6 +9,7 @@ import numpy as np
 from tomo_polysplat.scan.opposite_geometry import opposite_rays_of
 from tomo_polysplat.scan.opposite_rays import OppositeRays
 from tomo_polysplat.scan.view_geometry import Geometry
+from tomo_polysplat.spread import evenly_spread
 
 __all__ = ["LARGEST_SHARE", "AxisOffset", "axis_offset", "offset_of", "spread"]
 
@@ -141,10 +142,7 @@ def _rough(rays: OppositeRays) -> tuple[float, int]:
 def spread(rays: OppositeRays, most: int) -> tuple[np.ndarray, np.ndarray]:
     """Views and columns that are compared."""
     views, columns, _ = rays.values.shape
-    return (
-        np.unique(np.linspace(0, views - 1, min(views, most)).round().astype(int)),
-        np.arange(0, columns, -(-columns // _COLUMNS)),
-    )
+    return evenly_spread(views, most), np.arange(0, columns, -(-columns // _COLUMNS))
 
 
 def _refined(rays: OppositeRays, place: float, limit: float, varying: bool = False) -> tuple[float, float]:
@@ -196,7 +194,7 @@ def _elsewhere(rays: OppositeRays, columns: np.ndarray) -> float:
 
 
 def _least(weight: np.ndarray, like: np.ndarray, slope: np.ndarray) -> float:
-    """What the sum of the slopes' weighted product must be more than, for noise alone seldom is."""
+    """The least sum of the slopes' weighted product that noise alone seldom reaches."""
     size = float((weight * like**2).sum() * (weight * slope**2).sum())
     return _CORRELATED * np.sqrt(_ALIKE * size / max(int(np.count_nonzero(weight)), 1))
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from tomo_polysplat.checks import fail, require_array, require_shape
 from tomo_polysplat.parallel import run_tasks
-from tomo_polysplat.scan.evidence import Located, compare, locate
+from tomo_polysplat.scan.assumptions import Located, compare, locate
+from tomo_polysplat.spread import evenly_spread
 
 __all__ = ["chosen_rows", "estimate_centre", "find_centre"]
 
@@ -86,7 +87,7 @@ def find_centre(projections: np.ndarray, angles: np.ndarray, valid: np.ndarray |
 
 def chosen_rows(rows: int) -> np.ndarray:
     """Those of so many rows that `find_centre` looks at."""
-    return np.unique(np.linspace(0, rows - 1, min(rows, _MOST_ROWS)).round().astype(int))
+    return evenly_spread(rows, _MOST_ROWS)
 
 
 class _Pairs(NamedTuple):
@@ -124,8 +125,7 @@ def _opposite_views(angles: np.ndarray, most: int) -> _Pairs:
             f"{np.ptp(np.rad2deg(angles)):.1f} degrees in {len(angles)} views",
             "give centre= in columns",
         )
-    keep = np.linspace(0, len(found) - 1, min(most, len(found))).round().astype(int)
-    return _Pairs(*map(np.array, zip(*(found[k] for k in keep))))
+    return _Pairs(*map(np.array, zip(*(found[k] for k in evenly_spread(len(found), most)))))
 
 
 def _mismatches(

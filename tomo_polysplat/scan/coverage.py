@@ -6,6 +6,7 @@ import numpy as np
 
 from tomo_polysplat.scan.view_geometry import Geometry
 from tomo_polysplat.scan.volume_grid import VolumeGrid
+from tomo_polysplat.spread import evenly_spread
 
 __all__ = ["coverage", "unseen_share"]
 
@@ -34,7 +35,7 @@ def coverage(
     float32 array, shape (z, y, x)
         From 0, not measured, to 1.
     """
-    views = np.unique(np.linspace(0, geometry.views - 1, min(geometry.views, most_views)).round().astype(int))
+    views = evenly_spread(geometry.views, most_views)
     some = geometry.select(views)
     x, y, z = grid.axes()
     if geometry.planar:

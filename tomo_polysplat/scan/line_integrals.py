@@ -12,6 +12,7 @@ import numpy as np
 
 from tomo_polysplat.checks import fail
 from tomo_polysplat.scan.probes.logarithm import COUNTS, REMEDIES, SIGN, TRANSMISSIONS
+from tomo_polysplat.spread import evenly_spread
 
 __all__ = ["require_line_integrals"]
 
@@ -51,7 +52,7 @@ def require_line_integrals(values: np.ndarray, marked: np.ndarray | None = None)
     ValueError
         For counts, transmissions, logarithms of the other sign or of a wrong scale, with what to pass instead.
     """
-    chosen = np.ix_(*(_spread(n, most) for n, most in zip(values.shape, (_VIEWS, _ROWS))))
+    chosen = np.ix_(*(evenly_spread(n, most) for n, most in zip(values.shape, (_VIEWS, _ROWS))))
     some = values[chosen]
     meant = (some > _BRIGHTEST_LOGARITHM) & (some < _BRIGHTEST)
     some = np.where(meant if marked is None else meant & ~marked[chosen], some, np.nan)
@@ -75,10 +76,6 @@ def require_line_integrals(values: np.ndarray, marked: np.ndarray | None = None)
     logger.warning(
         "The projections do not look like -log(I/I0): %s. If they are %s, %s.", seen, kind, REMEDIES[kind]
     )
-
-
-def _spread(count: int, most: int) -> np.ndarray:
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
 def _require_some_light(finite: np.ndarray) -> None:

@@ -1,4 +1,4 @@
-"""Where on the detector as it stands the rays fall that its pixels would have were it moved a little."""
+"""Where the rays of a scanner that is moved a little fall on the detector as it stands."""
 
 from __future__ import annotations
 

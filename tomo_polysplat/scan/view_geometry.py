@@ -221,11 +221,12 @@ class Geometry:
         kind = "2D " if self.planar else ""
         width, height = (np.median(np.linalg.norm(step, axis=1)) for step in (self.u, self.v))
         size = f"{self.views} views of {self.rows} x {self.columns} pixels"
-        text = f"{kind}{self.beam} beam, {size}, each {width:.4g} wide and {height:.4g} high"
+        text = f"{kind}{self.beam} beam, {size}, each {width:.4g} x {height:.4g} (width x height)"
         if self.beam == "parallel":
             return text
         distance = np.linalg.norm(self.centre - self.origin, axis=1)
-        return f"{text}, source to detector {distance.min():.4g} to {distance.max():.4g}"
+        least, most = f"{distance.min():.4g}", f"{distance.max():.4g}"
+        return f"{text}, source to detector {least if least == most else f'{least} to {most}'}"
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

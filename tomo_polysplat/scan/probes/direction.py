@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from tomo_polysplat.scan.assumptions import RULED_OUT, compare
 from tomo_polysplat.scan.axis_offset import LARGEST_SHARE, AxisOffset, offset_of, spread
-from tomo_polysplat.scan.evidence import RULED_OUT, compare
 from tomo_polysplat.scan.opposite_rays import OppositeRays
 
 __all__ = ["MUCH_BETTER", "direction_doubt", "runs_backwards", "turned_round"]

@@ -14,6 +14,7 @@ from tomo_polysplat.scan.geometry import Geometry, from_astra
 from tomo_polysplat.scan.probes.air import Air, look_for_air
 from tomo_polysplat.scan.scan import Scan
 from tomo_polysplat.scan.volume_grid import VolumeGrid
+from tomo_polysplat.spread import evenly_spread
 
 __all__ = ["Measured"]
 
@@ -59,7 +60,7 @@ class Measured:
         rows = np.flatnonzero(self.valid.any(axis=(1, 2)))
         if not len(rows):
             rows = np.arange(self.scan.rows)
-        return rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), _MOST_ROWS)).round().astype(int))]
+        return rows[evenly_spread(len(rows), _MOST_ROWS)]
 
     @cached_property
     def good(self) -> np.ndarray:

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from tomo_polysplat.scan.assumptions import RULED_OUT
 from tomo_polysplat.scan.axis_offset import LARGEST_SHARE, AxisOffset, axis_offset, offset_of
 from tomo_polysplat.scan.centre import find_centre
-from tomo_polysplat.scan.evidence import RULED_OUT
 from tomo_polysplat.scan.opposite_geometry import opposite_rays_of
 from tomo_polysplat.scan.probes.direction import MUCH_BETTER, direction_doubt, turned_round
 from tomo_polysplat.scan.probes.finding import DEFECT, OK, UNKNOWN, Finding

@@ -7,6 +7,7 @@ import numpy as np
 from tomo_polysplat.scan.probes.alike import Alike
 from tomo_polysplat.scan.probes.finding import DEFECT, OK, UNKNOWN, Finding
 from tomo_polysplat.scan.probes.measured import Measured
+from tomo_polysplat.spread import evenly_spread
 
 __all__ = ["ORDER", "blurred_views", "probe_order"]
 
@@ -34,9 +35,7 @@ _POWER = 0.2
 
 def probe_order(measured: Measured) -> Finding:
     """Compare views that are neighbours by place with each other and with all others."""
-    chosen = np.unique(
-        np.linspace(0, measured.scan.views - 1, min(_MOST_VIEWS, measured.scan.views)).round().astype(int)
-    )
+    chosen = evenly_spread(measured.scan.views, _MOST_VIEWS)
     if len(chosen) < _FEWEST_VIEWS:
         return Finding(ORDER, UNKNOWN, "too few views to tell", f"{_FEWEST_VIEWS} views or more")
     places = measured.places[chosen]
@@ -88,7 +87,7 @@ def _in_order(numbers: dict[str, float], doubt: float, shows: bool) -> Finding:
         Whether misplaced views would be seen.
     """
     ratio, rank = numbers["ratio"], numbers["rank"]
-    text = f"views from neighbouring places differ {100 * max(ratio, 0):.2g} % as much as any two views"
+    text = f"neighbouring views differ by {100 * max(ratio, 0):.2g} % of what any two views differ by"
     if ratio < _UNLIKE and rank < _RANDOM and not shows:
         text += ", but many would not stand out elsewhere either"
         return Finding(ORDER, UNKNOWN, text, "more light, or an object that is not round", numbers, doubt)

@@ -12,6 +12,7 @@ from tomo_polysplat.scan.probes.finding import DEFECT, OK, Finding
 from tomo_polysplat.scan.probes.measured import Measured
 from tomo_polysplat.scan.scale_end import ONE_PHOTON, dark_end
 from tomo_polysplat.scan.stuck import stuck_pixels
+from tomo_polysplat.spread import evenly_spread
 
 __all__ = ["DEAD", "RAYS", "bad_rays", "probe_rays"]
 
@@ -63,8 +64,7 @@ def bad_rays(measured: Measured) -> dict[str, np.ndarray]:
 def _some_views(measured: Measured) -> np.ndarray:
     """Evenly spread views, as many as keep the probe within seconds."""
     scan = measured.scan
-    number = min(scan.views, max(_FEWEST_VIEWS, _MOST_RAYS // (scan.rows * scan.columns)))
-    return np.linspace(0, scan.views - 1, number).round().astype(int)
+    return evenly_spread(scan.views, max(_FEWEST_VIEWS, _MOST_RAYS // (scan.rows * scan.columns)))
 
 
 def probe_rays(measured: Measured, kinds: dict[str, np.ndarray]) -> Finding:

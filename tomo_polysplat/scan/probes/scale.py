@@ -22,7 +22,7 @@ _FAR = 6.0
 _DARKEST = 4.0
 # Detail adds to the variance, by an amount that neighbouring views share less than noise: their ratio in pure noise.
 _PURE, _TOLERANCE = np.sqrt(2.0), 0.12
-_NEEDS = "a look at how the values were made; fewer photons show it"
+_NEEDS = "ask how the values were made; a scan of fewer photons would tell"
 
 
 def probe_scale(measured: Measured) -> Finding:

@@ -231,13 +231,13 @@ def _spectrum(told: Acquisition, options: ReadOptions) -> tuple[Acquisition, Spe
         spectrum = Spectrum.from_tube(tube.kvp, tube.anode, dict(tube.filters), detector)
     except ValueError as error:
         return told.saying(f"there is no spectrum: {error}"), None
-    known = f"the spectrum is that of {tube.anode} at {tube.kvp:g} kV behind {_filter_words(tube.filters)}"
-    if tube.detector is not None:
-        return told.saying(f"{known}; what else the beam passes is not known"), spectrum
-    return told.saying(
-        f"{known}, seen by a flat panel of 0.6 mm CsI; what else the beam passes and the detector are not known; give "
-        "detector="
-    ), spectrum
+    known = (
+        f"the spectrum is that of a tube of {tube.anode} at {tube.kvp:g} kV behind {_filter_words(tube.filters)}; "
+        "filters that are built in are not told"
+    )
+    if tube.detector is None:
+        known += ", nor is the detector: a flat panel of 0.6 mm CsI is taken; give detector= for another"
+    return told.saying(known), spectrum
 
 
 def _filter_words(filters: Mapping[str, float]) -> str:

@@ -8,6 +8,7 @@ from tomo_polysplat.checks import require_shape
 from tomo_polysplat.scan.readers.acquisition import Acquisition
 from tomo_polysplat.scan.readers.frames import Frames
 from tomo_polysplat.scan.readers.part import Part
+from tomo_polysplat.spread import evenly_spread
 
 __all__ = ["Upright"]
 
@@ -64,7 +65,7 @@ class Upright:
 
     def bright(self, share: float) -> float:
         """The value that so many percent of the pixels of a few views are below."""
-        some = np.unique(np.linspace(0, len(self.chosen) - 1, 8).round().astype(int))
+        some = evenly_spread(len(self.chosen), 8)
         pictures = [self.views(slice(k, k + 1)) for k in some]
         return float(np.nanpercentile(np.concatenate(pictures), share))
 
