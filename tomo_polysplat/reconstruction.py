@@ -214,6 +214,7 @@ def reconstruct(
     unit, spectrum = measured.unit or "cm", require_spectrum("spectrum", measured.spectrum)
     geometry, grid = from_astra(*measured.geometries())
     problem, counts = _problem(measured, geometry, grid, materials, run_options)
+    run_options = run_options.allowing(problem.noise(run_options.device))
     wanted = Calibration.of(calibrate, soft_density, problem.spectrum)
     flipped = is_planar_geometry(measured.geometries()[0])
     moved = moves_of(align if mend or align != "auto" else None, time_budget)

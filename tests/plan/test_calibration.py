@@ -34,7 +34,7 @@ def fan(scatter, views=40):
 
 def of_fit(fitted, error, *, darkest=None, density=1.0, cut=False):
     """A short fit that left such errors, with one ray."""
-    rays = RaySample(np.zeros((3, 1)), *np.zeros((4, 1)))
+    rays = RaySample(np.zeros((3, 1)), *np.zeros((5, 1)))
     return ShortFit(
         fitted,
         error,
@@ -50,7 +50,7 @@ def test_rays_darker_than_scatter_speak_against_it_where_noise_does_not_explain_
     measured, light = np.full(50_000, 0.5), np.full(50_000, 0.8)
     measured[:30] = -np.log(0.005)
     rest = (np.zeros((3, 50_000)), measured, np.ones(50_000), light, np.zeros(50_000))
-    bright, dim = (RaySample(*rest, photons=photons) for photons in (1e5, 2e2))
+    bright, dim = (RaySample(*rest, np.exp(0.5 * measured) / photons**0.5) for photons in (1e5, 2e2))
     assert bright.darker_than(Scatter(0.02)) == 30 and bright.darker_than(Scatter(0.005)) == 0
     assert bright.darker_than(Scatter(0.024, -0.025)) == 0, "less behind matter"
     assert dim.darker_than(Scatter(0.02)) == 0, "one photon where four are expected"

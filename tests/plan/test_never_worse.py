@@ -18,6 +18,7 @@ from tomo_polysplat.plan.lab import Lab
 from tomo_polysplat.plan.order import decide, decide_start
 from tomo_polysplat.plan.preparation import fit_start
 from tomo_polysplat.report.decided import doubts
+from tomo_polysplat.scan.noise import RayNoise
 from tomo_polysplat.settings import Settings
 
 CPU = torch.device("cpu")
@@ -136,18 +137,18 @@ def test_unexplained_rays_without_a_spectrum_ask_for_one(caplog, monkeypatch):
 def test_the_truth_misses_its_rays_by_their_noise(held_out):
     scan = cone(metal=False)
     lab = lab_of_scan(scan, held_out)
-    rays, photons, settings = lab.rays, 4e3, lab.settings
+    rays, noise, settings = lab.rays, RayNoise(4e3), lab.settings
     seeds = lab.seeds()
     with torch.no_grad():
         clean = lab.scene.projections(seeds, rays.views)[0]
     drawn = torch.from_numpy(np.random.default_rng(2).standard_normal(clean.shape, np.float32))
-    noisy = replace(rays, projections=clean + drawn * torch.exp(0.5 * clean) / photons**0.5)
-    found = misses(seeds, lab.scene, noisy, photons, settings)
+    noisy = replace(rays, projections=clean + drawn * noise.variance(clean).sqrt())
+    found = misses(seeds, lab.scene, noisy, noise, settings)
     assert found.held_out == bool(held_out) and found.rays > 800
     assert found.times == pytest.approx(1.0, abs=0.06) and found.excess < 0.1 * found.misfit
     seeds.attenuation *= 1.1
-    assert misses(seeds, lab.scene, noisy, photons, settings).excess > 0.2 * found.misfit
-    silent = misses(seeds, lab.scene, noisy, math.inf, settings)
+    assert misses(seeds, lab.scene, noisy, noise, settings).excess > 0.2 * found.misfit
+    silent = misses(seeds, lab.scene, noisy, RayNoise(), settings)
     assert math.isinf(silent.times) and silent.least == 0 and "allowed" in silent.describe()
 
 

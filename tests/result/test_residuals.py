@@ -18,6 +18,7 @@ from tomo_polysplat.report.verdict import verdict
 from tomo_polysplat.result.result import Result
 from tomo_polysplat.scan.counts import Counts
 from tomo_polysplat.scan.geometry import VolumeGrid, from_astra
+from tomo_polysplat.scan.noise import RayNoise
 from tomo_polysplat.scan.scan import Scan
 
 WIDTH, HEIGHT, PHOTONS = 0.5, 0.2, 5e3
@@ -81,6 +82,19 @@ def ball(plan=None):
 def ball_of(result):
     result.gaussians = ball().gaussians
     return result
+
+
+def test_noise_that_is_as_strong_in_every_ray_is_its_own_unit(tmp_path, monkeypatch):
+    noisy = line_integrals() + np.random.default_rng(3).normal(0, 0.02, (VIEWS, ROWS, COLUMNS))
+    # So thin an object does not tell it from that of counts.
+    told = RayNoise(deviation=0.02)
+    monkeypatch.setattr("tomo_polysplat.report.residuals.ray_noise", lambda *_: told)
+    result = ball()
+    result.residuals = residuals_of(result, scan_of(noisy, noise=False))
+    assert result.residuals.rms == pytest.approx(1, abs=0.02) and "noise" in result.residuals.unit
+    result.save(tmp_path / "ball.h5")
+    read = Result.load(tmp_path / "ball.h5").residuals
+    assert (read.photons, read.deviation, read.noisy) == (np.inf, 0.02, True)
 
 
 def test_the_right_model_leaves_noise():

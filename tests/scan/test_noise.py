@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from small_scans import fan, reconstruct
 
-from tomo_polysplat.scan.noise import photons_per_ray
+from tomo_polysplat.scan.noise import RayNoise, photons_per_ray, ray_noise
 from tomo_polysplat.scan.usable import usable_rays
 
 PARALLEL = {"type": "parallel3d", "DetectorSpacingX": 1.0, "DetectorSpacingY": 1.0}
@@ -34,6 +34,17 @@ def poisson(projections, photons, seed=0):
 def test_the_exposure_of_a_poisson_scan_is_found(photons, peak):
     found = photons_per_ray(poisson(disc(peak), photons))
     assert found == pytest.approx(photons, rel=0.15)
+
+
+@pytest.mark.parametrize("peak", [0.3, 1.5, 3.0, 8.0])
+def test_normal_noise_of_any_depth_is_not_taken_for_that_of_counts(peak):
+    scan, deviation = disc(peak), 0.02 * peak
+    noisy = scan + np.random.default_rng(4).normal(0, deviation, scan.shape).astype(np.float32)
+    found = ray_noise(noisy)
+    if peak > 1:
+        assert found.photons == np.inf and found.deviation == pytest.approx(deviation, rel=0.15)
+    depth = np.array([0.2 * peak, 0.6 * peak])
+    np.testing.assert_allclose(found.variance(depth), deviation**2, rtol=0.3)
 
 
 def test_unusable_rays_do_not_matter():
@@ -108,7 +119,8 @@ def test_of_many_rays_every_so_many_rows_tell_as_well(monkeypatch):
 def test_the_noise_of_a_scan_is_looked_at_once(monkeypatch):
     seen = []
     monkeypatch.setattr(
-        "tomo_polysplat.fit.problem.photons_per_ray", lambda rays, dimmed, **options: seen.append(rays) or 5e4
+        "tomo_polysplat.fit.problem.ray_noise",
+        lambda rays, dimmed, **options: seen.append(rays) or RayNoise(5e4),
     )
     result = reconstruct(fan(), calibrate=True)
     assert len(seen) == 1 and result.plan["photons_per_ray"].value == pytest.approx(5e4)

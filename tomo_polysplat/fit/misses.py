@@ -12,6 +12,7 @@ from tomo_polysplat.fit.loss import misfit
 from tomo_polysplat.fit.rays import Rays, batches_around
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.scan.noise import RayNoise
 from tomo_polysplat.settings import Settings
 
 __all__ = ["Misses", "misses"]
@@ -60,7 +61,7 @@ class Misses:
 
 
 @torch.no_grad()
-def misses(gaussians: Gaussians, scene: FitScene, rays: Rays, photons: float, settings: Settings) -> Misses:
+def misses(gaussians: Gaussians, scene: FitScene, rays: Rays, noise: RayNoise, settings: Settings) -> Misses:
     """How Gaussians miss the rays of some views, evenly spread over the scan.
 
     Parameters
@@ -68,8 +69,7 @@ def misses(gaussians: Gaussians, scene: FitScene, rays: Rays, photons: float, se
     gaussians : Gaussians
     scene : FitScene
     rays : Rays
-    photons : float
-        Of an unattenuated ray; the variance of -log(I/I0) of Poisson counts is exp(P)/photons. Infinity: no noise.
+    noise : RayNoise
     settings : Settings
         For the misfit, and the model's error.
     """
@@ -80,15 +80,16 @@ def misses(gaussians: Gaussians, scene: FitScene, rays: Rays, photons: float, se
         weight = aside if held_out else fitted
         seen.append([part[weight > 0].cpu() for part in (predicted, measured, weight)])
     predicted, measured, weight = (torch.cat(parts) for parts in zip(*seen))
-    variance = torch.exp(measured) / photons
+    variance = noise.variance(measured)
     drawn = torch.from_numpy(np.random.default_rng(0).standard_normal(len(measured), np.float32))
     noisy = measured + drawn.to(measured) * variance.sqrt()
     squares = (predicted - measured).double().square()
     return Misses(
         float(misfit(predicted, measured, weight, settings)),
         float(misfit(noisy, measured, weight, settings)),
-        math.inf if math.isinf(photons) else _root(squares / variance),
-        _root(squares / (variance + settings.model_error**2)),
+        _root(squares / variance) if noise.shows else math.inf,
+        # Noise that is as strong in every ray is a part of the model's error already.
+        _root(squares / (variance + max(settings.model_error**2 - noise.deviation**2, 0.0))),
         len(measured),
         held_out,
     )

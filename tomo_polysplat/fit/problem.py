@@ -25,7 +25,7 @@ from tomo_polysplat.physics.filter_map import FilterMap
 from tomo_polysplat.physics.scatter import Scatter, made_level, without_scatter
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
-from tomo_polysplat.scan.noise import photons_per_ray
+from tomo_polysplat.scan.noise import RayNoise, ray_noise
 from tomo_polysplat.scan.snapped import snapped_geometry, snapped_grid
 from tomo_polysplat.scan.view_order import sorted_in_place, view_order
 from tomo_polysplat.start.agreement import halves_agree
@@ -48,7 +48,7 @@ class _Known:
     level: dict[torch.device, tuple[tuple[Scatter, float], torch.Tensor, float]] = field(default_factory=dict)
     closed: tuple[bool, str] | None = None
     agreement: list[float | None] | None = None
-    photons: float | None = None
+    noise: RayNoise | None = None
     solid: bool = False
     hardening: float | None = None
     taken: list[Step] = field(default_factory=list)
@@ -191,7 +191,7 @@ class Problem:
     def seen_by(self, geometry: Geometry) -> Problem:
         """The same measurements by a scanner that stood elsewhere; copies of them on devices serve both."""
         other, known = replace(self, geometry=geometry), self._known
-        shared = _Known(known.copies, known.level, photons=known.photons, taken=known.taken)
+        shared = _Known(known.copies, known.level, noise=known.noise, taken=known.taken)
         object.__setattr__(other, "_known", shared)
         return other
 
@@ -216,7 +216,7 @@ class Problem:
     def with_one_energy(self) -> Problem:
         """The same measurements as if all photons had one energy; copies of them on devices serve both."""
         other = replace(self, spectrum=None, materials=None, depth=self.length, scatter=Scatter(), beam=1.0)
-        known = _Known(self._known.copies, closed=self._known.closed, photons=self._known.photons)
+        known = _Known(self._known.copies, closed=self._known.closed, noise=self._known.noise)
         object.__setattr__(other, "_known", known)
         return other
 
@@ -278,7 +278,7 @@ class Problem:
         known = self._known
         known.agreement = known.closed = None
         # Less gains and drift rays do not hold what they were given any more.
-        known.photons = known.photons if self.given else None
+        known.noise = known.noise if self.given else None
 
     def let_go_of_level(self) -> None:
         """Forget rays made level for physics that is not used: they take as much memory as those measured."""
@@ -308,12 +308,16 @@ class Problem:
                 self._known.agreement = [None] * len(bodies)
         return self._known.agreement
 
-    def photons(self, device: torch.device) -> float:
-        """Photons of an unattenuated ray, told once a scan; see ``scan.noise``."""
-        if self._known.photons is None:
+    def noise(self, device: torch.device) -> RayNoise:
+        """How noisy the rays are, told once a scan; see ``scan.noise``."""
+        if self._known.noise is None:
             told = self._copied(device), self.dimmed(device)
-            self._known.photons = photons_per_ray(*told, given=self.given)
-        return self._known.photons
+            self._known.noise = ray_noise(*told, given=self.given)
+        return self._known.noise
+
+    def photons(self, device: torch.device) -> float:
+        """Photons of an unattenuated ray, by that noise."""
+        return self.noise(device).photons
 
     def closed(self, device: torch.device) -> tuple[bool, str]:
         """Whether no matter lies beside the volume, and words that say so."""

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.kernels.views import DetectorViews
+from tomo_polysplat.scan.noise import RayNoise
 
 __all__ = ["Rays", "batches_around", "views_around"]
 
@@ -32,13 +33,16 @@ class Rays:
     photons : float
         Photons of an unattenuated ray; infinity weighs all rays alike.
     model_error : float
-        Error of P that the model itself is allowed, which keeps quiet rays from outweighing the rest.
+        Error of P that the model itself is allowed, which keeps quiet rays from outweighing the rest; with the noise
+        that is as strong in every ray, if there is such.
     held_out : float
         Share of the rays kept from the fit.
     device : torch.device, optional
         Where batches go, for projections that stay on the host because they do not fit there.
     dimmed : (rows, columns) tensor, optional
         -log of the share of the beam that reaches each pixel through its filter: as many fewer photons.
+    deviation : float
+        Of the noise that is as strong in every ray.
     """
 
     projections: torch.Tensor
@@ -48,6 +52,7 @@ class Rays:
     held_out: float
     device: torch.device | None = None
     dimmed: torch.Tensor | None = None
+    deviation: float = 0.0
 
     @property
     def target(self) -> torch.device:
@@ -59,6 +64,10 @@ class Rays:
         """Variance of an unattenuated ray over that of the model's error."""
         allowed = self.photons * self.model_error**2
         return 1 / allowed if allowed else float("inf")
+
+    def variance(self, depth: torch.Tensor) -> torch.Tensor:
+        """Of the noise of rays with this -log(I/I0)."""
+        return RayNoise(self.photons, self.deviation).variance(depth)
 
     @property
     def threshold(self) -> int:

@@ -19,6 +19,7 @@ from tomo_polysplat.physics.solids import number_of_solid
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.spectral_model import spectral_model
 from tomo_polysplat.render.renderer import detector_views, voxel_box
+from tomo_polysplat.scan.noise import RayNoise
 from tomo_polysplat.settings import Settings
 
 __all__ = ["all_curves", "rays_of", "scene_of"]
@@ -68,13 +69,17 @@ def _behind(problem: Problem, quadrature: Quadrature | None, device: torch.devic
 
 def rays_of(problem: Problem, plan: Plan, settings: Settings, device: torch.device) -> Rays:
     """The measured rays on the device."""
-    photons = float("inf") if settings.loss == "l1" else problem.photons(device)
-    plan.note("photons_per_ray", photons, "from the scatter of neighbouring pixels")
+    noise = RayNoise() if settings.loss == "l1" else problem.noise(device)
+    photons, why = noise.photons, "from the scatter of neighbouring pixels"
+    if noise.deviation:
+        why = f"the noise of -log(I/I0) does not grow with depth: a deviation of {noise.deviation:.2g}, {why}"
+    plan.note("photons_per_ray", photons, why)
     views = detector_views(problem.geometry, problem.planar)
     values = problem.measured(device)
     target = None if values.device.type == device.type else device
     dimmed = problem.dimmed(device)
-    return Rays(values, views, photons, settings.model_error, settings.held_out, target, dimmed)
+    given = settings.model_error, settings.held_out, target, dimmed
+    return Rays(values, views, photons, *given, deviation=noise.deviation)
 
 
 def _solid_number(

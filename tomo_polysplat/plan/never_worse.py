@@ -118,5 +118,5 @@ def _left(found: Misses, first: float) -> float:
 
 
 def _misses(gaussians: Gaussians, prepared: PreparedFit, problem: Problem, run_options: RunOptions) -> Misses:
-    photons = problem.photons(run_options.device)
-    return misses(gaussians, prepared.scene, prepared.rays, photons, run_options.settings)
+    noise = problem.noise(run_options.device)
+    return misses(gaussians, prepared.scene, prepared.rays, noise, run_options.settings)

@@ -95,7 +95,7 @@ def _by_seeds(one: Problem, means: Means) -> float:
     start, _ = initial_volume_on(one.primary(device), one.geometry, one.grid)
     lab = Lab(one, start, settings, device)
     decide_start(lab)
-    return misses(lab.seeds(), lab.scene, lab.rays, one.photons(device), settings).misfit
+    return misses(lab.seeds(), lab.scene, lab.rays, one.noise(device), settings).misfit
 
 
 def _after_short_fit(of: Problem, means: Means) -> float:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -32,6 +33,7 @@ from tomo_polysplat.plan.order import alternatives, decide, decide_start
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.seeds_in_time import seed_for_time
 from tomo_polysplat.plan.short_fit import ShortFit, short_fit
+from tomo_polysplat.scan.noise import RayNoise
 from tomo_polysplat.settings import Settings, make_settings
 
 __all__ = [
@@ -70,6 +72,13 @@ class RunOptions(Means):
             time_budget = require_number("time_budget", time_budget, above=0)
         track_compiling()
         return cls(chosen, time_budget, _whole(seed), pick_fast_device(device), _functions(callbacks))
+
+    def allowing(self, noise: RayNoise) -> RunOptions:
+        """The same where the model may miss every ray by what noise that does not grow with depth misses it by."""
+        if not noise.deviation:
+            return self
+        allowed = math.hypot(self.settings.model_error, noise.deviation)
+        return replace(self, settings=replace(self.settings, model_error=allowed))
 
     def to_dict(self) -> dict[str, Any]:
         """All that the result depends on, for a checkpoint."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +13,7 @@ from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.ray_estimates import FittedRays
 from tomo_polysplat.physics.scatter import Scatter, light_around
 from tomo_polysplat.render.renderer import project_gaussians
+from tomo_polysplat.scan.noise import RayNoise
 
 __all__ = ["RaySample", "sample_rays"]
 
@@ -40,8 +40,8 @@ class RaySample:
         That around them; see `tomo_polysplat.physics.scatter.light_around`.
     view : (rays,) array
         Which of the views looked at they belong to.
-    photons : float
-        Of an unattenuated ray.
+    deviation : (rays,) array
+        Of their noise.
     """
 
     areal: np.ndarray
@@ -49,7 +49,7 @@ class RaySample:
     weight: np.ndarray
     light: np.ndarray
     view: np.ndarray
-    photons: float = math.inf
+    deviation: np.ndarray
 
     @property
     def fitted(self) -> FittedRays:
@@ -70,9 +70,7 @@ class RaySample:
     def darker_than(self, scatter: Scatter) -> int:
         """How many rays have less light than their scatter alone, whatever their noise."""
         least = scatter.at(torch.as_tensor(self.light)).numpy()
-        # Of Poisson counts the variance of -log(I/I0) is exp(P)/I0.
-        deviation = np.sqrt(np.exp(self.measured) / self.photons)
-        return int(np.count_nonzero(np.exp(_DEVIATIONS * deviation - self.measured) < _LESS * least))
+        return int(np.count_nonzero(np.exp(_DEVIATIONS * self.deviation - self.measured) < _LESS * least))
 
 
 @torch.no_grad()
@@ -96,4 +94,5 @@ def sample_rays(gaussians: Gaussians, scene: FitScene, rays: Rays, seed: int, mo
         flat += [values.reshape(-1)[chosen] for values in (measured, weight, light)]
         parts.append([tensor.double().cpu().numpy() for tensor in (*flat, view)])
     whole = [np.concatenate(part, axis=-1) for part in zip(*parts)]
-    return RaySample(whole[0], whole[1], whole[2], whole[3], whole[4], rays.photons)
+    deviation = np.sqrt(RayNoise(rays.photons, rays.deviation).variance(whole[1]))
+    return RaySample(whole[0], whole[1], whole[2], whole[3], whole[4], deviation)

@@ -38,7 +38,7 @@ def by_view_figure(residuals: Residuals) -> Figure:
     if np.isfinite(residuals.held_out).any():
         unseen: dict[str, Any] = {"marker": "x", "markersize": 4, "linestyle": "", "label": "rays held out"}
         axis.plot(residuals.views, residuals.held_out, color=SAFE[1], **unseen)
-    if np.isfinite(residuals.photons):
+    if residuals.noisy:
         axis.axhline(1.0, color=QUIET, linestyle="--", linewidth=0.9, label="noise alone")
     axis.legend(frameon=False, fontsize=8, ncols=3)
     shown = np.append(residuals.by_view, residuals.held_out)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from tomo_polysplat.report.where import MisfitMap
 from tomo_polysplat.result.filter_found import filter_of
 from tomo_polysplat.result.residuals import Residuals
 from tomo_polysplat.scan.geometry import from_astra, is_planar_geometry
-from tomo_polysplat.scan.noise import photons_per_ray
+from tomo_polysplat.scan.noise import RayNoise, ray_noise
 from tomo_polysplat.scan.usable import usable_rays
 from tomo_polysplat.units import cm_per
 
@@ -48,8 +49,8 @@ def residuals_of(
 ) -> Residuals:
     """Project the Gaussians of a result along the rays of its scan, and compare.
 
-    The variance of -log(I/I0) of Poisson counts is exp(P)/I0, with P as the model has it and I0 from the scatter of
-    neighbouring pixels. The detector's blur and scatter count as the plan tells of them. Saturated rays are left out.
+    The noise is that of `scan.noise.ray_noise`, with P as the model has it. The detector's blur and scatter count as
+    the plan tells of them. Saturated rays are left out.
 
     Parameters
     ----------
@@ -85,8 +86,8 @@ def residuals_of(
     model = _Model(result, detector_views(some, planar), pick_fast_device(device), behind)
     share = float(result.settings.get("held_out", 0.0))
     unseen = HeldOut(geometry, grid, values, share, model.device)
-    photons = photons_per_ray(values.array, model.dimmed, model.device, values.given)
-    return _collected(model, values[chosen], chosen, photons, MisfitMap(some, grid), unseen)
+    noise = ray_noise(values.array, model.dimmed, model.device, values.given)
+    return _collected(model, values[chosen], chosen, noise, MisfitMap(some, grid), unseen)
 
 
 class _OfViews:
@@ -192,7 +193,7 @@ def _collected(
     model: _Model,
     values: np.ndarray,
     chosen: np.ndarray,
-    photons: float,
+    noise: RayNoise,
     where: MisfitMap,
     unseen: HeldOut,
 ) -> Residuals:
@@ -201,7 +202,7 @@ def _collected(
     sums, near = np.zeros((4, len(chosen))), 0
     for first in range(0, len(chosen), _AT_ONCE):
         some = np.arange(first, min(first + _AT_ONCE, len(chosen)))
-        scaled, good = _scaled(model, some, values[some], photons)
+        scaled, good = _scaled(model, some, values[some], noise)
         squares = scaled**2
         for total, part in zip(pixels, (good, scaled, squares)):
             total += part.sum(dim=0)
@@ -221,19 +222,20 @@ def _collected(
     totals = sums.sum(axis=1)
     rms, rms_held_out = (float(_root_mean(totals[k], totals[k + 1])) for k in (0, 2))
     maps = by_view, _root_mean(of_squares, number), bias, held_out
-    within = near / max(rays, 1)
-    return Residuals(chosen, *maps, rms, within, rms_held_out, rays, photons, *where.worst(), block)
+    within, photons = near / max(rays, 1), noise.photons
+    found = Residuals(chosen, *maps, rms, within, rms_held_out, rays, photons, *where.worst(), block)
+    return replace(found, deviation=noise.deviation)
 
 
 def _scaled(
-    model: _Model, some: np.ndarray, values: np.ndarray, photons: float
+    model: _Model, some: np.ndarray, values: np.ndarray, noise: RayNoise
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Residuals of some views in units of noise, 0 where a ray is not usable, and where one is."""
     measured = torch.from_numpy(np.ascontiguousarray(values)).to(model.device)
     predicted = model.predict(some, measured)
     depth = predicted + model.behind[2] if model.behind else predicted
-    noise = torch.exp(0.5 * depth) / photons**0.5 if np.isfinite(photons) else 1.0
-    scaled = ((predicted - measured) / noise).double()
+    deviation = noise.variance(depth).sqrt() if noise.shows else 1.0
+    scaled = ((predicted - measured) / deviation).double()
     good = torch.isfinite(scaled)
     return torch.where(good, scaled, 0.0), good
 

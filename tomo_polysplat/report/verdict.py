@@ -41,7 +41,7 @@ def verdict(result: ResultData, residuals: Residuals | None) -> list[str]:
 def explained(result: ResultData, residuals: Residuals | None) -> str:
     """How well the model explains the rays, in units of their noise where the scan is at hand."""
     if residuals is not None:
-        if not np.isfinite(residuals.photons):
+        if not residuals.noisy:
             return f"The data shows no noise; the model misses the rays by {residuals.rms:.2g} of -log(I/I0)."
         unseen = residuals.rms_held_out
         apart = f" (those kept out of the fit to {_short(unseen)})" if np.isfinite(unseen) else ""

@@ -32,14 +32,16 @@ class Residuals:
     rays : int
         Usable rays looked at.
     photons : float
-        Of an unattenuated ray, from which the noise follows; infinity for data without noise, whose residuals are
-        those of -log(I/I0) themselves.
+        Of an unattenuated ray, from which the noise follows; infinity where it does not.
     worst : (3,) array
         Where in the volume the rays meet that are explained worst, (x, y, z); see ``report.where``.
     worst_value, usual_value : float
         Root mean square of the rays through there, and through the middling point of the volume.
     block : int
         Pixels along an edge of a block of the maps.
+    deviation : float
+        Of the noise, where it is as strong in every ray. Without this and photons the data shows no noise, and
+        residuals are those of -log(I/I0) themselves.
     """
 
     views: np.ndarray
@@ -56,8 +58,14 @@ class Residuals:
     worst_value: float
     usual_value: float
     block: int = 1
+    deviation: float = 0.0
 
     @property
     def unit(self) -> str:
         """What the numbers are in."""
-        return "deviations of the noise" if np.isfinite(self.photons) else "units of -log(I/I0)"
+        return "deviations of the noise" if self.noisy else "units of -log(I/I0)"
+
+    @property
+    def noisy(self) -> bool:
+        """Whether the data shows noise."""
+        return bool(np.isfinite(self.photons)) or self.deviation > 0

@@ -15,7 +15,17 @@ __all__ = ["read_residuals", "write_residuals"]
 _GROUP = "residuals"
 _BY_VIEW, _BY_PIXEL = ("by_view", "held_out"), ("by_pixel", "bias")
 _ARRAYS = ("views", *_BY_VIEW, *_BY_PIXEL, "worst")
-_NUMBERS = ("rms", "within", "rms_held_out", "rays", "photons", "worst_value", "usual_value", "block")
+_NUMBERS = (
+    "rms",
+    "within",
+    "rms_held_out",
+    "rays",
+    "photons",
+    "worst_value",
+    "usual_value",
+    "block",
+    "deviation",
+)
 # Far more than are ever kept.
 _MOST, _LARGEST = 1 << 20, 1e30
 
@@ -29,7 +39,7 @@ def write_residuals(group: Any, residuals: Residuals | None) -> None:
         values = np.asarray(getattr(residuals, name))
         kept[name] = values.astype(np.int64 if name == "views" else np.float32)
     numbers = {name: float(getattr(residuals, name)) for name in _NUMBERS}
-    # What is missing is not known, or of the photons, without end.
+    # What is missing is not known, of photons without end, and of a deviation none.
     kept.attrs.update({name: number for name, number in numbers.items() if np.isfinite(number)})
 
 
@@ -54,7 +64,9 @@ def read_residuals(group: Any) -> Residuals | None:
             require_shape(f"/polysplat/{_GROUP}/{name}", arrays[name], axes.shape, "as those beside it")
     if arrays["views"].ndim != 1 or arrays["by_pixel"].ndim != 2 or arrays["worst"].shape != (3,):
         raise _wrong("views", "arrays of other axes")
-    if not (numbers["rays"] >= 0 and numbers["block"] >= 1 and numbers["photons"] > 0):
+    if not (
+        numbers["rays"] >= 0 and numbers["block"] >= 1 and numbers["photons"] > 0 <= numbers["deviation"]
+    ):
         raise _wrong("rays", "numbers out of range")
     views = np.nan_to_num(arrays.pop("views")).astype(np.int64)
     whole = {name: int(numbers.pop(name)) for name in ("rays", "block")}
@@ -64,7 +76,7 @@ def read_residuals(group: Any) -> Residuals | None:
 def _number(kept: Any, name: str) -> float:
     value = number_attribute(kept, name)
     if value is None:
-        return np.inf if name == "photons" else np.nan
+        return {"photons": np.inf, "deviation": 0.0}.get(name, np.nan)
     if not abs(value) <= _LARGEST:
         raise _wrong(name, f"{value:g}")
     return value

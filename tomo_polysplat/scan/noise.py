@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
 
-__all__ = ["photons_per_ray"]
+__all__ = ["RayNoise", "photons_per_ray", "ray_noise"]
+
+Values = TypeVar("Values", np.ndarray, torch.Tensor)
 
 _VIEWS = 24
 # This many rays tell the noise to half a per cent.
@@ -19,19 +22,58 @@ _LARGEST_EXPONENT = 700.0
 _OF_A_MEDIAN, _CLEARLY = 2.33, 3.0
 
 
+class RayNoise(NamedTuple):
+    """Noise of ``-log(I/I0)``: that of counts, which grows with depth, or one that is as strong in every ray.
+
+    Attributes
+    ----------
+    photons : float
+        Of an unattenuated ray; infinity where it is not that of counts, or where there is none.
+    deviation : float
+        Of every ray, where it is as strong in all; else 0.
+    """
+
+    photons: float = math.inf
+    deviation: float = 0.0
+
+    @property
+    def shows(self) -> bool:
+        """Whether there is any."""
+        return math.isfinite(self.photons) or self.deviation > 0
+
+    def variance(self, depth: Values) -> Values:
+        """Of rays with this ``-log(I/I0)``: ``exp(P) / I0`` for Poisson distributed counts."""
+        grows = torch.exp(depth) if isinstance(depth, torch.Tensor) else np.exp(depth)
+        return grows / self.photons + self.deviation**2
+
+
 def photons_per_ray(
     projections: np.ndarray | torch.Tensor,
     dimmed: np.ndarray | torch.Tensor | None = None,
     device: torch.device | None = None,
     given: Sequence[float] = (),
 ) -> float:
-    """Photons of an unattenuated ray, from the scatter of neighbouring pixels.
+    """Photons of an unattenuated ray, at least 1; infinity for data without the noise of counts. See `ray_noise`."""
+    return ray_noise(projections, dimmed, device, given).photons
+
+
+def ray_noise(
+    projections: np.ndarray | torch.Tensor,
+    dimmed: np.ndarray | torch.Tensor | None = None,
+    device: torch.device | None = None,
+    given: Sequence[float] = (),
+) -> RayNoise:
+    """How noisy the rays are, from the scatter of neighbouring pixels.
 
     Counts that are Poisson distributed give ``-log(I/I0)`` a variance ``exp(P) / I0``. The variance is taken
     from second differences along detector rows, ``p[j-1] - 2 p[j] + p[j+1]``, whose variance is six times
     that of a pixel. It is estimated by the median absolute deviation, which edges disturb little. Structure can only
     add to the variance, so the quietest bins of P give the noise. So do gains of pixels, which all views have in
     common: where each pixel's mean over the views is clearly a part of the variance, it is left out.
+
+    Line integrals that were simulated with normal noise, or smoothed according to their depth, have a variance that
+    does not grow with P. It is likewise that of the quietest bins. Of the two, the one that lies clearly closer beneath
+    the variances of all bins is the noise.
 
     Parameters
     ----------
@@ -46,11 +88,11 @@ def photons_per_ray(
 
     Returns
     -------
-    float
-        ``I0``, at least 1; infinity for data without noise.
+    RayNoise
+        Of at least one photon.
     """
     if projections.shape[2] < 5:
-        return float("inf")
+        return RayNoise()
     some = projections[:: max(1, len(projections) // _VIEWS)]
     rows = max(1, -(-math.prod(some.shape) // _MOST))
     some = some[:, ::rows]
@@ -65,30 +107,58 @@ def photons_per_ray(
     whole = torch.ones_like(difference[0])
     if dimmed is not None:
         whole = torch.exp(-0.5 * torch.as_tensor(dimmed)[::rows, 2:-2].to(difference))
-    (plain, error), (own, _) = (
-        _variance((kept * whole).abs(), middle) for kept in (difference, _of_views(difference))
-    )
-    variance = own if own < (1 - _CLEARLY * error) * plain else plain
-    return max(1.0, 1 / variance) if 0 < variance < math.inf else float("inf")
+    plain, own = (_scatter((kept * whole).abs(), middle) for kept in (difference, _of_views(difference)))
+    if plain is None or own is None:
+        return RayNoise()
+    found = own if own.of_counts < (1 - _CLEARLY * plain.error) * plain.of_counts else plain
+    if not 0 < found.of_counts < math.inf:
+        return RayNoise()
+    # By how much closer one of the two lies beneath all bins, in the mean of the logarithms.
+    if dimmed is None and found.closer_alike() > _CLEARLY * found.error:
+        return RayNoise(deviation=math.sqrt(found.alike))
+    return RayNoise(max(1.0, 1 / found.of_counts))
 
 
-def _variance(difference: torch.Tensor, middle: torch.Tensor) -> tuple[float, float]:
-    """Of an unattenuated ray, from second differences and the values that they lie among, and its relative error.
+class _Scatter(NamedTuple):
+    """What the variances in bins of P say.
 
-    Infinity if they are too few.
+    Attributes
+    ----------
+    of_counts, alike : float
+        Variance of an unattenuated ray by the quietest bins, were it that of counts, and were it the same in every ray.
+    level : float
+        Mean of P over the bins.
+    error : float
+        Relative, of a variance.
     """
+
+    of_counts: float
+    alike: float
+    level: float
+    error: float
+
+    def closer_alike(self) -> float:
+        """By how much closer ``alike`` lies beneath the variances than ``of_counts``, in the mean logarithm."""
+        return math.log(self.alike) - math.log(self.of_counts) - self.level if self.alike > 0 else -math.inf
+
+
+def _scatter(difference: torch.Tensor, middle: torch.Tensor) -> _Scatter | None:
+    """Of second differences and the values that they lie among; None if they are too few."""
     good = torch.isfinite(difference) & torch.isfinite(middle)
     difference, middle = difference[good], middle[good]
     if len(middle) < 4 * _BINS:
-        return float("inf"), 1.0
+        return None
     middle, order = middle.sort()
-    rates = []
+    levels, variances = [], []
     for values, differences in zip(middle.tensor_split(_BINS), difference[order].tensor_split(_BINS)):
         deviation = 1.4826 * _median(differences.sort().values) / math.sqrt(6)
         # A broken detector may give values whose exponential no float can hold.
-        level = min(max(_median(values), -_LARGEST_EXPONENT), _LARGEST_EXPONENT)
-        rates.append(deviation**2 / math.exp(level))
-    return sorted(rates)[_BINS // 8], _OF_A_MEDIAN / math.sqrt(len(middle) / _BINS)
+        levels.append(min(max(_median(values), -_LARGEST_EXPONENT), _LARGEST_EXPONENT))
+        variances.append(deviation**2)
+    rates = [variance / math.exp(level) for variance, level in zip(variances, levels)]
+    quiet, alike = (sorted(each)[_BINS // 8] for each in (rates, variances))
+    error = _OF_A_MEDIAN / math.sqrt(len(middle) / _BINS)
+    return _Scatter(quiet, alike, sum(levels) / _BINS, error)
 
 
 def _of_views(values: torch.Tensor) -> torch.Tensor:

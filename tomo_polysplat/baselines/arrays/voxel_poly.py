@@ -28,7 +28,7 @@ from tomo_polysplat.physics.water import areal_density, transmitted_energy
 from tomo_polysplat.plan.decisions.tv_corner import tv_corners
 from tomo_polysplat.render.renderer import detector_views
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
-from tomo_polysplat.scan.noise import photons_per_ray
+from tomo_polysplat.scan.noise import ray_noise
 from tomo_polysplat.settings import Settings, make_settings
 from tomo_polysplat.start.agreement import halves_agree
 from tomo_polysplat.start.initial import initial_volume
@@ -132,12 +132,14 @@ class _Fit:
         self.water = float(curves[0, 1]) * self.cm
         relative = torch.as_tensor(curves / curves[:1], dtype=torch.float32, device=target)
         self.reference_curve, self.output_curve = relative[:, 0], relative[:, 1]
+        noise = ray_noise(values)
         self.rays = Rays(
             torch.from_numpy(values).to(target),
             detector_views(geometry, geometry.planar),
-            photons_per_ray(values),
-            settings.model_error,
+            noise.photons,
+            math.hypot(settings.model_error, noise.deviation),
             settings.held_out,
+            deviation=noise.deviation,
         )
         measured = self.rays.projections
         self.corners, _ = tv_corners(

@@ -161,8 +161,7 @@ def unexplained(gaussians: Gaussians, scene: FitScene, rays: Rays, bone_level: f
             predicted = scene.projections(gaussians, views)[0]
             through &= scene.projections(dense, views)[0] < _SHADE
         squares.append((predicted - measured)[through].square())
-        # The variance of -log(I/I0) is exp(P)/I0 for Poisson counts.
-        noise.append(measured[through].exp() / rays.photons)
+        noise.append(rays.variance(measured[through]))
         seen.append(measured[through])
     if not any(len(values) for values in seen):
         return 0.0
