@@ -106,7 +106,7 @@ def _draw(volume: Path, path: Path) -> None:
 
     stack = tifffile.imread(volume)
     z, y, x = np.unravel_index(int(np.argmax(stack)), stack.shape)
-    figure = Figure(figsize=(7.4, 2.6), layout="constrained")
+    figure = Figure(figsize=(7.4, 2.9), layout="constrained")
     planes = {"z": stack[z], "y": stack[:, y][::-1], "x": stack[:, :, x][::-1]}
     for axis, (name, plane) in zip(figure.subplots(1, 3), planes.items()):
         axis.imshow(plane, cmap="gray", vmin=0, vmax=float(np.quantile(stack, 0.999)))

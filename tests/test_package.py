@@ -27,7 +27,7 @@ BASICS = (
     "plain_file",
     "units",
     "settings",
-    "spread",
+    "evenly_spread",
     "progress",
     "interrupts",
     "transfer",

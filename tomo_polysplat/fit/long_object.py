@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from tomo_polysplat.evenly_spread import evenly_spread
 from tomo_polysplat.fit.inside import NOTHING, typical_ray
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
-from tomo_polysplat.spread import evenly_spread
 from tomo_polysplat.start.orbit import Orbit
 from tomo_polysplat.start.weights import ray_offsets
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from tomo_polysplat.spread import evenly_spread
+from tomo_polysplat.evenly_spread import evenly_spread
 
 __all__ = ["edge_rise"]
 

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from tomo_polysplat.evenly_spread import evenly_spread
 from tomo_polysplat.report.page import data_uri, text
-from tomo_polysplat.spread import evenly_spread
 
 __all__ = ["browser"]
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tomo_polysplat.evenly_spread import evenly_spread
 from tomo_polysplat.scan.opposite_geometry import opposite_rays_of
 from tomo_polysplat.scan.opposite_rays import OppositeRays
 from tomo_polysplat.scan.view_geometry import Geometry
-from tomo_polysplat.spread import evenly_spread
 
 __all__ = ["LARGEST_SHARE", "AxisOffset", "axis_offset", "offset_of", "spread"]
 

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from tomo_polysplat.checks import fail, require_array, require_shape
+from tomo_polysplat.evenly_spread import evenly_spread
 from tomo_polysplat.parallel import run_tasks
 from tomo_polysplat.scan.assumptions import Located, compare, locate
-from tomo_polysplat.spread import evenly_spread
 
 __all__ = ["chosen_rows", "estimate_centre", "find_centre"]
 

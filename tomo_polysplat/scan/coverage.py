@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from tomo_polysplat.evenly_spread import evenly_spread
 from tomo_polysplat.scan.view_geometry import Geometry
 from tomo_polysplat.scan.volume_grid import VolumeGrid
-from tomo_polysplat.spread import evenly_spread
 
 __all__ = ["coverage", "unseen_share"]
 

@@ -11,8 +11,8 @@ import logging
 import numpy as np
 
 from tomo_polysplat.checks import fail
+from tomo_polysplat.evenly_spread import evenly_spread
 from tomo_polysplat.scan.probes.logarithm import COUNTS, REMEDIES, SIGN, TRANSMISSIONS
-from tomo_polysplat.spread import evenly_spread
 
 __all__ = ["require_line_integrals"]
 

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from tomo_polysplat.evenly_spread import evenly_spread
 from tomo_polysplat.scan.counts import Counts, Marks
 from tomo_polysplat.scan.defects import fill_invalid
 from tomo_polysplat.scan.dropouts import dropped_rays
@@ -14,7 +15,6 @@ from tomo_polysplat.scan.geometry import Geometry, from_astra
 from tomo_polysplat.scan.probes.air import Air, look_for_air
 from tomo_polysplat.scan.scan import Scan
 from tomo_polysplat.scan.volume_grid import VolumeGrid
-from tomo_polysplat.spread import evenly_spread
 
 __all__ = ["Measured"]
 

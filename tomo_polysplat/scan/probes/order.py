@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from tomo_polysplat.evenly_spread import evenly_spread
 from tomo_polysplat.scan.probes.alike import Alike
 from tomo_polysplat.scan.probes.finding import DEFECT, OK, UNKNOWN, Finding
 from tomo_polysplat.scan.probes.measured import Measured
-from tomo_polysplat.spread import evenly_spread
 
 __all__ = ["ORDER", "blurred_views", "probe_order"]
 

@@ -7,12 +7,12 @@ from functools import reduce
 
 import numpy as np
 
+from tomo_polysplat.evenly_spread import evenly_spread
 from tomo_polysplat.scan.dropouts import dropped_rays
 from tomo_polysplat.scan.probes.finding import DEFECT, OK, Finding
 from tomo_polysplat.scan.probes.measured import Measured
 from tomo_polysplat.scan.scale_end import ONE_PHOTON, dark_end
 from tomo_polysplat.scan.stuck import stuck_pixels
-from tomo_polysplat.spread import evenly_spread
 
 __all__ = ["DEAD", "RAYS", "bad_rays", "probe_rays"]
 

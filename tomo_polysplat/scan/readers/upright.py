@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from tomo_polysplat.checks import require_shape
+from tomo_polysplat.evenly_spread import evenly_spread
 from tomo_polysplat.scan.readers.acquisition import Acquisition
 from tomo_polysplat.scan.readers.frames import Frames
 from tomo_polysplat.scan.readers.part import Part
-from tomo_polysplat.spread import evenly_spread
 
 __all__ = ["Upright"]
 
