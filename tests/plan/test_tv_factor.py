@@ -1,9 +1,17 @@
 """How much is smoothed: by how much light an object takes away, and by what rays held out of short fits say."""
 
+import math
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import torch
 
 from tomo_polysplat import reconstruct
+from tomo_polysplat.fit.rays import Rays
+from tomo_polysplat.kernels.views import DetectorViews
+from tomo_polysplat.plan.decisions.tv_factor import _misfit_aside
+from tomo_polysplat.settings import Settings
 
 SIZE, VIEWS = 64, 90
 # Where the question is how the error scales, a quarter of the voxels tells it as well.
@@ -130,3 +138,28 @@ def test_many_rays_a_voxel_need_no_more_smoothing():
     coarse = vol_geom | {"GridRowCount": 32, "GridColCount": 32}
     told = fitted((projections, proj_geom, coarse), views_per_step=VIEWS).plan["tv_factor"]
     assert "3 rays a voxel" in told.why
+
+
+def test_rings_that_explain_gains_are_no_reason_to_smooth_less():
+    """Held-out rays have the gains of the others; what a fit misses otherwise counts as ever."""
+    random = np.random.default_rng(0)
+    gains, noise = random.normal(0, 0.1, (12, 15)), random.normal(0, 0.02, (40, 12, 15))
+    turned = DetectorViews(False, np.zeros((40, 3)), np.broadcast_to(np.eye(3), (40, 3, 3)), 12, 15)
+    values = torch.as_tensor((gains + noise).astype(np.float32))
+    rays = Rays(values, turned, math.inf, 0.01, 0.2)
+    gaussians = SimpleNamespace(attenuation=values.new_zeros(1))
+
+    def missed(rings, uneven, wrong=0.0):
+        """By a fit that has rings where the gains are, and is off otherwise by so much from view to view."""
+        off = (
+            rings * torch.as_tensor(gains, dtype=torch.float32)
+            + wrong * torch.linspace(-1, 1, 40)[:, None, None]
+        )
+        numbers = iter([off[k : k + 8] for k in range(0, 40, 8)] * 2)
+        scene = SimpleNamespace(projections=lambda *_: (next(numbers).expand(8, 12, 15), None))
+        return _misfit_aside(gaussians, scene, rays, Settings(), 40, uneven)
+
+    assert missed(1.0, False) < 0.5 * missed(0.0, False)
+    assert missed(1.0, True) == pytest.approx(missed(0.0, True), rel=1e-3)
+    assert missed(1.0, True) < missed(1.0, False)
+    assert missed(1.0, True, wrong=0.1) > 2 * missed(1.0, True)

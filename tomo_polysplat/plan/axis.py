@@ -19,7 +19,7 @@ from tomo_polysplat.scan.axis_offset import AxisOffset, offset_of
 from tomo_polysplat.scan.moves import Scanner, moved_geometry
 from tomo_polysplat.scan.opposite_geometry import opposite_rays_of
 from tomo_polysplat.scan.opposite_rays import OppositeRays
-from tomo_polysplat.scan.probes.direction import runs_backwards
+from tomo_polysplat.scan.probes.direction import REMEDY, runs_backwards
 
 __all__ = ["aligned", "axis_of", "find_axis", "is_known"]
 
@@ -137,9 +137,7 @@ def _warn_of_angles(rays: OppositeRays, told: AxisOffset) -> None:
         return
     if better:
         logger.warning(
-            "Opposite rays agree %.1f times better with the angles turned round: take the angles times -1, or reverse "
-            "the views.",
-            better,
+            "Opposite rays agree %.1f times better with the angles turned round: %s.", better, REMEDY
         )
 
 

@@ -137,7 +137,9 @@ def _left_by(factor: float, asking: Rays, known: Known, lab: Lab) -> float:
     own = lab.plan.assuming(tv_factor=factor)
     short = replace(own.adapted(lab.seeding), passes=passes, soft_gain=0.0)
     gaussians = lab.trial(short, asking).gaussians
-    return _misfit_aside(gaussians, lab.scene, asking, short, _VIEWS_PLANAR if problem.planar else _VIEWS)
+    most = _VIEWS_PLANAR if problem.planar else _VIEWS
+    uneven = bool(problem.taken.gains.any())
+    return _misfit_aside(gaussians, lab.scene, asking, short, most, uneven)
 
 
 @dataclass
@@ -179,15 +181,32 @@ class _Tries:
 
 
 @torch.no_grad()
-def _misfit_aside(gaussians: Gaussians, scene: FitScene, rays: Rays, settings: Settings, most: int) -> float:
-    """Mean misfit of the rays held out in so many views at most; 0 if there are none."""
+def _misfit_aside(
+    gaussians: Gaussians, scene: FitScene, rays: Rays, settings: Settings, most: int, uneven: bool
+) -> float:
+    """Mean misfit of the rays held out in so many views at most; 0 if there are none.
+
+    Of ``uneven`` pixels, whose gains are not all taken out, less what those of a pixel have in common: held-out rays
+    have the gains of the others, so rings, which smoothing takes away, would explain them.
+    """
+    common = _common_of_pixels(gaussians, scene, rays, most) if uneven else 0.0
     total = weighed = 0.0
     for views, measured, _, aside in batches_around(rays, most):
-        predicted, _ = scene.projections(gaussians, views)
+        predicted = scene.projections(gaussians, views)[0] - common
         weight = float(aside.sum())
         total += weight * float(misfit(predicted, measured, aside, settings))
         weighed += weight
     return total / weighed if weighed else 0.0
+
+
+def _common_of_pixels(gaussians: Gaussians, scene: FitScene, rays: Rays, most: int) -> torch.Tensor:
+    """(rows, columns) weighted mean of what the held-out rays of each pixel are missed by; 0 where it has none."""
+    sums, weights = (gaussians.attenuation.new_zeros(rays.projections.shape[1:]) for _ in range(2))
+    for views, measured, _, aside in batches_around(rays, most):
+        missed = torch.where(aside > 0, scene.projections(gaussians, views)[0] - measured, 0.0)
+        sums += (aside * missed).sum(dim=0)
+        weights += aside.sum(dim=0)
+    return sums / weights.clamp(min=1e-12)
 
 
 def _why_not(seeds: int, passes: float, problem: Problem, settings: Settings) -> str:

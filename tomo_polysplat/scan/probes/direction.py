@@ -10,7 +10,7 @@ from tomo_polysplat.scan.assumptions import RULED_OUT, compare
 from tomo_polysplat.scan.axis_offset import LARGEST_SHARE, AxisOffset, offset_of, spread
 from tomo_polysplat.scan.opposite_rays import OppositeRays
 
-__all__ = ["MUCH_BETTER", "direction_doubt", "runs_backwards", "turned_round"]
+__all__ = ["MUCH_BETTER", "REMEDY", "direction_doubt", "runs_backwards", "turned_round"]
 
 # Views that are compared, and those that it takes to tell; pairs of any place that a place must have, of the most.
 _VIEWS, _FEWEST_VIEWS, _ENOUGH = 60, 24, 0.2
@@ -19,6 +19,8 @@ _VIEWS, _FEWEST_VIEWS, _ENOUGH = 60, 24, 0.2
 _ALIKE = 0.003
 # The other direction must fit this many times better.
 MUCH_BETTER = 2.0
+# Rays do not tell a wrong direction from mirrored pictures: either makes the other's volume a mirror image.
+REMEDY = "take the angles times -1 (or reverse the views); where pictures are mirrored, mirror their columns instead"
 
 
 def turned_round(rays: OppositeRays) -> OppositeRays:

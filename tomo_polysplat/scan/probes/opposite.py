@@ -14,7 +14,7 @@ from tomo_polysplat.scan.assumptions import RULED_OUT
 from tomo_polysplat.scan.axis_offset import LARGEST_SHARE, AxisOffset, axis_offset, offset_of
 from tomo_polysplat.scan.centre import find_centre
 from tomo_polysplat.scan.opposite_geometry import opposite_rays_of
-from tomo_polysplat.scan.probes.direction import MUCH_BETTER, direction_doubt, turned_round
+from tomo_polysplat.scan.probes.direction import MUCH_BETTER, REMEDY, direction_doubt, turned_round
 from tomo_polysplat.scan.probes.finding import DEFECT, OK, UNKNOWN, Finding
 from tomo_polysplat.scan.probes.measured import Measured
 
@@ -44,7 +44,7 @@ def probe_centre_and_direction(measured: Measured) -> list[Finding]:
     numbers = {"ratio": ratio, "standard errors": abs(doubt)}
     if doubt < -RULED_OUT and ratio > MUCH_BETTER and not turned.doubt:
         text = f"opposite rays agree {ratio:.1f} times better with the angles turned round"
-        turn = Finding(DIRECTION, DEFECT, text, "take the angles times -1 (or reverse the views)", numbers)
+        turn = Finding(DIRECTION, DEFECT, text, REMEDY, numbers)
         return [_centre(turned), turn]
     return [_centre(told), _direction(told, doubt, numbers)]
 
