@@ -2,6 +2,7 @@
 
 import math
 import sys
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -74,6 +75,18 @@ def test_rays_through_dense_matter_do_not_count():
     everything = gaussians.copy()
     everything.attenuation += level
     assert unexplained(everything, scene, rays, level) == 0.0
+
+
+def test_a_single_ray_beside_dense_matter_varies_by_nothing():
+    # torch warns of the variance of one value.
+    gaussians, scene, rays, _ = scan()
+    with torch.no_grad():
+        seen = scene.projections(gaussians, rays.views)[0]
+    alone = torch.where(seen == seen.max(), rays.projections, torch.nan)
+    assert int(torch.isfinite(alone).sum()) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert unexplained(gaussians, scene, replace(rays, projections=alone), DENSE) == 0.0
 
 
 class Bench:

@@ -167,5 +167,5 @@ def unexplained(gaussians: Gaussians, scene: FitScene, rays: Rays, bone_level: f
     if not any(len(values) for values in seen):
         return 0.0
     left = float(torch.cat(squares).median()) / _MEDIAN_SQUARE - float(torch.cat(noise).median())
-    variance = float(torch.cat(seen).var())
+    variance = float(torch.cat(seen).var(correction=0))
     return max(left, 0.0) / variance if math.isfinite(variance) and variance > 0 else 0.0
