@@ -384,7 +384,8 @@ def _result(
             "density": to_host(heights) * plan.reference,
             "u": to_host(gaussians.material()),
         }
-    curves = all_curves(problem, own, plan, about["settings"]["bone_level"])
+    levels = (about["settings"][name] for name in ("bone_level", "metal_level"))
+    curves = all_curves(problem, own, plan, *levels)
     # Of the start, all matter is taken for soft.
     if problem.polychromatic and outcome.start is None:
         counts = about["counts"]

@@ -2,6 +2,7 @@
 
 import math
 import sys
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +17,7 @@ from tomo_polysplat.fit.rays import batches_around
 from tomo_polysplat.fit.stopping import Clock
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.decisions import growth
-from tomo_polysplat.plan.decisions.growth import Growth, unexplained
+from tomo_polysplat.plan.decisions.growth import Growth, shaded, unexplained
 from tomo_polysplat.plan.decisions.tv_factor import TvFactor
 from tomo_polysplat.plan.lab import Untold
 from tomo_polysplat.plan.order import answer_to
@@ -74,6 +75,30 @@ def test_rays_through_dense_matter_do_not_count():
     everything = gaussians.copy()
     everything.attenuation += level
     assert unexplained(everything, scene, rays, level) == 0.0
+
+
+def test_where_most_rays_pass_dense_matter_the_rest_does_not_tell():
+    gaussians, scene, rays, _ = scan()
+    assert shaded(gaussians, scene, rays, DENSE) == 0.0
+    short = dimmer(gaussians)
+    assert answer_to(Growth(), Bench(short, gaussians, curves=3)).value == 4.0
+    # Half of the Gaussians are metal, and lie in the way of nearly all rays.
+    short.attenuation[::2] += DENSE
+    assert shaded(short, scene, rays, DENSE) > 0.75
+    answer = answer_to(Growth(), Bench(short, gaussians, curves=3))
+    assert answer.value == 1.0 and "pass dense matter" in answer.why
+
+
+def test_a_single_ray_beside_dense_matter_varies_by_nothing():
+    # torch warns of the variance of one value.
+    gaussians, scene, rays, _ = scan()
+    with torch.no_grad():
+        seen = scene.projections(gaussians, rays.views)[0]
+    alone = torch.where(seen == seen.max(), rays.projections, torch.nan)
+    assert int(torch.isfinite(alone).sum()) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert unexplained(gaussians, scene, replace(rays, projections=alone), DENSE) == 0.0
 
 
 class Bench:

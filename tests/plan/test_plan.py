@@ -101,11 +101,14 @@ def test_dense_matter_that_only_the_fit_shows_is_told(caplog):
     of = problem(polychromatic=True)
     chosen = plan(of, ball(of, 1))
     basis = np.ones((1, 2, 2, 2), np.float32)
-    assert all_curves(of, basis, chosen, 2.2).shape == (3, 2, 2, 2) and not caplog.records
-    assert not all_curves(of, basis, chosen, 2.2)[1:].any()
-    with caplog.at_level(logging.WARNING):
-        all_curves(of, 3 * basis, chosen, 2.2)
-    assert "bone_level" in caplog.text and "3 soft references" in why(chosen, "dense_matter")
+    caplog.set_level(logging.INFO)
+    assert all_curves(of, basis, chosen, 2.2, 6.0).shape == (3, 2, 2, 2) and not caplog.records
+    assert not all_curves(of, basis, chosen, 2.2, 6.0)[1:].any()
+    # Thin bone is no worse as dense soft matter; metal is.
+    for times, level in ((3, logging.INFO), (7, logging.WARNING)):
+        all_curves(of, times * basis, chosen, 2.2, 6.0)
+        assert caplog.records[-1].levelno == level
+        assert f"{times} soft references" in caplog.text and f"{times} soft" in why(chosen, "dense_matter")
 
 
 def test_an_empty_start_can_be_planned():

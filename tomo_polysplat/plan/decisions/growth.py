@@ -29,7 +29,7 @@ from tomo_polysplat.plan.first_gaussians import room_to_grow
 from tomo_polysplat.plan.lab import Lab, Untold
 from tomo_polysplat.settings import Settings
 
-__all__ = ["Growth", "unexplained"]
+__all__ = ["Growth", "shaded", "unexplained"]
 
 
 logger = logging.getLogger(__name__)
@@ -57,6 +57,10 @@ _LEAST, _ROOM = 1.2, 2.5
 _SEEN = 0.15
 # -log(I/I0) of dense matter from which on a ray does not count.
 _SHADE = 1e-3
+# Where more than this share of the rays do not count, the rest tells of what lies between metal, not of detail: 0.9 in a
+# connector of 36^3 with brass pins and a steel plate (21.5 dB in half the time; grown 20.4). Broccoli of 26^3 with iron
+# comes to 0.54, peppers, teeth and others to 0.2 or less.
+_MOST_SHADED = 0.75
 # Median of the square of a normally distributed number of variance 1.
 _MEDIAN_SQUARE = 0.4549
 
@@ -107,6 +111,8 @@ class Growth(Decision):
         room = room_to_grow(len(tried), plan, lab.problem, lab.device)
         if room < _ROOM:
             raise Untold(f"there is memory for {room:.2g} times as many")
+        if (share := shaded(tried, lab.scene, lab.rays, dense)) > _MOST_SHADED:
+            raise Untold(f"{share:.0%} of the rays through soft matter pass dense matter: the rest tells of no detail")
         left = unexplained(tried, lab.scene, lab.rays, dense)
         usual = (_BESIDE_DENSE if known[Curves] > 1 else _UNEXPLAINED) / math.sqrt(max(len(tried), 1))
         why = f"a short fit leaves {left:.2%} of what the rays vary by unexplained, plain surfaces up to {usual:.2%}"
@@ -141,6 +147,22 @@ def most_times(seeds: int, settings: Settings) -> float:
 
 
 @torch.no_grad()
+def shaded(gaussians: Gaussians, scene: FitScene, rays: Rays, bone_level: float) -> float:
+    """Share of the rays through lighter matter that pass what is denser than ``bone_level``, too."""
+    light = gaussians.attenuation <= bone_level
+    if bool(light.all()) or not bool(light.any()):
+        return 0.0
+    lighter, dense = (gaussians.select(which.nonzero()[:, 0]) for which in (light, ~light))
+    through = behind = 0
+    for views, _, weight, _ in batches_around(rays):
+        soft = scene.projections(lighter, views)[0]
+        of_object = (weight > 0) & (soft > _SEEN * soft.max())
+        through += int(of_object.sum())
+        behind += int((of_object & (scene.projections(dense, views)[0] >= _SHADE)).sum())
+    return behind / max(through, 1)
+
+
+@torch.no_grad()
 def unexplained(gaussians: Gaussians, scene: FitScene, rays: Rays, bone_level: float) -> float:
     """Mean square of what Gaussians leave of the rays through the object, less its noise, over the rays' variance.
 
@@ -166,5 +188,5 @@ def unexplained(gaussians: Gaussians, scene: FitScene, rays: Rays, bone_level: f
     if not any(len(values) for values in seen):
         return 0.0
     left = float(torch.cat(squares).median()) / _MEDIAN_SQUARE - float(torch.cat(noise).median())
-    variance = float(torch.cat(seen).var())
+    variance = float(torch.cat(seen).var(correction=0))
     return max(left, 0.0) / variance if math.isfinite(variance) and variance > 0 else 0.0
