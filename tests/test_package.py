@@ -5,6 +5,7 @@ import graphlib
 import importlib
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -74,17 +75,26 @@ def part_of(path, folder, prefix):
     return "plugins" if prefix else path.relative_to(folder).with_suffix("").parts[0]
 
 
-def imported_parts(path):
-    """Parts of the package that a file imports anywhere in it, for type checking as well."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+@cache
+def read(path):
+    """What a file imports anywhere in it, for type checking as well, as (module or None, names); its long functions."""
+    source = path.read_text(encoding="utf-8")
+    nodes, imported = [*ast.walk(ast.parse(source))], []
+    for node in nodes:
         if isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative imports hide where they lead"
-            names = [f"{node.module}.{alias.name}" for alias in node.names]
+            imported.append((node.module, [alias.name for alias in node.names]))
         elif isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        else:
-            continue
-        yield from (name.split(".")[1] for name in names if name.startswith("tomo_polysplat."))
+            imported.append((None, [alias.name for alias in node.names]))
+    functions = [node for node in nodes if isinstance(node, ast.FunctionDef)]
+    return imported, [*long_functions(functions, source.splitlines())]
+
+
+def imported_parts(path):
+    """Parts of the package that a file imports."""
+    for module, names in read(path)[0]:
+        whole = names if module is None else [f"{module}.{name}" for name in names]
+        yield from (name.split(".")[1] for name in whole if name.startswith("tomo_polysplat."))
 
 
 def test_importing_is_quick_and_light():
@@ -119,13 +129,10 @@ def test_imports_go_one_way():
 
 
 def imported_modules(path, known):
-    """Modules of the package that a file imports anywhere, for type checking as well."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.ImportFrom):
-            whole = [f"{node.module}.{alias.name}" for alias in node.names]
-            yield from (name if name in known else node.module for name in whole)
-        elif isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+    """Modules of the package that a file imports."""
+    for module, names in read(path)[0]:
+        whole = names if module is None else [f"{module}.{name}" for name in names]
+        yield from (name if module is None or name in known else module for name in whole)
 
 
 def module_of(path):
@@ -207,13 +214,9 @@ def test_constraints_cover_every_dependency():
     assert len(wanted) > 8 and wanted <= pinned
 
 
-def long_functions(path):
+def long_functions(functions, lines):
     """Functions of more than 40 lines, 6 parameters or 3 closures, and whether a comment above says why."""
-    source = path.read_text(encoding="utf-8")
-    lines = source.splitlines()
-    for node in ast.walk(ast.parse(source)):
-        if not isinstance(node, ast.FunctionDef):
-            continue
+    for node in functions:
         body = node.body[1:] if ast.get_docstring(node) else node.body
         length = node.end_lineno - body[0].lineno + 1 if body else 0
         names = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
@@ -226,4 +229,4 @@ def long_functions(path):
 def test_a_long_function_says_why():
     """But for the kernels, whose compilers take arrays and numbers and no objects that hold them."""
     files = [path for part, path in sources() if part != "kernels"]
-    assert [f"{path.name}: {name}" for path in files for name, why in long_functions(path) if not why] == []
+    assert [f"{path.name}: {name}" for path in files for name, why in read(path)[1] if not why] == []
