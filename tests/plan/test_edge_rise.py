@@ -1,6 +1,7 @@
 """How sharp edges are, of steps and blobs in closed form."""
 
 import math
+import sys
 
 import pytest
 import torch
@@ -36,3 +37,13 @@ def test_noise_does_not_make_a_smooth_object_look_sharp():
     noise = torch.randn(blob.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     for deviation in (0.0, 0.1, 0.3, 1.0):
         assert edge_rise(blob + deviation * noise) < 1 / 3
+
+
+def test_planes_tell_the_same_one_by_one(monkeypatch):
+    """Of each its own noise decides what is an edge."""
+    volume = 2 * step(0.6).float()
+    noise = torch.randn(volume.shape, generator=torch.Generator().manual_seed(0))
+    volume += 0.03 * torch.arange(len(volume))[:, None, None] * noise
+    together = edge_rise(volume)
+    monkeypatch.setattr(sys.modules[edge_rise.__module__], "_AT_ONCE", 1)
+    assert edge_rise(volume) == together > 0

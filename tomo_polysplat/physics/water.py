@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -90,6 +91,13 @@ def _path_of(
     spectrum: Spectrum, largest: float, material: MaterialLike
 ) -> tuple[Callable[[Any], np.ndarray], float]:
     """The areal density by P, from 0 to ``largest``, and dP by areal density at 0."""
+    # A run asks twice for that of its typical ray, and every run of one scan for the same two.
+    return (_known_path if isinstance(material, str) else _new_path)(spectrum, largest, material)
+
+
+def _new_path(
+    spectrum: Spectrum, largest: float, material: MaterialLike
+) -> tuple[Callable[[Any], np.ndarray], float]:
     # Not needed where there is no spectrum.
     from scipy.interpolate import CubicHermiteSpline
 
@@ -102,6 +110,9 @@ def _path_of(
     value[0] = 0.0
     rise = curve[0] @ share
     return CubicHermiteSpline(value, paths, 1 / rise), float(rise[0])
+
+
+_known_path = lru_cache(maxsize=8)(_new_path)
 
 
 def _curve(spectrum: Spectrum, material: MaterialLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -22,6 +22,7 @@ _LOWEST, _OVER_NOISE = 0.5, 20.0
 _MATTER = 0.3
 # Fewer edges do not tell. Planes that are looked at, evenly spread.
 _FEWEST, _PLANES = 50, 24
+_AT_ONCE = 1 << 18
 # Edges that lie across the axes look less steep than they are: those of the steepest quarter lie along them.
 _STEEPEST = 0.75
 
@@ -43,26 +44,29 @@ def edge_rise(relative: torch.Tensor) -> float:
         0 where there are too few edges.
     """
     planes = evenly_spread(len(relative), _PLANES)
+    # Planes that are looked at together, as far as they are small.
+    together = max(1, _AT_ONCE // max(relative[0].numel(), 1))
+    groups = [planes[k : k + together].tolist() for k in range(0, len(planes), together)]
     # Noise would look like edges of its own: three planes and three lines together have a third of it.
-    rises = [
-        _rises(relative[max(z - 1, 0) : z + 2].float().mean(dim=0).movedim(axis, 0))
-        for z in planes.tolist()
-        for axis in (0, 1)
-    ]
+    means = (
+        torch.stack([relative[max(z - 1, 0) : z + 2].float().mean(dim=0) for z in group]) for group in groups
+    )
+    rises = [_rises(some.movedim(axis, 1)) for some in means for axis in (1, 2)]
     found: Any = torch.cat(rises).cpu().numpy()
     return float(np.quantile(found, _STEEPEST)) if len(found) >= _FEWEST else 0.0
 
 
-def _rises(plane: torch.Tensor) -> torch.Tensor:
-    """Of a plane (along, across): of each edge that is met along the first axis."""
-    if plane.shape[0] < 2 * _REACH or plane.shape[1] < 3:
-        return plane.new_zeros(0)
-    lines = plane.unfold(1, 3, 1).mean(dim=2)
-    around = lines.unfold(0, 2 * _REACH, 1)
-    height = around.amax(dim=2) - around.amin(dim=2)
-    steps = lines.diff(dim=0).abs().unfold(0, 2 * _REACH - 1, 1)
+def _rises(planes: torch.Tensor) -> torch.Tensor:
+    """Of planes (planes, along, across): of each edge that is met along the second axis."""
+    if planes.shape[1] < 2 * _REACH or planes.shape[2] < 3:
+        return planes.new_zeros(0)
+    lines = planes.unfold(2, 3, 1).mean(dim=3)
+    around = lines.unfold(1, 2 * _REACH, 1)
+    height = around.amax(dim=3) - around.amin(dim=3)
+    steps = lines.diff(dim=1).abs().unfold(1, 2 * _REACH - 1, 1)
     middle = steps[..., _REACH - 1]
-    edges = (height > max(_LOWEST, _OVER_NOISE * _noise(lines))) & (middle == steps.amax(dim=2))
+    least = [max(_LOWEST, _OVER_NOISE * _noise(plane)) for plane in lines]
+    edges = (height > height.new_tensor(least)[:, None, None]) & (middle == steps.amax(dim=3))
     return middle[edges] / height[edges]
 
 

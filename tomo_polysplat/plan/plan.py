@@ -167,7 +167,8 @@ class Plan:
 
     def with_agent(self, settings: Settings) -> Settings:
         """The settings with what the search for a contrast agent has changed: what is dense is the agent."""
-        return replace(settings, **self.value("agent", {}))
+        changes = self.value("agent", {})
+        return replace(settings, **changes) if changes else settings
 
     def adapted(self, settings: Settings) -> Settings:
         """The settings for this object: levels, material numbers, and how much is smoothed."""
