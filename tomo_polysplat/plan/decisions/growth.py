@@ -57,9 +57,9 @@ _LEAST, _ROOM = 1.2, 2.5
 _SEEN = 0.15
 # -log(I/I0) of dense matter from which on a ray does not count.
 _SHADE = 1e-3
-# Where more than this share of the rays do not count, the rest tells of what lies between metal, not of detail: 0.9 in a
-# connector of 36^3 with brass pins and a steel plate (21.5 dB in half the time; grown 20.4). Broccoli of 26^3 with iron
-# comes to 0.54, peppers, teeth and others to 0.2 or less.
+# Where more than this share of the rays do not count, the rest tells of what lies between metal, not of detail: in a
+# connector of 36^3 with brass pins 0.9 (21.5 dB in half the time; grown 20.4). Broccoli of 26^3 with iron comes to
+# 0.54, peppers, teeth and others to 0.2 or less.
 _MOST_SHADED = 0.75
 # Median of the square of a normally distributed number of variance 1.
 _MEDIAN_SQUARE = 0.4549
@@ -112,7 +112,9 @@ class Growth(Decision):
         if room < _ROOM:
             raise Untold(f"there is memory for {room:.2g} times as many")
         if (share := shaded(tried, lab.scene, lab.rays, dense)) > _MOST_SHADED:
-            raise Untold(f"{share:.0%} of the rays through soft matter pass dense matter: the rest tells of no detail")
+            raise Untold(
+                f"{share:.0%} of the rays through soft matter pass dense matter: the rest tells of no detail"
+            )
         left = unexplained(tried, lab.scene, lab.rays, dense)
         usual = (_BESIDE_DENSE if known[Curves] > 1 else _UNEXPLAINED) / math.sqrt(max(len(tried), 1))
         why = f"a short fit leaves {left:.2%} of what the rays vary by unexplained, plain surfaces up to {usual:.2%}"
