@@ -47,6 +47,10 @@ def test_normal_noise_of_any_depth_is_not_taken_for_that_of_counts(peak):
     np.testing.assert_allclose(found.variance(depth), deviation**2, rtol=0.3)
 
 
+def test_a_single_view_tells_its_noise():
+    assert photons_per_ray(poisson(disc(1.5, views=1, rows=61), 1e4)) == pytest.approx(1e4, rel=0.3)
+
+
 def test_unusable_rays_do_not_matter():
     scan = poisson(disc(1.0), 1e4)
     scan[np.random.default_rng(1).random(scan.shape) < 0.1] = np.nan

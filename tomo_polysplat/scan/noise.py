@@ -108,9 +108,12 @@ def ray_noise(
     if dimmed is not None:
         whole = torch.exp(-0.5 * torch.as_tensor(dimmed)[::rows, 2:-2].to(difference))
     plain, own = (_scatter((kept * whole).abs(), middle) for kept in (difference, _of_views(difference)))
-    if plain is None or own is None:
+    if plain is None:
         return RayNoise()
-    found = own if own.of_counts < (1 - _CLEARLY * plain.error) * plain.of_counts else plain
+    found = plain
+    # Of a single view less its mean nothing is left.
+    if own is not None and own.of_counts < (1 - _CLEARLY * plain.error) * plain.of_counts:
+        found = own
     if not 0 < found.of_counts < math.inf:
         return RayNoise()
     # By how much closer one of the two lies beneath all bins, in the mean of the logarithms.
