@@ -2,9 +2,9 @@
 
 import os
 import signal
+import subprocess
 import sys
 import time
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,8 +12,6 @@ import astra
 import numpy as np
 import pytest
 import torch
-from campaign.forks import child
-from forked_ranks import forked_followers, torchrun
 from shared_out import (
     ROUGH,
     SMOOTHED,
@@ -80,9 +78,7 @@ def tilted():
 @pytest.fixture(scope="class")
 def three():
     """Three processes that share out what is fitted while they live; they are started once."""
-    with ExitStack() as stack:
-        with forked_followers():
-            stack.enter_context(sharing([CPU] * 3))
+    with sharing([CPU] * 3):
         yield current_ranks()
 
 
@@ -278,16 +274,23 @@ def test_what_a_process_fails_of_is_told(monkeypatch):
     assert not children()
 
 
-def test_torchrun_reconstructs_by_the_command_line(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    save_scan(fan(metal=False), "scan.npz")
+def test_torchrun_reconstructs_by_the_command_line(tmp_path):
+    save_scan(fan(metal=False), tmp_path / "scan.npz")
     about = [arg for name, value in ROUGH.items() for arg in ("--set", f"{name}={value}")]
-    command = ["recon", "scan.npz", "-o", "volume.npy", "--json", "about.json", *about, "--device", "cpu"]
-    done = child(lambda: torchrun(command, tmp_path / "logs"))
-    told = "".join(path.read_text() for path in sorted((tmp_path / "logs").rglob("std*.log")))
-    assert done == 0, told
-    assert told.count("wrote volume.npy") == 1 and '"ranks"' in Path("about.json").read_text()
-    assert same(np.load("volume.npy"), reconstruct(fan(metal=False), settings=ROUGH).volume)
+    command = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--nproc-per-node=2",
+        "-m",
+        "tomo_polysplat",
+        "recon",
+    ]
+    command += ["scan.npz", "-o", "volume.npy", "--json", "about.json", *about, "--device", "cpu"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("wrote volume.npy") == 1 and '"ranks"' in (tmp_path / "about.json").read_text()
+    assert same(np.load(tmp_path / "volume.npy"), reconstruct(fan(metal=False), settings=ROUGH).volume)
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
