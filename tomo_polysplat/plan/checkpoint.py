@@ -97,6 +97,8 @@ class Checkpoint:
             # There have to be copies to take it out of.
             problem.measured(device)
             problem.taken.add(*self._taken[0])
+            # As the run did, which had been told of the noise before.
+            problem.forget_told()
 
     def share_taken(self, problem: Problem) -> None:
         """Take out of what was measured what the run had taken out, and keep what it will, from now on."""
