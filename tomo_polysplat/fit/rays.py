@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.kernels.views import DetectorViews
-from tomo_polysplat.scan.noise import RayNoise
+from tomo_polysplat.scan.noise import RayNoise, Values
 
 __all__ = ["Rays", "batches_around", "views_around"]
 
@@ -65,7 +65,7 @@ class Rays:
         allowed = self.photons * self.model_error**2
         return 1 / allowed if allowed else float("inf")
 
-    def variance(self, depth: torch.Tensor) -> torch.Tensor:
+    def variance(self, depth: Values) -> Values:
         """Of the noise of rays with this -log(I/I0)."""
         return RayNoise(self.photons, self.deviation).variance(depth)
 

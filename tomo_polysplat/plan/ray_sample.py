@@ -13,7 +13,6 @@ from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.physics.ray_estimates import FittedRays
 from tomo_polysplat.physics.scatter import Scatter, light_around
 from tomo_polysplat.render.renderer import project_gaussians
-from tomo_polysplat.scan.noise import RayNoise
 
 __all__ = ["RaySample", "sample_rays"]
 
@@ -94,5 +93,5 @@ def sample_rays(gaussians: Gaussians, scene: FitScene, rays: Rays, seed: int, mo
         flat += [values.reshape(-1)[chosen] for values in (measured, weight, light)]
         parts.append([tensor.double().cpu().numpy() for tensor in (*flat, view)])
     whole = [np.concatenate(part, axis=-1) for part in zip(*parts)]
-    deviation = np.sqrt(RayNoise(rays.photons, rays.deviation).variance(whole[1]))
+    deviation = np.sqrt(rays.variance(whole[1]))
     return RaySample(whole[0], whole[1], whole[2], whole[3], whole[4], deviation)

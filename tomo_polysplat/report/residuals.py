@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.checks import fail
+from tomo_polysplat.evenly_spread import evenly_spread
 from tomo_polysplat.kernels.project.autograd import project
 from tomo_polysplat.kernels.select import choose, pick_fast_device
 from tomo_polysplat.kernels.views import DetectorViews
@@ -74,8 +75,7 @@ def residuals_of(
         raise fail("scan", wanted, got)
     spectrum = result.spectrum if result.materials is not None else None
     geometry, grid = from_astra(scan.proj_geom, scan.vol_geom)
-    count = min(most_views, geometry.views)
-    chosen = np.unique(np.linspace(0, geometry.views - 1, count).round().astype(int))
+    chosen = evenly_spread(geometry.views, most_views)
     values = _OfViews(result, scan, np.union1d(chosen, HeldOut.views_told_by_values(geometry, grid)))
     # Where the scanner stood, if the fit has moved it.
     seen = geometry if result.geometry is None else from_astra(result.geometry, scan.vol_geom)[0]

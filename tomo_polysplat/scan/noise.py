@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 import torch
 
-__all__ = ["RayNoise", "photons_per_ray", "ray_noise"]
+__all__ = ["RayNoise", "Values", "photons_per_ray", "ray_noise"]
 
 Values = TypeVar("Values", np.ndarray, torch.Tensor)
 

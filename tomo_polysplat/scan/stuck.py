@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from tomo_polysplat.evenly_spread import evenly_spread
 from tomo_polysplat.scan.axis_offset import LARGEST_SHARE
 
 __all__ = ["stuck_pixels"]
@@ -47,7 +48,7 @@ def stuck_pixels(values: np.ndarray, axis: float | None = None) -> np.ndarray:
         return stuck
     # A few views leave few pixels to look at in all of them.
     pairs = min(views // 2, max(3, -(-_TELLING // (rows * columns))))
-    before = np.linspace(0, views - 2, pairs).round().astype(int)
+    before = evenly_spread(views - 1, pairs)
     some = values[np.stack([before, before + 1], 1).reshape(-1)]
     first = np.fmax.reduce(some, axis=0)
     same = np.isfinite(first) & (np.isnan(some) | (some == first)).all(axis=0)
