@@ -120,8 +120,6 @@ class Settings:
     logarithm, so that edges and texture stay; with 1000 all count in full."""
     tv_every: int | None = None
     """Every how many steps the total variation is taken. It is then multiplied by that number."""
-    tv_clip: float = 5.0
-    """Attenuation above this many soft references does not count as variation: that would erode metal."""
 
     # Materials.
     curves: int | None = None

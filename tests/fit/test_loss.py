@@ -95,14 +95,14 @@ def test_the_misfit_of_each_view_is_that_of_its_rays_alone(loss):
 def test_total_variation_of_a_ramp_is_its_slopes():
     z, y, x = np.meshgrid(np.arange(5), np.arange(7), np.arange(4), indexing="ij")
     volume = torch.as_tensor(0.5 * z - 0.25 * y + 2.0 * x)
-    assert float(total_variation(volume, 100.0)) == pytest.approx(0.5 + 0.25 + 2.0)
+    assert float(total_variation(volume)) == pytest.approx(0.5 + 0.25 + 2.0)
 
 
 def test_total_variation_of_a_cube_is_its_surface():
     """Faces of (side)^2 over the number of neighbours along each axis: the mean, summed over the axes."""
     volume = torch.zeros((9, 9, 9), dtype=torch.float64)
     volume[3:6, 3:6, 3:6] = 0.7
-    assert float(total_variation(volume, 10.0)) == pytest.approx(3 * 0.7 * 2 * 9 / (8 * 9 * 9))
+    assert float(total_variation(volume)) == pytest.approx(3 * 0.7 * 2 * 9 / (8 * 9 * 9))
 
 
 @pytest.mark.parametrize("corners", [(0.0, 0.0), (0.2, 0.05), (0.29, 0.05)])
@@ -111,8 +111,8 @@ def test_the_slope_of_a_slab_is_that_of_the_whole_but_where_it_ends(depth, first
     generator = torch.Generator().manual_seed(1)
     volume = torch.rand((depth, 4, 5), generator=generator, dtype=torch.float64)
     whole, slab = volume.clone().requires_grad_(), volume[first:last].clone().requires_grad_()
-    total_variation(whole, 0.9, corners, 0.6).backward()
-    variation_of_slab(slab, depth, 0.9, corners, 0.6).backward()
+    total_variation(whole, corners, 0.6).backward()
+    variation_of_slab(slab, depth, corners, 0.6).backward()
     beside = HALO if any(corners) else 1
     inner = slice(first + beside * (first > 0), last - beside * (last < depth))
     told = slab.grad[inner.start - first : inner.stop - first]
@@ -123,14 +123,14 @@ def test_the_slope_of_a_slab_is_that_of_the_whole_but_where_it_ends(depth, first
 def test_total_variation_of_one_slice_leaves_the_missing_axis_out():
     volume = torch.rand((1, 6, 8), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     stacked = volume.repeat(3, 1, 1)
-    assert float(total_variation(volume, 10.0)) == pytest.approx(float(total_variation(stacked, 10.0)))
-    assert float(total_variation(torch.full((1, 1, 1), 3.0), 10.0)) == 0
+    assert float(total_variation(volume)) == pytest.approx(float(total_variation(stacked)))
+    assert float(total_variation(torch.full((1, 1, 1), 3.0))) == 0
 
 
 def test_with_a_corner_noise_beside_an_edge_counts_in_full_and_the_edge_by_its_logarithm():
     edge = torch.tensor([1e-3, 0.0, 0.7], dtype=torch.float64)[None, None]
-    assert float(total_variation(edge, 10.0)) == pytest.approx((1e-3 + 0.7) / 2)
-    found = float(total_variation(edge, 10.0, (0.1, 0.1)))
+    assert float(total_variation(edge)) == pytest.approx((1e-3 + 0.7) / 2)
+    found = float(total_variation(edge, (0.1, 0.1)))
     assert found == pytest.approx((1e-3 + 0.1 * math.log(8.0)) / 2, rel=1e-4)
 
 
@@ -147,7 +147,7 @@ def test_faint_differences_count_squared_unless_an_edge_is_within_three_voxels(w
     )
     for some, values in ((faint, column), (0, column.transpose(0, 2))):
         expected = (some * squared + (2 - some) * full + edge) / 12
-        assert float(total_variation(values, 10.0, (corner, corner))) == pytest.approx(expected, rel=1e-12)
+        assert float(total_variation(values, (corner, corner))) == pytest.approx(expected, rel=1e-12)
 
 
 def test_nothing_dense_is_faint_nor_what_is_beside_it():
@@ -162,7 +162,7 @@ def test_the_pull_on_an_edge_falls_with_its_height():
     pulls = []
     for height in (1e-9, 0.1, 0.9):
         row = torch.tensor([0.0, height, 9.0], dtype=torch.float64)[None, None].requires_grad_()
-        total_variation(row, 10.0, (0.1, 0.1)).backward()
+        total_variation(row, (0.1, 0.1)).backward()
         pulls.append(-2 * float(row.grad[0, 0, 0]))
     assert pulls == pytest.approx([1.0, 0.5, 0.1])
 
@@ -173,15 +173,16 @@ def test_the_slope_of_the_total_variation_is_that_of_its_values(depth, corners):
     """By finite differences, in faint matter, at its edges and at dense matter."""
     volume = 0.3 * torch.rand((depth, 4, 9), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     volume[..., 6:] += 0.7
-    value = lambda v: total_variation(v, 0.95, corners, 0.6)  # noqa: E731
+    value = lambda v: total_variation(v, corners, 0.6)  # noqa: E731
     assert torch.autograd.gradcheck(value, volume.requires_grad_(), eps=1e-7, atol=1e-6)
 
 
-def test_brightness_above_the_ceiling_is_free():
+def test_metal_pays_for_its_mottles_and_by_the_logarithm_for_its_brightness():
     volume = torch.zeros((1, 8, 8), dtype=torch.float64)
-    volume[0, 2:5, 2:5] = 3.0
-    brighter = volume * 100
-    assert float(total_variation(brighter, 2.5)) == pytest.approx(float(total_variation(volume, 2.5)))
-    assert float(total_variation(volume, math.inf)) == pytest.approx(
-        float(total_variation(volume, 2.5)) * 3.0 / 2.5
-    )
+    volume[0, 1:7, 1:7] = 10.0
+    mottled = volume.clone()
+    mottled[0, 2:6:2, 2:6:2] += 3.0
+    smooth, brighter, uneven = (float(total_variation(v, (0.1, 0.1))) for v in (volume, 10 * volume, mottled))
+    # 24 of the 56 differences along each axis are at the surface, and 16 of both axes beside the mottles.
+    assert brighter - smooth == pytest.approx(0.1 * math.log(1001 / 101) * 24 / 56)
+    assert uneven - smooth == pytest.approx(0.1 * math.log(31) * 16 / 56)

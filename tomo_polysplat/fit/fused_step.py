@@ -362,7 +362,6 @@ class FusedStep:
         chosen, planes = self.settings, self.scene.box.shape[0]
         return variation_gradient(
             volume,
-            chosen.tv_clip,
             self.scene.tv_corners,
             chosen.bone_level,
             smooth,

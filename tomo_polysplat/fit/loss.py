@@ -81,7 +81,7 @@ def roughness(
     gaussians: Gaussians, scene: FitScene, settings: Settings, part: Part | None = None
 ) -> torch.Tensor:
     """Total variation of the volume; with a rank's ``part`` of the fit, that of its planes in the sum over ranks."""
-    chosen = settings.tv_clip, scene.tv_corners, settings.bone_level
+    chosen = scene.tv_corners, settings.bone_level
     if part is None:
         return total_variation(scene.attenuation(gaussians, scene.box), *chosen)
     volume = part.volume_of_all(scene.attenuation(gaussians, part.box(scene.box)))
@@ -90,7 +90,6 @@ def roughness(
 
 def total_variation(
     volume: torch.Tensor,
-    ceiling: float,
     corners: tuple[float, float] = (0.0, 0.0),
     dense: float = math.inf,
 ) -> torch.Tensor:
@@ -108,20 +107,17 @@ def total_variation(
     ----------
     volume : (nz, ny, nx) tensor
         Axes of length one contribute nothing.
-    ceiling : float
-        Values above it count as it: a piece of metal should not pay for its brightness, only for its surface.
     corners : pair of float
         Of matter up to ``dense``, and where one of two neighbours is above it; both 0 for the total variation itself.
     dense : float
-        Below ``ceiling``, for the second corner to matter.
+        In the unit of the volume.
     """
-    return variation_of_slab(volume, len(volume), ceiling, corners, dense)
+    return variation_of_slab(volume, len(volume), corners, dense)
 
 
 def variation_of_slab(
     slab: torch.Tensor,
     planes: int,
-    ceiling: float,
     corners: tuple[float, float] = (0.0, 0.0),
     dense: float = math.inf,
 ) -> torch.Tensor:
@@ -129,21 +125,19 @@ def variation_of_slab(
 
     Its slope is that of the whole, except within ``faint.HALO`` planes of where the slab ends and the volume does not.
     """
-    clipped, whole = slab.clamp(max=ceiling), (planes, *slab.shape[1:])
-    away = _away(clipped, planes, corners, dense)
+    whole = (planes, *slab.shape[1:])
+    away = _away(slab, planes, corners, dense)
     total = slab.new_zeros(())
     for axis, length in enumerate(whole):
         if length > 1:
-            heights = _Heights.apply(clipped, away, axis, corners, dense)
+            heights = _Heights.apply(slab, away, axis, corners, dense)
             total = total + heights / (math.prod(whole) // length * (length - 1))
     return total
 
 
-def _away(
-    clipped: torch.Tensor, planes: int, corners: tuple[float, float], dense: float
-) -> torch.Tensor | None:
+def _away(slab: torch.Tensor, planes: int, corners: tuple[float, float], dense: float) -> torch.Tensor | None:
     """`away_from_edges` of a volume of several planes. In a slice, of few rays a voxel, streaks are faint, too."""
-    return away_from_edges(clipped, corners[0], dense) if any(corners) and planes > 1 else None
+    return away_from_edges(slab, corners[0], dense) if any(corners) and planes > 1 else None
 
 
 @torch.no_grad()
@@ -188,24 +182,24 @@ class _Heights(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        clipped: torch.Tensor,
+        slab: torch.Tensor,
         away: torch.Tensor | None,
         axis: int,
         corners: tuple[float, float],
         dense: float,
     ) -> torch.Tensor:
-        step = clipped.diff(dim=axis)
+        step = slab.diff(dim=axis)
         height, ctx.axis = step.abs(), axis
         slope = step.sign_()
         if any(corners):
-            length = clipped.shape[axis] - 1
+            length = slab.shape[axis] - 1
             if away is not None and (width := FAINT * corners[0]):
                 # Huber's function of d is d - width / 2 (1 - missing^2), and its slope 1 - missing.
                 both = (away.narrow(axis, 0, length) & away.narrow(axis, 1, length)).to(height.dtype)
                 missing = (height * (-1 / width)).add_(1).clamp_(min=0).mul_(both)
                 height += missing.square().sub_(both).mul_(0.5 * width)
                 slope *= missing.neg_().add_(1)
-            corner = _corner(clipped, axis, corners, dense)
+            corner = _corner(slab, axis, corners, dense)
             height /= corner
             slope /= height + 1
             height = height.log1p_().mul_(corner)
@@ -225,11 +219,11 @@ class _Heights(torch.autograd.Function):
 
 
 def _corner(
-    clipped: torch.Tensor, axis: int, corners: tuple[float, float], dense: float
+    slab: torch.Tensor, axis: int, corners: tuple[float, float], dense: float
 ) -> torch.Tensor | float:
     """The corner of each difference along an axis."""
     if corners[0] == corners[1]:
         return corners[0]
-    length = clipped.shape[axis] - 1
-    either = torch.maximum(clipped.narrow(axis, 0, length), clipped.narrow(axis, 1, length)) > dense
-    return torch.where(either, clipped.new_tensor(corners[1]), clipped.new_tensor(corners[0]))
+    length = slab.shape[axis] - 1
+    either = torch.maximum(slab.narrow(axis, 0, length), slab.narrow(axis, 1, length)) > dense
+    return torch.where(either, slab.new_tensor(corners[1]), slab.new_tensor(corners[0]))

@@ -179,7 +179,7 @@ def _varied(
     # Means over cells of half a step suppress noise; the middles of such cells are half a step apart.
     half = np.ones(3, int)
     half[3 - dims :] = np.maximum(np.round(0.5 * step / grid.voxel_size[:dims]).astype(int), 1)[::-1]
-    mean = box_mean(start.clamp(0.0, settings.tv_clip), half)
+    mean = box_mean(start.clamp(0.0, settings.metal_level), half)
     reach = [int(n) if size > 1 else 0 for n, size in zip(half, start.shape)]
     voxels = voxel_of(points, grid)
     highest, lowest = (largest_around(side, reach)[voxels] for side in (mean, -mean))

@@ -37,7 +37,7 @@ def edge_shapes(
     Parameters
     ----------
     start : (nz, ny, nx) tensor
-        In soft references; values above ``tv_clip`` count as ``tv_clip``.
+        In soft references; values above ``metal_level`` count as ``metal_level``.
     points : (n, 3) tensor
         The seeds, in the grid's unit.
     size : (n,) tensor
@@ -68,7 +68,7 @@ def edge_shapes(
     # Seeds at metal are fine enough, and beside metal the start is too uncertain to follow its edges.
     beside = reaches(start, points, grid, settings.metal_level, float(grid.voxel_size[:dims].min()))
     size = size.masked_fill(beside, 0.0)
-    slope = _slope(start.clamp(0.0, settings.tv_clip), points, grid, dims)
+    slope = _slope(start.clamp(0.0, settings.metal_level), points, grid, dims)
     steepness = slope.norm(dim=1)
     direction = slope / steepness.clamp(min=torch.finfo(slope.dtype).tiny)[:, None]
     # The sign of an axis is free. This one avoids rotations by half a turn, whose own axis is not defined.

@@ -193,9 +193,7 @@ class _Fit:
         areal = project_voxels(weights, self.pair, views) * self.cm
         predicted = polychromatic_projection(areal, self.quadrature)
         fitted = misfit(predicted, measured, weight, self.settings)
-        rough = total_variation(
-            self._output(weights), self.settings.tv_clip, self.corners, self.settings.bone_level
-        )
+        rough = total_variation(self._output(weights), self.corners, self.settings.bone_level)
         self.adam.forget_gradients()
         (fitted + self.settings.tv_weight * rough).backward()
         self.adam.step({"attenuation": RATE_ATTENUATION * falling, "material": RATE_MATERIAL * falling})

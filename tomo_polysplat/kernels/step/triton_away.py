@@ -15,20 +15,20 @@ _BLOCK = 256
 
 
 @triton.jit(do_not_specialize=SIZES)
-def _across_kernel(volume, most, least, nz, ny, nx, ceiling, BESIDE: tl.constexpr, BLOCK: tl.constexpr):
+def _across_kernel(volume, most, least, nz, ny, nx, BESIDE: tl.constexpr, BLOCK: tl.constexpr):
     """Largest and least value up to BESIDE voxels along x and y from each voxel."""
     at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = at < tl.cast(nz, tl.int64) * ny * nx
     line = at // nx
     x, y = at - line * nx, line % ny
-    high = tl.minimum(tl.load(volume + at, mask=live, other=0.0), ceiling)
+    high = tl.load(volume + at, mask=live, other=0.0)
     low = high
     for v in tl.static_range(0, 2 * BESIDE + 1):
         # A neighbour outside is the one at the end once more, which changes no extreme.
         start = at - x + (tl.minimum(tl.maximum(y + v - BESIDE, 0), ny - 1) - y) * nx
         for u in tl.static_range(0, 2 * BESIDE + 1):
             beside = start + tl.minimum(tl.maximum(x + u - BESIDE, 0), nx - 1)
-            value = tl.minimum(tl.load(volume + beside, mask=live, other=0.0), ceiling)
+            value = tl.load(volume + beside, mask=live, other=0.0)
             high, low = tl.maximum(high, value), tl.minimum(low, value)
     tl.store(most + at, high, mask=live)
     tl.store(least + at, low, mask=live)
@@ -49,13 +49,13 @@ def _away_kernel(most, least, away, nz, ny, nx, edge, dense, BESIDE: tl.constexp
     tl.store(away + at, ((high - low < edge) & (high <= dense)).to(tl.int8), mask=live)
 
 
-def away_from_edges(volume: torch.Tensor, ceiling: float, corner: float, dense: float) -> torch.Tensor:
-    """``fit.loss.away_from_edges`` of a volume (1, nz, ny, nx) clipped at ``ceiling``, as int8."""
+def away_from_edges(volume: torch.Tensor, corner: float, dense: float) -> torch.Tensor:
+    """``fit.loss.away_from_edges`` of a volume (1, nz, ny, nx), as int8."""
     shape, (most, least) = volume.shape[1:], (torch.empty_like(volume) for _ in range(2))
     away = torch.empty_like(volume, dtype=torch.int8)
     blocks = (triton.cdiv(volume.numel(), _BLOCK),)
     with on_device(volume):
-        _across_kernel[blocks](volume, most, least, *shape, ceiling, BESIDE=BESIDE, BLOCK=_BLOCK, num_warps=4)
+        _across_kernel[blocks](volume, most, least, *shape, BESIDE=BESIDE, BLOCK=_BLOCK, num_warps=4)
         _away_kernel[blocks](
             most, least, away, *shape, EDGE * corner, dense, BESIDE=BESIDE, BLOCK=_BLOCK, num_warps=4
         )

@@ -28,12 +28,12 @@ def _slope(a, b, both, dense, by_corner, by_dense_corner, width):
 
 @triton.jit
 def _along(
-    volume, away, at, value, faint, index, length, stride, live, ceiling, dense, by_corner, by_dense_corner, width
+    volume, away, at, value, faint, index, length, stride, live, dense, by_corner, by_dense_corner, width
 ):  # fmt: skip
     """d/dvalue of the penalties of the differences from both neighbours along an axis."""
     has_before, has_after = live & (index > 0), live & (index < length - 1)
-    before = tl.minimum(tl.load(volume + at - stride, mask=has_before, other=0.0), ceiling)
-    after = tl.minimum(tl.load(volume + at + stride, mask=has_after, other=0.0), ceiling)
+    before = tl.load(volume + at - stride, mask=has_before, other=0.0)
+    after = tl.load(volume + at + stride, mask=has_after, other=0.0)
     both_before = faint & (tl.load(away + at - stride, mask=has_before, other=0) != 0)
     both_after = faint & (tl.load(away + at + stride, mask=has_after, other=0) != 0)
     slope = _slope(value, before, both_before, dense, by_corner, by_dense_corner, width)
@@ -43,7 +43,7 @@ def _along(
 
 @triton.jit(do_not_specialize=SIZES)
 def _variation_kernel(
-    volume, away, grad, largest, nz, ny, nx, count, ceiling, dense, by_corner, by_dense_corner, width, factor,
+    volume, away, grad, largest, nz, ny, nx, count, dense, by_corner, by_dense_corner, width, factor,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
     at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -51,30 +51,28 @@ def _variation_kernel(
     live = at < size
     line = at // nx
     x, y, z = at - line * nx, line % ny, line // ny
-    raw = tl.load(volume + at, mask=live, other=0.0)
-    value = tl.minimum(raw, ceiling)
+    value = tl.load(volume + at, mask=live, other=0.0)
     faint = tl.load(away + at, mask=live, other=0) != 0
-    tl.atomic_max(largest, tl.max(raw, 0), sem="relaxed")
+    tl.atomic_max(largest, tl.max(value, 0), sem="relaxed")
     # The mean over an axis has a term less a line than the volume has voxels; of a slab, the whole volume.
     along_x = _along(
-        volume, away, at, value, faint, x, nx, 1, live, ceiling, dense, by_corner, by_dense_corner, width
+        volume, away, at, value, faint, x, nx, 1, live, dense, by_corner, by_dense_corner, width
     )  # fmt: skip
     along_y = _along(
-        volume, away, at, value, faint, y, ny, nx, live, ceiling, dense, by_corner, by_dense_corner, width
+        volume, away, at, value, faint, y, ny, nx, live, dense, by_corner, by_dense_corner, width
     )  # fmt: skip
     along_z = _along(
-        volume, away, at, value, faint, z, nz, nx * ny, live, ceiling, dense, by_corner, by_dense_corner, width
+        volume, away, at, value, faint, z, nz, nx * ny, live, dense, by_corner, by_dense_corner, width
     )  # fmt: skip
     whole = tl.cast(count, tl.int64) * ny * nx
     slope = along_x / tl.maximum(whole - ny * count, 1)
     slope += along_y / tl.maximum(whole - nx * count, 1)
     slope += along_z / tl.maximum(whole - nx * ny, 1)
-    tl.store(grad + at, tl.where(raw <= ceiling, slope * factor, 0.0), mask=live)
+    tl.store(grad + at, slope * factor, mask=live)
 
 
 def variation_gradient(
     volume: torch.Tensor,
-    ceiling: float,
     corners: tuple[float, float],
     dense: float,
     factor: float,
@@ -88,13 +86,13 @@ def variation_gradient(
     """
     by_corners = [1 / corner if corner else 0.0 for corner in corners]
     if planes > 1:
-        away = away_from_edges(volume, ceiling, corners[0], dense)
+        away = away_from_edges(volume, corners[0], dense)
     else:  # in a slice nothing is faint
         away = torch.zeros_like(volume, dtype=torch.int8)
     grad = torch.empty_like(volume)
     with on_device(volume):
         _variation_kernel[(triton.cdiv(volume.numel(), _BLOCK),)](
-            volume, away, grad, largest, *volume.shape[1:], planes, ceiling, dense, *by_corners,
+            volume, away, grad, largest, *volume.shape[1:], planes, dense, *by_corners,
             FAINT * corners[0] or 1.0, factor, BLOCK=_BLOCK, num_warps=4,
         )  # fmt: skip
     return grad
