@@ -7,6 +7,7 @@ import logging
 import numpy as np
 import torch
 
+from tomo_polysplat.evenly_spread import evenly_spread
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.continued import cut_rows
 
@@ -36,7 +37,7 @@ def matter_is_inside(projections: torch.Tensor, geometry: Geometry, grid: Volume
         -log(I/I0); NaN where a ray is not to be used.
     geometry, grid : Geometry, VolumeGrid
     """
-    some = np.unique(np.linspace(0, geometry.views - 1, min(_VIEWS, geometry.views)).astype(int))
+    some = evenly_spread(geometry.views, _VIEWS)
     rows, columns = (np.arange(0, count, -(-count // _LINES)) for count in (geometry.rows, geometry.columns))
     device = projections.device
     chosen = (torch.from_numpy(index).to(device) for index in np.ix_(some, rows, columns))

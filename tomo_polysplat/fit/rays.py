@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from tomo_polysplat.evenly_spread import evenly_spread
 from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.scan.noise import RayNoise, Values
 
@@ -158,6 +159,6 @@ def batches_around(
     rays: Rays, most: int = _VIEWS
 ) -> Iterator[tuple[DetectorViews, torch.Tensor, torch.Tensor, torch.Tensor]]:
     """What `Rays.batch` gives for so many of the views at most, evenly spread over the scan."""
-    views = np.unique(np.linspace(0, len(rays.views) - 1, views_around(rays, most)).astype(int))
+    views = evenly_spread(len(rays.views), most)
     for first in range(0, len(views), _AT_ONCE):
         yield rays.batch(views[first : first + _AT_ONCE])

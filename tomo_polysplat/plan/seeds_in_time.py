@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from tomo_polysplat.evenly_spread import evenly_spread
 from tomo_polysplat.fit.fitter import Batches, Fitter, steps_of_a_run
 from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.kernels.compile_time import working_time
@@ -79,7 +80,7 @@ def _seconds_of_run(lab: Lab, seeds: Gaussians, left: float) -> float:
     scene = scene_of(lab.problem, plan, lab.settings, lab.device)
     setup = FitSetup(seeds.copy(), spacing, lab.rays, scene, plan.adapted(lab.seeding))
     fitter = Fitter(setup, Batches(batch, steps, np.random.default_rng(0)))
-    some, took = np.unique(np.linspace(0, views - 1, batch).astype(int)), list[float]()
+    some, took = evenly_spread(views, batch), list[float]()
     while len(took) <= _TIMED and sum(took) <= _MOST * left:
         begun = working_time()
         fitter.step(some, 0.0)

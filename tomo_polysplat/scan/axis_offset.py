@@ -119,7 +119,7 @@ def _rough(rays: OppositeRays) -> tuple[float, int]:
     """The place where opposite rays agree best, in columns, and how many columns were joined to find it."""
     columns = rays.values.shape[1]
     factor = max(1, columns // _COARSE)
-    some = np.unique(np.linspace(0, rays.values.shape[2] - 1, _COARSE_ROWS).astype(int))
+    some = evenly_spread(rays.values.shape[2], _COARSE_ROWS)
     coarse = OppositeRays(rays.values[..., some], rays.azimuth, rays.axis, rays.slope).joined(factor)
     lines, columns = spread(coarse, _COARSE_VIEWS)
     reach = np.ceil(LARGEST_SHARE * len(columns))

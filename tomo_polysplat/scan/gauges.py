@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from tomo_polysplat.evenly_spread import evenly_spread
 from tomo_polysplat.scan.moves import Scanner
 from tomo_polysplat.scan.slopes import slope_at_zero
 
@@ -47,7 +48,7 @@ def effects(scanner: Scanner, names: list[str] | tuple[str, ...], radius: float)
         In the unit of the geometry.
     """
     many = scanner.geometry.views
-    some = np.unique(np.linspace(0, many - 1, min(many, _VIEWS)).astype(int))
+    some = evenly_spread(many, _VIEWS)
     part = Scanner(scanner.geometry.select(some), scanner.pivot.numpy())
     points = _points(radius)
     basis = _orthonormal(_of_object(part, points))

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tomo_polysplat.evenly_spread import evenly_spread
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.water import areal_density
 from tomo_polysplat.scan.filling import fill_rows_in_place
@@ -67,7 +68,7 @@ def hardening_shown(values: Any, geometry: Geometry, spectrum: Spectrum) -> Hard
     """
     if not _sees_slices(geometry):
         return None
-    rows = np.unique(np.linspace(0, geometry.rows - 1, _ROWS).astype(int))
+    rows = evenly_spread(geometry.rows, _ROWS)
     some = np.asarray(values[:, rows], dtype=np.float64).copy()
     flat = some.reshape(-1, geometry.columns)
     fill_rows_in_place(flat, np.isfinite(flat))

@@ -12,6 +12,8 @@ from functools import cached_property
 
 import numpy as np
 
+from tomo_polysplat.evenly_spread import evenly_spread
+
 __all__ = ["OppositeRays", "RaysAndOpposites"]
 
 # Gaps between views of more than this many usual ones are not bridged.
@@ -181,7 +183,7 @@ class OppositeRays:
         places = np.array(
             [k for k in range(3, len(self.azimuth) - 2) if even[k - 3 : k + 2].all()], dtype=np.int64
         )
-        some = places[np.unique(np.linspace(0, len(places) - 1, min(most, len(places))).astype(int))]
+        some = places[evenly_spread(len(places), most)]
         steps = range(-3, 3)
         return [
             self._compared(

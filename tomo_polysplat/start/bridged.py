@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 import torch
 
+from tomo_polysplat.evenly_spread import evenly_spread
 from tomo_polysplat.physics.typical import largest_finite
 from tomo_polysplat.ranks import RankFailed
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
@@ -118,7 +119,7 @@ def _better(
     covered = _blanked(rays, mask, geometry, grid)
     if covered > _MOST_OF_RAYS:
         return volume, f"; metal not bridged: {covered:.0%} of the object's rays pass through it"
-    views = np.unique(np.linspace(0, len(rays) - 1, min(_JUDGES, len(rays))).astype(int))
+    views = evenly_spread(len(rays), _JUDGES)
     beside = rays[torch.from_numpy(views).to(rays.device)]
     bridged = torch.where(mask, volume, _made_without(rays, mask, geometry, grid, pair, metal))
     before, after = (_misfit(each, views, beside, pair) for each in (volume, bridged))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tomo_polysplat.checks import fail, visible
+from tomo_polysplat.evenly_spread import evenly_spread
 from tomo_polysplat.scan.circular import volume_seen
 from tomo_polysplat.scan.counts import Counts
 from tomo_polysplat.scan.defects import flat_and_dark
@@ -174,9 +175,7 @@ def _require_light(told: Acquisition, open_beam: float, without: float) -> None:
 
 def _require_possible(told: Acquisition, kind: str, projections: np.ndarray, valid: np.ndarray) -> None:
     """Refuse rays most of which are brighter than the open beam, or darker than anything that lets light through."""
-    chosen = np.unravel_index(
-        np.linspace(0, valid.size - 1, min(valid.size, _LOOKED_AT)).astype(np.int64), valid.shape
-    )
+    chosen = np.unravel_index(evenly_spread(valid.size, _LOOKED_AT), valid.shape)
     some = projections[chosen][valid[chosen]]
     middle = float(np.median(some)) if some.size else 0.0
     if kind == "attenuation" and middle > _OPAQUE:
