@@ -17,7 +17,7 @@ from tomo_polysplat.fit.rays import batches_around
 from tomo_polysplat.fit.stopping import Clock
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.decisions import growth
-from tomo_polysplat.plan.decisions.growth import Growth, shaded, unexplained
+from tomo_polysplat.plan.decisions.growth import Growth, left_over
 from tomo_polysplat.plan.decisions.tv_factor import TvFactor
 from tomo_polysplat.plan.lab import Untold
 from tomo_polysplat.plan.order import answer_to
@@ -51,14 +51,14 @@ def scan(more=0.0, photons=PHOTONS, seed=4):
 @pytest.mark.parametrize("more", [0.03, 0.1])
 def test_what_is_left_is_a_share_of_what_the_rays_vary_by(more):
     # A few hundred rays tell it to a sixth. They vary by what is added, too.
-    found = np.mean([unexplained(*scan(more, seed=seed)) for seed in range(12)])
+    found = np.mean([left_over(*scan(more, seed=seed)).unexplained for seed in range(12)])
     assert found == pytest.approx(more / (1 + more), rel=0.15)
 
 
 def test_noise_is_no_detail():
-    assert unexplained(*scan()) < 0.01
+    assert left_over(*scan()).unexplained < 0.01
     gaussians, scene, rays, _ = scan()
-    assert unexplained(gaussians, scene, replace(rays, photons=math.inf), DENSE) > 0
+    assert left_over(gaussians, scene, replace(rays, photons=math.inf), DENSE).unexplained > 0
 
 
 def test_rays_through_dense_matter_do_not_count():
@@ -70,21 +70,21 @@ def test_rays_through_dense_matter_do_not_count():
     lit = scene.projections(one.select(torch.arange(6)), views)[0] < 1e-3
     assert 0 < int(lit.sum()) < lit.numel()
     # Only the rays through what is too dense tell that it is.
-    assert unexplained(one, scene, rays, DENSE) > 1.0
-    assert unexplained(one, scene, rays, level) < 0.03
+    assert left_over(one, scene, rays, DENSE).unexplained > 1.0
+    assert left_over(one, scene, rays, level).unexplained < 0.03
     everything = gaussians.copy()
     everything.attenuation += level
-    assert unexplained(everything, scene, rays, level) == 0.0
+    assert left_over(everything, scene, rays, level).unexplained == 0.0
 
 
 def test_where_most_rays_pass_dense_matter_the_rest_does_not_tell():
     gaussians, scene, rays, _ = scan()
-    assert shaded(gaussians, scene, rays, DENSE) == 0.0
+    assert left_over(gaussians, scene, rays, DENSE).shaded == 0.0
     short = dimmer(gaussians)
     assert answer_to(Growth(), Bench(short, gaussians, curves=3)).value == 4.0
     # Half of the Gaussians are metal, and lie in the way of nearly all rays.
     short.attenuation[::2] += DENSE
-    assert shaded(short, scene, rays, DENSE) > 0.75
+    assert left_over(short, scene, rays, DENSE).shaded > 0.75
     answer = answer_to(Growth(), Bench(short, gaussians, curves=3))
     assert answer.value == 1.0 and "pass dense matter" in answer.why
 
@@ -98,7 +98,7 @@ def test_a_single_ray_beside_dense_matter_varies_by_nothing():
     assert int(torch.isfinite(alone).sum()) == 1
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert unexplained(gaussians, scene, replace(rays, projections=alone), DENSE) == 0.0
+        assert left_over(gaussians, scene, replace(rays, projections=alone), DENSE).unexplained == 0.0
 
 
 class Bench:
@@ -201,8 +201,8 @@ def test_what_is_left_by_many_is_detail_sooner():
     one.attenuation *= 0.8
     several = one.select(torch.arange(len(one)).repeat(40))
     several.attenuation /= 40
-    assert unexplained(several, scene, rays, DENSE) == pytest.approx(
-        unexplained(one, scene, rays, DENSE), rel=1e-3
+    assert left_over(several, scene, rays, DENSE).unexplained == pytest.approx(
+        left_over(one, scene, rays, DENSE).unexplained, rel=1e-3
     )
     for short, times in ((one, 1.0), (several, 4.0)):
         assert answer_to(Growth(), Bench(short, gaussians)).value == times

@@ -109,7 +109,7 @@ def found_about_the_scanner(plan: Mapping[str, Answer]) -> str:
         if name in plan:
             found.insert(0, f"{what} ({plan[name].why})")
     if not found:
-        return "About the scanner nothing was found that the geometry and the spectrum had not said."
+        return "The rays show the scanner as the geometry and the spectrum tell it."
     return f"About the scanner was found: {'; '.join(found)}."
 
 

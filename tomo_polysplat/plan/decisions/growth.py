@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -29,7 +29,7 @@ from tomo_polysplat.plan.first_gaussians import room_to_grow
 from tomo_polysplat.plan.lab import Lab, Untold
 from tomo_polysplat.settings import Settings
 
-__all__ = ["Growth", "shaded", "unexplained"]
+__all__ = ["Growth", "LeftOver", "left_over"]
 
 
 logger = logging.getLogger(__name__)
@@ -62,6 +62,21 @@ _SHADE = 1e-3
 _MOST_SHADED = 0.75
 # Median of the square of a normally distributed number of variance 1.
 _MEDIAN_SQUARE = 0.4549
+
+
+class LeftOver(NamedTuple):
+    """What a fit leaves of the rays through lighter matter.
+
+    Attributes
+    ----------
+    unexplained : float
+        Mean square of what it leaves, less its noise, over the rays' variance.
+    shaded : float
+        Share of these rays that pass dense matter, too, and do not count.
+    """
+
+    unexplained: float
+    shaded: float
 
 
 class Growth(Decision):
@@ -110,11 +125,11 @@ class Growth(Decision):
         room = room_to_grow(len(tried), plan, lab.problem, lab.device)
         if room < _ROOM:
             raise Untold(f"there is memory for {room:.2g} times as many")
-        if (share := shaded(tried, lab.scene, lab.rays, dense)) > _MOST_SHADED:
+        left, shaded = left_over(tried, lab.scene, lab.rays, dense)
+        if shaded > _MOST_SHADED:
             raise Untold(
-                f"{share:.0%} of the rays through soft matter pass dense matter: the rest tells of no detail"
+                f"{shaded:.0%} of the rays through soft matter pass dense matter: the rest tells of no detail"
             )
-        left = unexplained(tried, lab.scene, lab.rays, dense)
         usual = (_BESIDE_DENSE if known[Curves] > 1 else _UNEXPLAINED) / math.sqrt(max(len(tried), 1))
         why = f"a short fit leaves {left:.2%} of what the rays vary by unexplained, plain surfaces up to {usual:.2%}"
         evidence = {"unexplained": left, "usual": usual}
@@ -125,7 +140,7 @@ class Growth(Decision):
             of_closer = lab.trial(short, edges=kind, closer_seeds=0.0, seed_spacing=closer).gaussians
         except Untold:
             raise Untold(f"{why}, and there was no time to see whether more Gaussians would not") from None
-        share = unexplained(of_closer, lab.scene, lab.rays, dense) / left
+        share = left_over(of_closer, lab.scene, lab.rays, dense).unexplained / left
         why, evidence = f"{why}, and closer seeds {share:.2f} of that", evidence | {"closer": share}
         logger.info("Detail: %s", why)
         if share >= _DETAIL:
@@ -148,46 +163,35 @@ def most_times(seeds: int, settings: Settings) -> float:
 
 
 @torch.no_grad()
-def shaded(gaussians: Gaussians, scene: FitScene, rays: Rays, bone_level: float) -> float:
-    """Share of the rays through lighter matter that pass what is denser than ``bone_level``, too."""
-    light = gaussians.attenuation <= bone_level
-    if bool(light.all()) or not bool(light.any()):
-        return 0.0
-    lighter, dense = (gaussians.select(which.nonzero()[:, 0]) for which in (light, ~light))
-    through = behind = 0
-    for views, _, weight, _ in batches_around(rays):
-        soft = scene.projections(lighter, views)[0]
-        of_object = (weight > 0) & (soft > _SEEN * soft.max())
-        through += int(of_object.sum())
-        behind += int((of_object & (scene.projections(dense, views)[0] >= _SHADE)).sum())
-    return behind / max(through, 1)
+def left_over(gaussians: Gaussians, scene: FitScene, rays: Rays, bone_level: float) -> LeftOver:
+    """What Gaussians leave of the rays through lighter matter.
 
-
-@torch.no_grad()
-def unexplained(gaussians: Gaussians, scene: FitScene, rays: Rays, bone_level: float) -> float:
-    """Mean square of what Gaussians leave of the rays through the object, less its noise, over the rays' variance.
-
-    Rays through what is denser than ``bone_level`` do not count: it leaves something of its own. The median stands for
-    the mean, which a few rays past edges would decide.
+    Rays that pass what is denser than ``bone_level`` do not count: it leaves something of its own. The median stands
+    for the mean, which a few rays past edges would decide.
     """
     dense, light = (
         gaussians.select(which.nonzero()[:, 0])
         for which in (gaussians.attenuation > bone_level, gaussians.attenuation <= bone_level)
     )
     if not len(light):
-        return 0.0
-    squares, noise, seen = [], [], []
+        return LeftOver(0.0, 0.0)
+    squares, noise, seen, shaded = [], [], [], 0
     for views, measured, weight, _ in batches_around(rays):
         predicted = soft = scene.projections(light, views)[0]
         through = (weight > 0) & (soft > _SEEN * soft.max())
         if len(dense):
             predicted = scene.projections(gaussians, views)[0]
-            through &= scene.projections(dense, views)[0] < _SHADE
+            behind = through & (scene.projections(dense, views)[0] >= _SHADE)
+            shaded += int(behind.sum())
+            through &= ~behind
         squares.append((predicted - measured)[through].square())
         noise.append(rays.variance(measured[through]))
         seen.append(measured[through])
-    if not any(len(values) for values in seen):
-        return 0.0
+    lit = sum(len(values) for values in seen)
+    share = shaded / max(shaded + lit, 1)
+    if not lit:
+        return LeftOver(0.0, share)
     left = float(torch.cat(squares).median()) / _MEDIAN_SQUARE - float(torch.cat(noise).median())
     variance = float(torch.cat(seen).var(correction=0))
-    return max(left, 0.0) / variance if math.isfinite(variance) and variance > 0 else 0.0
+    known = math.isfinite(variance) and variance > 0
+    return LeftOver(max(left, 0.0) / variance if known else 0.0, share)
