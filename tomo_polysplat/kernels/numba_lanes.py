@@ -15,6 +15,7 @@ from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
+from llvmlite.binding import get_host_cpu_features
 from numba import types
 from numba.core.cgutils import for_range_slice, get_or_insert_function
 from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
@@ -22,7 +23,7 @@ from numba.extending import intrinsic, lower_builtin, models, register_model, ty
 __all__ = [
     "HALF",
     "LANES",
-    "QUARTER",
+    "FOLDED",
     "add_blocks",
     "ceiling",
     "fetch",
@@ -37,17 +38,18 @@ __all__ = [
     "power_of_two",
     "ramp",
     "store",
-    "store_quarters",
+    "store_folded",
     "within",
 ]
 
-LANES = 16
+# Without AVX-512 sixteen lanes are two vectors of eight, and the sums of a footprint more than there are registers.
+LANES = 16 if get_host_cpu_features().get("avx512f") else 8
 HALF = LANES // 2
-QUARTER = LANES // 4
+FOLDED = 4  # numbers that a sum over pixels is stored as
 
 _FLOAT, _INT = ir.FloatType(), ir.IntType(32)
 _BYTE, _LINE = ir.IntType(8), 64  # bytes of a line of a cache
-_VECTOR, _BLOCK = ir.VectorType(_FLOAT, LANES), ir.VectorType(_FLOAT, HALF)
+_VECTOR, _BLOCK, _EIGHT = (ir.VectorType(_FLOAT, count) for count in (LANES, HALF, 8))
 _INTS = ir.VectorType(_INT, LANES)
 _FLAGS = ("contract",)
 # The least number that a root is taken of: rounding might make a sum of squares negative.
@@ -283,12 +285,12 @@ def inverse_root(typing, value):
             flags = ("afn", "arcp", "contract")
             return builder.fdiv(_all(1.0), _called(builder, "sqrt", [value], fastmath=flags), flags=flags)
         # The compiler takes a root and a quotient, which on some processors is a third of all time in the kernels.
-        kind = ir.FunctionType(_BLOCK, [_BLOCK])
+        # An instruction takes eight.
+        kind = ir.FunctionType(_EIGHT, [_EIGHT])
         estimate = get_or_insert_function(builder.module, kind, "llvm.x86.avx.rsqrt.ps.256")
-        parts = (_mask(range(first, first + HALF)) for first in (0, HALF))
-        root = _joined(
-            builder, *(builder.call(estimate, [builder.shuffle_vector(value, value, part)]) for part in parts)
-        )
+        parts = (_mask(range(first, first + 8)) for first in range(0, LANES, 8))
+        roots = [builder.call(estimate, [builder.shuffle_vector(value, value, part)]) for part in parts]
+        root = _joined(builder, *roots) if len(roots) > 1 else roots[0]
         # A step of Newton's: from 4e-4 to 2e-7.
         half = builder.fmul(value, _all(-0.5), flags=_FLAGS)
         rest = builder.fmul(half, builder.fmul(root, root, flags=_FLAGS), flags=_FLAGS)
@@ -338,16 +340,16 @@ def within(typing, size, most, place, end, value):
 
 
 @_intrinsic
-def store_quarters(typing, array, start, value):
-    """Write sums of a value's lanes, of every fourth, to ``array[start : start + QUARTER]``, for `lane_sums`."""
+def store_folded(typing, array, start, value):
+    """Write ``FOLDED`` sums of a value's lanes, of those so far apart, to ``array[start : start + FOLDED]``."""
 
     def generate(context, builder, signature, values):
         array, start, value = values
-        for count in (HALF, QUARTER):
+        while value.type.count > FOLDED:
+            count = value.type.count // 2
             parts = (builder.shuffle_vector(value, value, _mask(range(k, k + count))) for k in (0, count))
             value = builder.fadd(*parts, flags=_FLAGS)
-        kind = ir.VectorType(_FLOAT, QUARTER)
-        pointer = _pointer(context, builder, signature.args[0], array, start, kind)
+        pointer = _pointer(context, builder, signature.args[0], array, start, value.type)
         builder.store(value, pointer, align=4)
         return context.get_dummy_value()
 
@@ -356,15 +358,15 @@ def store_quarters(typing, array, start, value):
 
 @_intrinsic
 def lane_sums(typing, array, start):
-    """Sums of ``LANES`` parts: lane k is ``sum(array[start + k QUARTER : start + (k + 1) QUARTER])``, likewise.
+    """Sums of ``LANES`` times what `store_folded` wrote: lane k is ``sum(array[start + k FOLDED :][:FOLDED])``.
 
     Two vectors at a time become one that holds sums of half as many numbers of either.
     """
 
     def generate(context, builder, signature, values):
         source = _pointer(context, builder, signature.args[0], *values)
-        vectors = [builder.load(builder.gep(source, [_INT(k)]), align=4) for k in range(QUARTER)]
-        half = QUARTER // 2
+        vectors = [builder.load(builder.gep(source, [_INT(k)]), align=4) for k in range(FOLDED)]
+        half = FOLDED // 2
         while half:
             lower = [k for k in range(2 * LANES) if k // half % 2 == 0]
             parts = [_mask(k + shift for k in lower) for shift in (0, half)]

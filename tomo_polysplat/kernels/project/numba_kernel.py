@@ -21,9 +21,9 @@ from tomo_polysplat.kernels.numba_group import (
     three,
 )
 from tomo_polysplat.kernels.numba_lanes import (
+    FOLDED,
     HALF,
     LANES,
-    QUARTER,
     add_blocks,
     fetch,
     halves,
@@ -33,7 +33,7 @@ from tomo_polysplat.kernels.numba_lanes import (
     load_blocks,
     ramp,
     store,
-    store_quarters,
+    store_folded,
 )
 from tomo_polysplat.kernels.project.numba_footprint import (
     MOMENTS,
@@ -122,7 +122,7 @@ def _splat(v, first, last, record, span, weight, cutoff, image):
 @njit(inline="always")
 def _gather(v, n, k, numbers, ends, weight, cutoff, grad_image, acc):
     """Write to ``acc``, as those of Gaussian ``k`` of a group, the sums over the footprint of Gaussian ``n`` in view
-    ``v``, by quarters: the moments in the order of ``pull_back``, then the gradient of its weight in every channel."""
+    ``v``, folded: the moments in the order of ``pull_back``, then the gradient of its weight in every channel."""
     cut, half, none = squared(cutoff), np.float32(-0.5), np.float32(0)
     rows, channels, stride = grad_image.shape[1:]
     three = channels > 1
@@ -160,20 +160,20 @@ def _gather(v, n, k, numbers, ends, weight, cutoff, grad_image, acc):
             m0, m1, m2, m3, m4 = m0 + h1, m1 + hu, m2 + h2, m3 + u * h1, m4 + u * hu
             m5, m6, m7, m8, m9, m10 = m5 + d0, m6 + d1, m7 + du, m8 + (h2 - g2), m9 + u * d1, m10 + u * du
         _store_sums(acc, MOMENTS + c, k, (s0, s1, s2) if three else (s0, zero, zero), three)
-    to, next_one = k * QUARTER, GROUP * QUARTER
+    to, next_one = k * FOLDED, GROUP * FOLDED
     for m in (m0, m1, m2, m3, m4, m5, m6, m7, m8, m9, m10):
-        store_quarters(acc, to, m)
+        store_folded(acc, to, m)
         to += next_one
 
 
 @njit(inline="always")
 def _store_sums(acc, first, k, sums, three):
     """Write the sums of one channel, or of three, to ``acc``."""
-    to, each = (first * GROUP + k) * QUARTER, GROUP * QUARTER
-    store_quarters(acc, to, sums[0])
+    to, each = (first * GROUP + k) * FOLDED, GROUP * FOLDED
+    store_folded(acc, to, sums[0])
     if three:
-        store_quarters(acc, to + each, sums[1])
-        store_quarters(acc, to + 2 * each, sums[2])
+        store_folded(acc, to + each, sums[1])
+        store_folded(acc, to + 2 * each, sums[2])
 
 
 @njit(inline="always")
@@ -191,11 +191,11 @@ def _gather_group(v, first, some, record, span, weight, cutoff, grad_image, acc,
         if ends[k] < ends[GROUP + k]:
             of_group[MOMENTS * GROUP + k] = np.float32(1)
         _gather(v, first + k, k, numbers, ends, weight, cutoff, grad_image, acc)
-    for m in range(MOMENTS):
-        store(of_group, m * GROUP, lane_sums(acc, m * GROUP * QUARTER))
-    for c in range(len(weight)):
-        sums = lane_sums(acc, (MOMENTS + c) * GROUP * QUARTER)
-        store(of_weight, c * GROUP, load(of_weight, c * GROUP) + sums)
+    for at in range(0, MOMENTS * GROUP, LANES):
+        store(of_group, at, lane_sums(acc, at * FOLDED))
+    for at in range(0, len(weight) * GROUP, LANES):
+        sums = lane_sums(acc, (MOMENTS * GROUP + at) * FOLDED)
+        store(of_weight, at, load(of_weight, at) + sums)
 
 
 @njit(inline="always")
@@ -243,7 +243,7 @@ def _gather_range(
     # The last number says whether there is a footprint.
     of_group = np.zeros((MOMENTS + 1) * GROUP, np.float32)
     of_weight = np.empty(len(weight) * GROUP, np.float32)
-    acc = np.zeros((MOMENTS + len(weight)) * GROUP * QUARTER, np.float32)
+    acc = np.zeros((MOMENTS + len(weight)) * GROUP * FOLDED, np.float32)
     for first in range(start, stop, GROUP):
         some = min(GROUP, stop - first)
         put_group(first, some, position, scale, rotation, group)

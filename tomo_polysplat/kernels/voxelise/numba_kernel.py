@@ -11,9 +11,9 @@ from tomo_polysplat.compiled import njit
 from tomo_polysplat.kernels.gaussian_maths import FAST, gaussian, squared
 from tomo_polysplat.kernels.numba_group import GROUP, SIZE, in_threes, put_group, take_gradients
 from tomo_polysplat.kernels.numba_lanes import (
+    FOLDED,
     HALF,
     LANES,
-    QUARTER,
     add_blocks,
     ceiling,
     floor,
@@ -25,7 +25,7 @@ from tomo_polysplat.kernels.numba_lanes import (
     ramp,
     smaller,
     store,
-    store_quarters,
+    store_folded,
 )
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.kernels.voxelise.numba_ellipsoid import MOMENTS, NUMBERS, describe, pull_back, set_up
@@ -119,7 +119,7 @@ def _fill(first, last, record, weight, cutoff, ny, volume):
 
 @njit(inline="always")
 def _gather(n, k, record, weight, cutoff, grad_volume, rows, acc):
-    """Write to ``acc``, as those of Gaussian ``k`` of a group, the sums over the voxels of Gaussian ``n``, by quarters:
+    """Write to ``acc``, as those of Gaussian ``k`` of a group, the sums over the voxels of Gaussian ``n``, folded:
     of h times (t, u, w, tt, tu, tw, uu, uw, ww), with h = dL/d(distance^2) = dL/d(t^2 + u^2 + w^2), and of
     dL/df f by channel."""
     cut, half, none = squared(cutoff), np.float32(-0.5), np.float32(0)
@@ -168,15 +168,15 @@ def _gather(n, k, record, weight, cutoff, grad_volume, rows, acc):
                     m7 + w * by_u,
                     m8 + w * hw,
                 )
-        to = ((MOMENTS + c) * GROUP + k) * QUARTER
-        store_quarters(acc, to, s0)
+        to = ((MOMENTS + c) * GROUP + k) * FOLDED
+        store_folded(acc, to, s0)
         if three:
-            store_quarters(acc, to + GROUP * QUARTER, s1)
-            store_quarters(acc, to + 2 * GROUP * QUARTER, s2)
-    to = k * QUARTER
+            store_folded(acc, to + GROUP * FOLDED, s1)
+            store_folded(acc, to + 2 * GROUP * FOLDED, s2)
+    to = k * FOLDED
     for m in (m0, m1, m2, m3, m4, m5, m6, m7, m8):
-        store_quarters(acc, to, m)
-        to += GROUP * QUARTER
+        store_folded(acc, to, m)
+        to += GROUP * FOLDED
 
 
 @njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
@@ -188,7 +188,7 @@ def _gather_range(
     group, out, grads = np.zeros(SIZE * GROUP), np.empty(NUMBERS * GROUP), np.empty(12 * GROUP)
     record, rows = np.empty((GROUP, NUMBERS), np.float32), np.empty(2 * LANES, np.float32)
     moments = np.empty((MOMENTS + len(weight)) * GROUP)
-    acc = np.zeros(len(moments) * QUARTER, np.float32)
+    acc = np.zeros(len(moments) * FOLDED, np.float32)
     corner, edges = (first[0], first[1], first[2]), (spacing[0], spacing[1], spacing[2])
     for n in range(start, stop, GROUP):
         some = min(GROUP, stop - n)
@@ -196,8 +196,8 @@ def _gather_range(
         describe(some, corner, edges, cutoff, len(grad_volume), nx, group, out, record, 0)
         for k in range(some):
             _gather(n + k, k, record, weight, cutoff, grad_volume, rows, acc)
-        for m in range(MOMENTS + len(weight)):
-            store(moments, m * GROUP, lane_sums(acc, m * GROUP * QUARTER))
+        for at in range(0, len(moments), LANES):
+            store(moments, at, lane_sums(acc, at * FOLDED))
         pull_back(edges, group, moments, grads)
         take_gradients(n, some, group, grads, grad_position, grad_scale, grad_rotation)
         for c in range(len(weight)):
