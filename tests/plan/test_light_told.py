@@ -9,21 +9,21 @@ from tomo_polysplat.nuisances.light_factor import WORTH
 from tomo_polysplat.plan import light_told
 from tomo_polysplat.settings import Settings
 
-VIEWS, ROWS, COLUMNS, NOISE = 300, 61, 83, 0.02
+ROWS, COLUMNS, NOISE = 61, 83, 0.02
 
 
 class _Scan:
     """What `ask_light` reads of a problem and of rays."""
 
-    def __init__(self, gain):
+    def __init__(self, gain, views):
         rng = np.random.default_rng(3)
-        self.left = rng.normal(0, NOISE, (VIEWS, ROWS, COLUMNS)) + rng.normal(0, gain, (ROWS, COLUMNS))
+        self.left = rng.normal(0, NOISE, (views, ROWS, COLUMNS)) + rng.normal(0, gain, (ROWS, COLUMNS))
         self.held = rng.random(self.left.shape) < 0.05
-        self.views, self.steps, self.asked = range(VIEWS), [], []
-        self.taken, self.gains, self.drift = self, np.zeros((ROWS, COLUMNS)), np.zeros(VIEWS)
+        self.views, self.steps, self.asked = range(views), [], []
+        self.taken, self.gains, self.drift = self, np.zeros((ROWS, COLUMNS)), np.zeros(views)
 
     def sums(self, gaussians, scene, rays, settings, some=None):
-        some = np.arange(VIEWS) if some is None else some
+        some = np.arange(len(self.views)) if some is None else some
         self.asked.append(len(some))
         left, held = self.left[some], self.held[some]
         block = np.arange(len(some)) * 8 // len(some)
@@ -37,36 +37,38 @@ class _Scan:
         return ResidualSums(weight, total, by_view, by_view, *parts)
 
 
-def asked(monkeypatch, gain, worth=WORTH, **options):
-    scan = _Scan(gain)
+def asked(monkeypatch, gain, worth=WORTH, views=300, **options):
+    scan = _Scan(gain, views)
     monkeypatch.setattr(light_told, "residual_sums", scan.sums)
     monkeypatch.setattr(light_told, "_axis_column", lambda problem: np.nan)
     told = light_told.ask_light(scan, None, None, scan, None, Settings(**options), worth)
     return scan.asked, told["gains"]
 
 
-def test_a_steady_scanner_is_looked_at_in_some_views_only(monkeypatch):
-    looks, gains = asked(monkeypatch, 0.0)
-    assert looks == [128] and not gains.kept and not gains.change.any()
+# A third of them, 128 at most, and all where a third would be fewer than 32.
+@pytest.mark.parametrize(("views", "first"), [(95, 95), (96, 32), (300, 100), (400, 128)])
+def test_a_steady_scanner_is_looked_at_in_some_views_only(monkeypatch, views, first):
+    looks, gains = asked(monkeypatch, 0.0, views=views)
+    assert looks == [first] and not gains.kept and not gains.change.any()
 
 
 # The fainter one is a twentieth of the noise of a ray: of all views it is worth 0.1 % of the misfit, of some it is not.
 @pytest.mark.parametrize("gain", [0.05 * NOISE, 2 * NOISE])
 def test_what_all_views_tell_is_not_missed_by_some(monkeypatch, gain):
     looks, gains = asked(monkeypatch, gain)
-    assert looks == [128, VIEWS]
+    assert looks == [100, 300]
     assert gain < NOISE or gains.kept
 
 
 def test_what_is_worth_less_than_is_asked_for_is_told_by_some_views(monkeypatch):
     faint, strong = 0.05 * NOISE, 2 * NOISE
-    assert asked(monkeypatch, faint, worth=0.05)[0] == [128]
+    assert asked(monkeypatch, faint, worth=0.05)[0] == [100]
     looks, gains = asked(monkeypatch, strong, worth=0.05)
-    assert looks == [128, VIEWS] and gains.kept
+    assert looks == [100, 300] and gains.kept
 
 
 def test_what_a_caller_asks_for_is_told_by_all_views(monkeypatch):
-    assert asked(monkeypatch, 0.0, gains=True)[0] == [VIEWS]
+    assert asked(monkeypatch, 0.0, gains=True)[0] == [300]
 
 
 def test_a_part_of_the_views_rules_out_only_what_all_would_not_confirm():
