@@ -124,14 +124,14 @@ def test_a_budget_that_ends_amid_the_question_leaves_the_run_as_it_was(passes):
 
 
 def passes_asked(monkeypatch, left, steps=30):
-    """Passes that either way is asked for, one after the other, where ``left`` is what averaged light leaves."""
-    asked = []
+    """Passes that either way is asked for, one after the other, where averaged light leaves ``left`` after each."""
+    asked, shares = [], iter(left)
 
     def ahead(clock, some):
         asked.append(some)
         return [(0.2, 0.3, 1)] * some
 
-    monkeypatch.setattr(pixel_rays, "_share", lambda both: left)
+    monkeypatch.setattr(pixel_rays, "_share", lambda both: next(shares))
     return amid(ahead, Clock(10, None), steps), asked
 
 
@@ -139,13 +139,22 @@ def passes_asked(monkeypatch, left, steps=30):
 def test_each_way_has_steps_enough_to_get_used_to_it_but_no_more_than_a_fifth_of_the_run(
     monkeypatch, steps, passes
 ):
-    (answer, run, fitter), asked = passes_asked(monkeypatch, 1.0, steps)
-    assert asked == [1, 1, passes - 1, passes - 1]
-    assert answer.value == 2 and run.fitter is not fitter and run.made == (0.2, 0.3, passes)
+    (answer, run, fitter), asked = passes_asked(monkeypatch, (1.6, 1.3, 1.1), steps)
+    assert asked == 2 * passes * [1]
+    assert run.made == (0.2, 0.3, passes)
+    assert (answer.value, run.fitter is fitter) == ((2, False) if passes == 3 else (1, True))
+
+
+@pytest.mark.parametrize(
+    ("left", "passes"), [((1.5, 1.45), 2), ((1.0, 1.05), 2), ((1.5, 1.3, 1.3), 3), ((0.5, 0.72, 1.0), 3)]
+)
+def test_no_pass_is_made_that_would_have_to_change_more_than_the_last_one_did(monkeypatch, left, passes):
+    (answer, _, _), asked = passes_asked(monkeypatch, left, steps=24)
+    assert asked == 2 * passes * [1] and answer.value == (2 if left[-1] < 1.2 else 1)
 
 
 def test_one_pass_each_way_is_enough_where_averaged_light_leaves_far_more(monkeypatch):
-    (answer, run, fitter), asked = passes_asked(monkeypatch, 2.0)
+    (answer, run, fitter), asked = passes_asked(monkeypatch, (2.0,))
     assert asked == [1, 1]
     assert answer.value == 1 and run.fitter is fitter and run.made == (0.2, 0.3, 1)
 

@@ -54,16 +54,18 @@ def passes_of_a_fork(fitter: Fitter, passes: float, steps: int, most: float) -> 
 def fork(
     fitter: Fitter, other: Fitter, clock: Clock, passes: int, enough: Callable[[], bool] | None = None
 ) -> Fork:
-    """Go both ways for so many passes, or for one if ``enough`` says so after it.
+    """Go both ways for so many passes, or until ``enough``, asked after each, says so.
 
     The run's clock goes on with the first way. The second has a copy of it, which tells whether it came too late.
     """
-    its_clock = copy.copy(clock)
-    first = passes if enough is None else 1
-    made, its = fitter.ahead(clock, first), other.ahead(its_clock, first)
-    if enough is not None and passes > first and not its_clock.late and not enough():
-        made += fitter.ahead(clock, passes - first)
-        its += other.ahead(its_clock, passes - first)
+    its_clock, at_once = copy.copy(clock), passes if enough is None else 1
+    made: list[Made] = []
+    its: list[Made] = []
+    for _ in range(0, passes, at_once):
+        made += fitter.ahead(clock, at_once)
+        its += other.ahead(its_clock, at_once)
+        if its_clock.late or (enough is not None and enough()):
+            break
     return Fork(its_clock.late, _last(made), _last(its))
 
 

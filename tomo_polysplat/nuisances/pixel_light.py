@@ -38,6 +38,11 @@ class PixelLight(Nuisance):
         return Verdict(kept, f"{kind}; {words} {_AS_WELL[0]:g} to {_AS_WELL[1]:g}")
 
     @classmethod
+    def margin(cls, share: float) -> float:
+        """By how much the ``share`` would have to be another one for the other answer."""
+        return min(abs(share - end) for end in _AS_WELL)
+
+    @classmethod
     def told(cls, values: Mapping[str, Any]) -> str:
         """That they do."""
         return "pixels that average the light" if values.get("pixel_rays", 1) > 1 else ""

@@ -78,20 +78,18 @@ class PixelRays(Decision):
             raise Untold("the time budget is kept for the fit")
         fitter = run.fitter
         other = lab.branch(pixel_rays=AVERAGED_RAYS)
-        both, share = [fitter, other], 0.0
+        shares: list[float] = []
 
-        def surely_thin() -> bool:
-            nonlocal share
-            share = _share(both)
-            return share >= _SURELY_THIN
+        def settled() -> bool:
+            shares.append(_share([fitter, other]))
+            return _is_settled(shares)
 
         passes = passes_of_a_fork(fitter, known[Passes], _STEPS, _MOST)
-        ways = fork(fitter, other, run.clock, passes, surely_thin)
+        ways = fork(fitter, other, run.clock, passes, settled)
         if ways.late:
             run.made = ways.was
             raise Untold("the time budget was used before the rays could tell")
-        if share < _SURELY_THIN:
-            share = _share(both)
+        share = shares[-1]
         verdict = PixelLight.gate({"share": share})
         averaged, why = verdict.kept, verdict.why
         run.fitter, run.made = (other, ways.other) if averaged else (fitter, ways.was)
@@ -104,6 +102,13 @@ class PixelRays(Decision):
             return ""
         rays = "twice" if lab.problem.planar else "four times"
         return f"1 or 2: not asked in the middle of the run; with 2 {rays} the pairs"
+
+
+def _is_settled(shares: Sequence[float]) -> bool:
+    """Whether the next pass would have to change the share by more than the last one did to change the answer."""
+    if len(shares) == 1:
+        return shares[0] >= _SURELY_THIN
+    return PixelLight.margin(shares[-1]) > abs(shares[-1] - shares[-2])
 
 
 def _share(fitters: Sequence[Fitter]) -> float:
