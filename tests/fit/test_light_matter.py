@@ -1,6 +1,7 @@
 """Light matter is told by what is fitted: its Gaussians get its number, and give it back."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from small_clouds import blocks
 
 from tomo_polysplat.fit.light_matter import light_gaussians, tell_light
 from tomo_polysplat.fit.scene import FitScene
+from tomo_polysplat.plan.decisions.light import _light_mass
 
 CURVE = torch.ones(3)
 FAT = -0.056
@@ -44,6 +46,14 @@ def test_light_matter_is_light_up_to_its_faces_and_no_rim_of_other_matter_is():
     faces = ((place == 0) | (place == SIZE - 1)).sum(dim=1)
     assert light[(block == 1) & (faces <= 1)].all()
     assert not light[(block == 1) & (faces > 1)].any() and not light[block != 1].any()
+
+
+def test_the_mass_that_is_light_is_a_share_of_what_is_not_metal():
+    """Of a light block all but its edges, which lie beside too much air."""
+    gaussians, scene, *_ = of_levels([1.0, 0.8, 20.0])
+    light_ones = SIZE**3 - 12 * SIZE + 16
+    share = _light_mass(SimpleNamespace(gaussians=gaussians, scene=scene))
+    assert share == pytest.approx(0.8 * light_ones / (1.8 * SIZE**3), rel=1e-5)
 
 
 def test_one_noisy_voxel_makes_nothing_light():

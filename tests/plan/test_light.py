@@ -8,18 +8,21 @@ import numpy as np
 import pytest
 import torch
 from killed_runs import assert_same, resumed_after
-from planned import planned
+from planned import lab_of, planned
 
 import tomo_polysplat as tps
 from tomo_polysplat.fit.optimise import Run
+from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.stopping import Clock
 from tomo_polysplat.kernels.compile_time import working_time
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.plan.answer import Status
+from tomo_polysplat.plan.decision import When
 from tomo_polysplat.plan.decisions import light
 from tomo_polysplat.plan.decisions.light import Light
 from tomo_polysplat.plan.lab import Lab
-from tomo_polysplat.plan.order import ask_between
+from tomo_polysplat.plan.order import ask_between, decide
+from tomo_polysplat.scan.geometry import from_astra, projections_from_astra
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.simulate.scanner import Scanner
 from tomo_polysplat.simulate.scenes import scan_phantom, scene_phantom
@@ -131,22 +134,39 @@ def test_less_than_two_standard_errors_is_no_answer(pancreas, small, monkeypatch
     assert told.value == "soft" and told.why.startswith("as fat it leaves -")
 
 
+def told_beforehand(scan, materials=None, **settings):
+    """The answer that a run begins with, if there is one."""
+    values = projections_from_astra(scan.projections, scan.proj_geom).copy()
+    geometries = from_astra(scan.proj_geom, scan.vol_geom)
+    lab = lab_of(
+        Problem.of(values, *geometries, scan.unit, scan.spectrum, materials), **QUICK | FEW_STEPS | settings
+    )
+    lab.gaussians = lab.seeds()
+    decide(lab, When.DURING)
+    return lab.plan.answers.get("light")
+
+
 @pytest.mark.parametrize(
-    ("settings", "options", "words"),
+    ("settings", "words"),
     [
-        ({}, {}, "fewer than 48 voxels"),
-        ({"curves": 1}, {}, "one material curve"),
-        ({"light_u": 0.0}, {}, "that of other soft matter"),
-        ({"soft_u": 0.1}, {}, "from water only"),
-        ({}, {"materials": ("pmma", "cortical_bone", "iron")}, "from water only"),
-        ({"passes": 9.0}, {}, "in so few passes"),
+        ({"curves": 1}, "one material curve"),
+        ({"light_u": 0.0}, "that of other soft matter"),
+        ({"soft_u": 0.1}, "from water only"),
+        ({"materials": ("pmma", "cortical_bone", "iron")}, "from water only"),
+        ({"passes": 9.0}, "in so few passes"),
     ],
 )
-def test_nobody_asks_where_it_cannot_be_told(pancreas, monkeypatch, settings, options, words):
-    if words != "fewer than 48 voxels":
-        monkeypatch.setattr(light, "_FEWEST_VOXELS", 10)
-    told = reconstruct(pancreas, FEW_STEPS | settings, **options).plan["light"]
+def test_nobody_asks_where_it_cannot_be_told(pancreas, small, settings, words):
+    told = told_beforehand(pancreas, **settings)
     assert told.value == "soft" and told.status is Status.USUAL and words in told.why
+
+
+def test_nobody_asks_where_voxels_are_few(pancreas, monkeypatch):
+    told = reconstruct(pancreas, FEW_STEPS).plan["light"]
+    assert told.value == "soft" and told.status is Status.USUAL and "fewer than 48 voxels" in told.why
+    assert told == told_beforehand(pancreas)
+    monkeypatch.setattr(light, "_FEWEST_VOXELS", 10)
+    assert told_beforehand(pancreas) is None
 
 
 def test_fat_of_one_energy_is_of_no_effect(pancreas):
@@ -157,14 +177,9 @@ def test_fat_of_one_energy_is_of_no_effect(pancreas):
 
 def test_neither_slices_nor_few_views_are_asked(small):
     fan = tps.simulate_scan("pancreas", size=15, views=VIEWS, geometry="fan")
-    assert "slices" in reconstruct(fan, FEW_STEPS).plan["light"].why
+    assert "slices" in told_beforehand(fan).why
     few = tps.simulate_scan("pancreas", size=15, views=39)
-    assert "fewer than 40 views" in reconstruct(few, FEW_STEPS).plan["light"].why
-
-
-def test_little_light_matter_is_left_alone(small):
-    pins = tps.simulate_scan("pins", size=19, views=VIEWS)
-    assert "too little to matter" in reconstruct(pins, {"views_per_step": 1}).plan["light"].why
+    assert "fewer than 40 views" in told_beforehand(few).why
 
 
 def amid(fitter, clock=None):
@@ -220,6 +235,17 @@ def test_a_budget_that_the_fit_needs_is_not_spent_on_it(much_light):
     answer, run = amid(fitter, clock)
     assert (run.fitter, run.made) == (fitter, None)
     assert answer.value == "soft" and "kept for the fit" in answer.why
+
+
+@pytest.mark.parametrize(("share", "asked"), [(0.09, False), (0.11, True)])
+def test_little_light_matter_is_left_alone(much_light, monkeypatch, share, asked):
+    def ahead(clock, passes):
+        clock.deadline = working_time() - 1
+        return []
+
+    monkeypatch.setattr(light, "_light_mass", lambda fitter: share)
+    answer, _ = amid(fake_fitter(ahead))
+    assert answer.value == "soft" and ("too little to matter" in answer.why) == (not asked)
 
 
 def test_soft_matter_that_is_no_water_is_not_asked(much_light):
