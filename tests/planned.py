@@ -7,11 +7,12 @@ from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.plan.answer import Answer
+from tomo_polysplat.plan.decision import When
 from tomo_polysplat.plan.first_volume import first_volume
 from tomo_polysplat.plan.lab import Lab
-from tomo_polysplat.plan.order import decide_start, plan_from_start
+from tomo_polysplat.plan.order import decide, decide_start, plan_from_start
 from tomo_polysplat.plan.plan import Plan
-from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
+from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, from_astra, projections_from_astra
 from tomo_polysplat.settings import Settings
 
 
@@ -69,3 +70,13 @@ def lab_of(of, budget=None, **settings):
     lab = Lab(of, first_volume(of, device, chosen)[0], chosen, device, time_budget=budget)
     decide_start(lab)
     return lab
+
+
+def told_beforehand(scan, name, materials=None, calibrate=None, **settings):
+    """What a run of a scan begins with as the answer to a question that is asked in its middle, or None."""
+    values = projections_from_astra(scan.projections, scan.proj_geom).copy()
+    geometry, grid = from_astra(scan.proj_geom, scan.vol_geom)
+    lab = lab_of(Problem.of(values, geometry, grid, scan.unit, scan.spectrum, materials), **settings)
+    lab.gaussians, lab.calibrate = lab.seeds(), calibrate
+    decide(lab, When.DURING)
+    return lab.plan.answers.get(name)

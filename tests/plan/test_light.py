@@ -8,21 +8,18 @@ import numpy as np
 import pytest
 import torch
 from killed_runs import assert_same, resumed_after
-from planned import lab_of, planned
+from planned import planned, told_beforehand
 
 import tomo_polysplat as tps
 from tomo_polysplat.fit.optimise import Run
-from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.stopping import Clock
 from tomo_polysplat.kernels.compile_time import working_time
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.plan.answer import Status
-from tomo_polysplat.plan.decision import When
 from tomo_polysplat.plan.decisions import light
 from tomo_polysplat.plan.decisions.light import Light
 from tomo_polysplat.plan.lab import Lab
-from tomo_polysplat.plan.order import ask_between, decide
-from tomo_polysplat.scan.geometry import from_astra, projections_from_astra
+from tomo_polysplat.plan.order import ask_between
 from tomo_polysplat.settings import Settings
 from tomo_polysplat.simulate.scanner import Scanner
 from tomo_polysplat.simulate.scenes import scan_phantom, scene_phantom
@@ -134,16 +131,9 @@ def test_less_than_two_standard_errors_is_no_answer(pancreas, small, monkeypatch
     assert told.value == "soft" and told.why.startswith("as fat it leaves -")
 
 
-def told_beforehand(scan, materials=None, **settings):
+def beforehand(scan, **options):
     """The answer that a run begins with, if there is one."""
-    values = projections_from_astra(scan.projections, scan.proj_geom).copy()
-    geometries = from_astra(scan.proj_geom, scan.vol_geom)
-    lab = lab_of(
-        Problem.of(values, *geometries, scan.unit, scan.spectrum, materials), **QUICK | FEW_STEPS | settings
-    )
-    lab.gaussians = lab.seeds()
-    decide(lab, When.DURING)
-    return lab.plan.answers.get("light")
+    return told_beforehand(scan, "light", **QUICK | FEW_STEPS | options)
 
 
 @pytest.mark.parametrize(
@@ -157,16 +147,16 @@ def told_beforehand(scan, materials=None, **settings):
     ],
 )
 def test_nobody_asks_where_it_cannot_be_told(pancreas, small, settings, words):
-    told = told_beforehand(pancreas, **settings)
+    told = beforehand(pancreas, **settings)
     assert told.value == "soft" and told.status is Status.USUAL and words in told.why
 
 
 def test_nobody_asks_where_voxels_are_few(pancreas, monkeypatch):
     told = reconstruct(pancreas, FEW_STEPS).plan["light"]
     assert told.value == "soft" and told.status is Status.USUAL and "fewer than 48 voxels" in told.why
-    assert told == told_beforehand(pancreas)
+    assert told == beforehand(pancreas)
     monkeypatch.setattr(light, "_FEWEST_VOXELS", 10)
-    assert told_beforehand(pancreas) is None
+    assert beforehand(pancreas) is None
 
 
 def test_fat_of_one_energy_is_of_no_effect(pancreas):
@@ -177,9 +167,9 @@ def test_fat_of_one_energy_is_of_no_effect(pancreas):
 
 def test_neither_slices_nor_few_views_are_asked(small):
     fan = tps.simulate_scan("pancreas", size=15, views=VIEWS, geometry="fan")
-    assert "slices" in told_beforehand(fan).why
+    assert "slices" in beforehand(fan).why
     few = tps.simulate_scan("pancreas", size=15, views=39)
-    assert "fewer than 40 views" in told_beforehand(few).why
+    assert "fewer than 40 views" in beforehand(few).why
 
 
 def amid(fitter, clock=None):

@@ -1,12 +1,13 @@
 """Whether pixels average their light: scans of one ray a pixel and of several, and when nobody needs to ask."""
 
+from dataclasses import replace
 from functools import cache, partial
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from killed_runs import assert_same, resumed_after
-from planned import planned
+from planned import planned, told_beforehand
 
 import tomo_polysplat as tps
 from tomo_polysplat.fit.optimise import Run
@@ -79,18 +80,25 @@ def test_the_loser_leaves_no_trace_of_itself():
 
 
 @pytest.mark.parametrize(
-    ("metal", "changes", "options", "words"),
+    ("metal", "changes", "one_energy", "words"),
     [
-        (False, {}, {}, "without metal"),
-        (True, {"passes": 9.0}, {}, "in so few passes"),
-        (True, {}, {"time_budget": 0.5}, "time budget"),
-        (True, {}, {"spectrum": None}, "one energy"),
+        (False, {}, False, "without metal"),
+        (True, {"passes": 9.0}, False, "in so few passes"),
+        (True, {}, True, "one energy"),
     ],
 )
-def test_nobody_asks_where_it_cannot_be_told(metal, changes, options, words):
-    changes = {"views_per_step": 60} | changes  # the volume is nothing to them
-    told = reconstruct(pins(metal=metal), changes, **options).plan["pixel_rays"]
+def test_nobody_asks_where_it_cannot_be_told(metal, changes, one_energy, words):
+    scan = pins(metal=metal, size=40, views=42)
+    scan = replace(scan, spectrum=None) if one_energy else scan
+    told = told_beforehand(scan, "pixel_rays", **QUICK | changes)
     assert told.value == 1 and told.status is Status.USUAL and words in told.why
+    # Else nothing would be told of it.
+    assert told_beforehand(thin(), "pixel_rays", **QUICK) is None
+
+
+def test_a_short_budget_is_kept_for_the_fit():
+    told = reconstruct(thin(), {"views_per_step": 42}, time_budget=0.5).plan["pixel_rays"]
+    assert told.value == 1 and told.status is Status.USUAL and "time budget" in told.why
 
 
 def test_a_budget_with_time_to_spare_does_not_hinder_it():
