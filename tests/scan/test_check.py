@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from one_probe import answer
 
 import tomo_polysplat as tps
 from tomo_polysplat.cli import main
@@ -40,10 +41,6 @@ def defects(scan):
     return {finding.probe: finding for finding in check_scan(scan) if finding.verdict == "defect"}
 
 
-def verdict(scan, probe):
-    return next(finding for finding in check_scan(scan) if finding.probe == probe)
-
-
 def views(scan, order):
     """The same geometry with the views in another order."""
     valid = None if scan.valid is None else scan.valid[:, order]
@@ -68,7 +65,7 @@ def test_a_clean_scan_has_no_defect(scene, geometry):
 def test_turned_angles(scan):
     turned = views(scan, slice(None, None, -1))
     if is_parallel(scan):
-        finding = verdict(turned, "direction of the angles")
+        finding = answer(turned, "direction of the angles")
         assert finding.verdict == "unknown" and "mirror image" in finding.text
         assert not defects(turned)
     else:
@@ -93,9 +90,7 @@ def test_an_axis_of_a_parallel_beam_far_off_is_found():
 
     scan = simulate_scan("pancreas", SIZE, VIEWS, geometry="parallel", arc_degrees=360)
     offset = 0.2 * scan.columns
-    found = verdict(
-        replace(scan, proj_geom=astra.geom_postalignment(scan.proj_geom, (offset, 0.0))), "centre"
-    )
+    found = answer(replace(scan, proj_geom=astra.geom_postalignment(scan.proj_geom, (offset, 0.0))), "centre")
     assert found.verdict == "defect" and found.values["offset"] == pytest.approx(offset, abs=0.2)
 
 
@@ -173,7 +168,7 @@ def test_a_detector_that_is_offset_on_purpose_is_not_truncation():
     geometry = astra.geom_postalignment(geometry, (cut / 2, 0.0))
     half = replace(scan, projections=scan.projections[..., cut:], valid=None, proj_geom=geometry)
     assert not defects(half)
-    assert "on purpose" in verdict(half, "truncation").text
+    assert "on purpose" in answer(half, "truncation").text
 
 
 def test_disorder_of_views(scan):

@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from one_probe import answer
 
 import tomo_polysplat as tps
-from tomo_polysplat.scan.check import DEFECT, OK, UNKNOWN, check_scan
+from tomo_polysplat.scan.check import DEFECT, OK, UNKNOWN
 from tomo_polysplat.scan.geometry import from_astra, to_astra
 from tomo_polysplat.scan.scan import Scan
 
@@ -28,10 +29,6 @@ def water(photons=PHOTONS, seed=0, doubled=False, told=None):
     proj_geom, vol_geom = tps.parallel_geometry(pixel=pixel, detector=(9, columns), radians=angles)
     spectrum = tps.Spectrum.monochromatic(14.5)  # where water attenuates by about 1.7 1/cm
     return Scan(values.astype(np.float32), proj_geom, vol_geom, spectrum=spectrum)
-
-
-def answer(scan, probe):
-    return next(finding for finding in check_scan(scan) if finding.probe == probe)
 
 
 @pytest.mark.parametrize("photons", [100.0, 400.0])

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from one_probe import answer
 
-from tomo_polysplat.scan.check import check_scan
 from tomo_polysplat.scan.probes.order import _shows
 from tomo_polysplat.simulate.scenes import simulate_scan
 
@@ -13,8 +13,7 @@ from tomo_polysplat.simulate.scenes import simulate_scan
 @pytest.mark.parametrize("size, views, seed", [(28, 73, 5), (24, 53, 6), (24, 53, 0)])
 def test_an_object_that_is_its_mirror_image_tells_no_direction(size, views, seed):
     scan = simulate_scan("pins", size, views, geometry="fan", metal=False, photons=3e4, seed=seed)
-    (found,) = (f for f in check_scan(scan) if f.probe == "direction of the angles")
-    assert str(found.verdict) == "unknown"
+    assert str(answer(scan, "direction of the angles").verdict) == "unknown"
 
 
 class _Noise:
@@ -35,5 +34,4 @@ def test_one_view_of_few_photons_at_the_border_is_no_object():
     for views, told in ((1, "ok"), (3, "defect")):
         values = scan.projections.copy()
         values[:, 7 : 7 + views, :2] += 0.9
-        (found,) = (f for f in check_scan(replace(scan, projections=values)) if f.probe == "truncation")
-        assert str(found.verdict) == told
+        assert str(answer(replace(scan, projections=values), "truncation").verdict) == told

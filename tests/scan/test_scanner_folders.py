@@ -14,11 +14,16 @@ from tomo_polysplat.simulate.folders.scene import MARKER
 from tomo_polysplat.simulate.folders.write import KINDS, scan_for, write_folder
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_folder_gives_the_volume_of_our_own_file(kind, tmp_path):
-    own = write_folder(kind, tmp_path / "folder")
+@pytest.fixture(scope="module", params=KINDS)
+def read(request, tmp_path_factory):
+    """A kind of folder, its scan as our own, and as it is read; what reads it leaves it as it is."""
+    folder = tmp_path_factory.mktemp("scans") / "folder"
+    return request.param, write_folder(request.param, folder), tps.load_scan(folder)
+
+
+def test_a_folder_gives_the_volume_of_our_own_file(read, tmp_path):
+    kind, own, scan = read
     tps.save_scan(own, tmp_path / "own.h5")
-    scan = tps.load_scan(tmp_path / "folder")
     require_the_same_volume(scan, tps.load_scan(tmp_path / "own.h5"))
     if kind in ("tiffs", "skyscan", "nikon"):
         # What the folder tells of the tube makes the spectrum that the scan was made with.
@@ -36,11 +41,10 @@ def test_a_scan_of_another_size_gives_the_volume_of_our_own_file(kind, tmp_path)
     require_the_same_volume(scan, own)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_another_library_opens_the_volume_of_a_folder(kind, tmp_path):
+def test_another_library_opens_the_volume_of_a_folder(read, tmp_path):
     """Voxel size, unit and orientation: the marker lies off every axis, where the simulated one does."""
-    own = write_folder(kind, tmp_path / "folder")
-    tps.baselines.fdk(tps.load_scan(tmp_path / "folder")).save(tmp_path / "volume.mha")
+    _, own, scan = read
+    tps.baselines.fdk(scan).save(tmp_path / "volume.mha")
     image = SimpleITK.ReadImage(str(tmp_path / "volume.mha"))
     side = 1.6 * 100 / 250  # of a pixel, brought down to the axis, in mm
     np.testing.assert_allclose(image.GetSpacing(), [side] * 3, rtol=1e-6)

@@ -57,8 +57,8 @@ class Comparison:
         FileExistsError
             If the file exists and `overwrite` is false.
         """
-        figure = self.figure() if title is None else self.figure(title)
         with replacing(path, overwrite=overwrite) as temporary:
+            figure = self.figure() if title is None else self.figure(title)
             figure.savefig(temporary, dpi=dpi)
 
     def __str__(self) -> str:
