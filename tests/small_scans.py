@@ -1,11 +1,14 @@
 """Scans small enough to be reconstructed in a fraction of a second, each simulated once."""
 
 from functools import cache
+from unittest import mock
 
 import astra
 import numpy as np
+import pytest
 
 import tomo_polysplat as tps
+from tomo_polysplat import reconstruction
 from tomo_polysplat.physics.beer_lambert import projection
 from tomo_polysplat.physics.materials import density, mass_attenuation
 from tomo_polysplat.scan.geometry import Geometry, from_astra, to_astra
@@ -34,6 +37,22 @@ def reconstruct(scan, projections=None, proj_geom=None, vol_geom=None, **options
         vol_geom or scan.vol_geom,
         **options,
     )
+
+
+class _Reached(Exception):
+    """What `reconstruct` has made of its arguments, before it solves anything."""
+
+
+def posed(*arguments, **options):
+    """The problem that `reconstruct` would solve, and its counts of rays: all that its solver knows of the rays."""
+
+    def reach(*made):
+        raise _Reached(*pose(*made))
+
+    pose = reconstruction._problem
+    with mock.patch.object(reconstruction, "_problem", reach), pytest.raises(_Reached) as reached:
+        reconstruct(*arguments, **options)
+    return reached.value.args
 
 
 def disc(core, spectrum, *, water=1.0, half=0.25):

@@ -8,7 +8,7 @@ import astra
 import numpy as np
 import pytest
 import torch
-from small_scans import QUICK, fan, in_two_dimensions, reconstruct, relative
+from small_scans import QUICK, fan, in_two_dimensions, posed, reconstruct, relative
 
 import tomo_polysplat as tps
 from tomo_polysplat.settings import make_settings
@@ -35,18 +35,31 @@ def as_torch(array):
     return torch.from_numpy(array.copy())
 
 
+def same_problem(one, other):
+    """Whether two calls pose the same problem, to the bit."""
+    (one, _), (other, _) = one, other
+    assert one.projections.dtype == other.projections.dtype and one.projections.flags.c_contiguous
+    return np.array_equal(one.projections, other.projections, equal_nan=True)
+
+
 @pytest.mark.parametrize(
     "change", [np.float64, as_big_endian, as_fortran, as_strided, as_torch, np.ndarray.tolist]
 )
-def test_the_form_of_an_array_does_not_matter(expected, change):
+def test_the_form_of_an_array_does_not_matter(change):
     scan = fan()
-    assert np.array_equal(reconstruct(scan, change(scan.projections)).volume, expected.volume)
+    assert same_problem(posed(scan, change(scan.projections)), posed(scan))
+
+
+def test_two_forms_of_an_array_give_one_volume(expected):
+    scan = fan()
+    assert np.array_equal(
+        reconstruct(scan, as_strided(as_big_endian(scan.projections))).volume, expected.volume
+    )
 
 
 def test_half_precision_is_what_it_says():
     half = fan().projections.astype(np.float16)
-    pair = [reconstruct(fan(), p).volume for p in (half, half.astype(np.float32))]
-    assert np.array_equal(*pair)
+    assert same_problem(posed(fan(), half), posed(fan(), half.astype(np.float32)))
 
 
 def test_nothing_handed_over_is_written_to(expected):
@@ -78,11 +91,17 @@ def marked():
 def test_rays_that_say_nothing_are_ignored_and_counted(value, marked):
     """Whatever they hold, and however they are marked."""
     scan, bad = spoilt()
-    held = reconstruct(scan, np.where(bad, np.float32(value), scan.projections))
-    assert np.array_equal(marked.volume, held.volume)
+    held = posed(scan, np.where(bad, np.float32(value), scan.projections))
+    assert same_problem(held, posed(scan, np.where(bad, 7.0, scan.projections), valid=~bad))
     kind = "rays_out_of_range" if math.isfinite(value) else "rays_not_finite"
-    assert held.counts[kind] == marked.counts["rays_marked_invalid"] == bad.sum()
+    assert held[1][kind] == marked.counts["rays_marked_invalid"] == bad.sum()
     assert marked.counts["rays_not_finite"] == marked.counts["rays_out_of_range"] == 0
+
+
+def test_ignored_rays_give_the_volume_of_marked_ones(marked):
+    scan, bad = spoilt()
+    held = reconstruct(scan, np.where(bad, np.float32(np.nan), scan.projections))
+    assert np.array_equal(marked.volume, held.volume) and held.counts["rays_not_finite"] == bad.sum()
 
 
 def test_ignored_rays_cost_little(expected, marked):
