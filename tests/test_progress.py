@@ -4,8 +4,6 @@ import logging
 import sys
 
 import pytest
-import tqdm.auto
-import tqdm.notebook
 from small_scans import QUICK, fan, reconstruct
 
 import tomo_polysplat as tps
@@ -77,6 +75,9 @@ def test_a_bar_is_drawn_where_it_is_wanted(capsys):
 
 def test_a_notebook_shows_it_unasked(monkeypatch):
     """Its streams are no terminals, which would leave the bar out."""
+    import tqdm.auto
+    import tqdm.notebook
+
     drawn = []
 
     class Bar(tqdm.notebook.tqdm_notebook):

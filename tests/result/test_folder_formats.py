@@ -1,4 +1,7 @@
-"""OME-Zarr and DICOM series, read back by other libraries, and replaced as a whole or not at all."""
+"""OME-Zarr and DICOM series, read back by other libraries, and replaced as a whole or not at all.
+
+The libraries are loaded where they are used: of several workers only one needs them.
+"""
 
 import json
 import os
@@ -6,10 +9,8 @@ import subprocess
 import sys
 
 import numpy as np
-import pydicom
 import pytest
 import SimpleITK
-import zarr
 
 from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.result import dicom, ome_zarr
@@ -38,6 +39,8 @@ def found(array):
 
 
 def opened(path):
+    import zarr
+
     group = zarr.open_group(str(path), mode="r")
     return group, group.attrs["multiscales"][0]
 
@@ -123,6 +126,8 @@ def test_itk_reads_hounsfield_units_where_they_are(tmp_path, unit, mm, most):
 
 
 def test_a_dicom_slice_has_what_the_standard_asks_for_and_no_patient(tmp_path):
+    import pydicom
+
     marked().save(tmp_path / "v.dicom", bits=16)
     slices = [pydicom.dcmread(file) for file in sorted((tmp_path / "v.dicom").iterdir())]
     assert [one.InstanceNumber for one in slices] == [1, 2, 3]

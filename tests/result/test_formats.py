@@ -2,7 +2,6 @@
 
 import json
 
-import nibabel
 import numpy as np
 import pytest
 import SimpleITK
@@ -53,6 +52,8 @@ def test_itk_reads_the_volume_where_it_is(tmp_path, ending, unit, mm):
 
 @pytest.mark.parametrize("ending", ["nii", "nii.gz"])
 def test_nibabel_finds_x_and_y_turned_as_nifti_has_them(tmp_path, ending):
+    import nibabel
+
     image = nibabel.load(saved(tmp_path, ending))
     array = image.get_fdata()
     assert marker_of(array) == MARKER[::-1] and image.header.get_xyzt_units()[0] == "mm"
@@ -131,6 +132,8 @@ def test_a_folder_of_slices_is_a_stack_with_its_scale(tmp_path):
 
 
 def test_numbers_of_16_bits_are_within_half_a_step(tmp_path):
+    import nibabel
+
     volume = marked().volume.astype(np.float64)
     image = nibabel.load(saved(tmp_path, "nii.gz", bits=16))
     step = np.ptp(volume) / 65535
@@ -146,6 +149,8 @@ def test_numbers_of_16_bits_are_within_half_a_step(tmp_path):
 @pytest.mark.parametrize("bits", [32, 16])
 @pytest.mark.parametrize(("unit", "cm"), [("cm", 1.0), ("um", 1e-4)])
 def test_water_has_no_hounsfield_units_and_nothing_minus_1000(tmp_path, unit, cm, bits):
+    import nibabel
+
     water = mass_attenuation("water", 60.0) * cm
     mu = np.zeros((1, *GRID.shape))
     mu[0, 0], mu[0, 1] = water, 2 * water
