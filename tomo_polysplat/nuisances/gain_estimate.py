@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-__all__ = ["drift_of_views", "gains_of_pixels", "less_rings"]
+__all__ = ["drift_of_views", "gains_of_pixels"]
 
 # Blocks of pixels over which a variance is averaged: one pixel's is rough.
 _AROUND = 7
@@ -24,11 +24,12 @@ _MEDIAN, _NORMAL = math.log(2), 1.4826
 _ROUNDS, _FEWEST_VIEWS = 8, 5
 
 
-def gains_of_pixels(weight: np.ndarray, total: np.ndarray) -> np.ndarray:
-    """Log-gain of each pixel, (rows, columns), less what neighbours have in common.
+def gains_of_pixels(weight: np.ndarray, total: np.ndarray, axis: float = math.nan) -> np.ndarray:
+    """Log-gain of each pixel, (rows, columns), less what the object is likely to have.
 
     Gains are taken for white: as strong for all waves across the detector. What is stronger for some is not theirs, and
-    is left by Wiener's filter.
+    is left by Wiener's filter. Pixels as far from the axis of rotation, on both sides, see the same ring of the object:
+    what differs between them is not the object's, and tells how strong gains are.
 
     Parameters
     ----------
@@ -36,61 +37,54 @@ def gains_of_pixels(weight: np.ndarray, total: np.ndarray) -> np.ndarray:
         Sums over the rays of each pixel, by blocks of views that lie apart, of inverse variances up to a factor.
     total : (blocks, rows, columns) array
         Likewise of these times measurement less model.
+    axis : float
+        Column of the axis of rotation; NaN, or far beyond the detector, where there are no rings.
     """
     mean, noise = _means(weight, total)
-    if not np.isfinite(noise).any():
-        return np.zeros(mean.shape)
     good = np.isfinite(noise)
-    value = np.where(good, mean - np.median(mean[good]), 0.0)
-    usual = _NORMAL * float(np.median(np.abs(value[good])))
-    power = _power(np.clip(value, -_FAR * usual, _FAR * usual)) / good.mean()
-    floor = _floor(power)
-    excess = max(0.0, floor - float(noise[good].mean()))
-    if not excess > 0.0:
+    if not good.any():
         return np.zeros(mean.shape)
-    believed = np.where(good, value * excess / (excess + np.where(good, noise, 0.0)), 0.0)
-    waves = np.fft.fft2(believed) * np.minimum(1.0, floor / np.maximum(_averaged(power), floor))
-    waves[0, 0] = 0.0
-    return np.where(good, np.fft.ifft2(waves).real, 0.0)
+    value, noise = np.where(good, mean - np.median(mean[good]), 0.0), np.where(good, 0.5 * noise, 0.0)
+    others, paired = _opposite(good, axis)
+    # Of a pair both parts have half of the variance; a pixel without another one is brought to that.
+    size = np.where(paired, 1.0, math.sqrt(0.5))
+    common, apart = 0.5 * size * (value + value[:, others]), 0.5 * (value - value[:, others])
+    common[~paired & good] = (size * value)[~paired & good]
+    apart[~paired] = 0.0
+    telling, where = (apart, paired) if paired.any() else (common, good)
+    floor = _floor(_power(_near(telling, where)) / where.mean())
+    return np.where(good, _white(common, noise, good, floor) / size + _white(apart, noise, paired, floor), 0.0)
 
 
-def less_rings(gains: np.ndarray, axis: float) -> np.ndarray:
-    """Gains, (rows, columns), less what the object is likely to have as rings.
-
-    Pixels as far from the axis of rotation, on both sides, see the same ring: what they have in common may be the
-    object's, what differs between them is not. Gains of pixels have nothing to do with each other, so both parts of
-    them are as strong. What the common part has beyond that is left to the object (Wiener's filter).
-
-    Parameters
-    ----------
-    gains : (rows, columns) array
-    axis : float
-        Column of the axis of rotation. A pixel without another on the other side keeps what it has as far as it is no
-        stronger than gains of other pixels; where there are no pairs at all, nothing tells and all stays.
-    """
-    columns = np.arange(gains.shape[1])
+def _opposite(good: np.ndarray, axis: float) -> tuple[np.ndarray, np.ndarray]:
+    """Column on the other side of the axis, itself where there is none, and which pixels have a good one there."""
+    columns = np.arange(good.shape[1])
+    if not math.isfinite(axis):
+        return columns, np.zeros_like(good)
     others = np.rint(2 * axis - columns).astype(int)
-    paired = (others >= 0) & (others < len(columns)) & (others != columns)
-    if not paired.any():
-        return gains
-    others = np.where(paired, others, columns)
-    common, apart = 0.5 * (gains + gains[:, others]), 0.5 * (gains - gains[:, others])
-    told = _strength(apart[:, paired])
-    shares = np.where(paired, _share(told, common[:, paired]), _share(2 * told, common[:, ~paired]))
-    return apart + shares * common
+    there = (others >= 0) & (others < len(columns)) & (others != columns)
+    others = np.where(there, others, columns)
+    return others, good & good[:, others] & there
 
 
-def _share(strength: float, values: np.ndarray) -> float:
-    """How much of the values is told by gains of this mean square."""
-    return min(1.0, strength / max(_strength(values), 1e-300))
+def _white(part: np.ndarray, noise: np.ndarray, there: np.ndarray, floor: float) -> np.ndarray:
+    """Of what pixels have, as much as is white, with this power, and no noise."""
+    excess = max(0.0, floor - float(noise[there].mean())) if there.any() else 0.0
+    if not excess > 0.0:
+        return np.zeros(part.shape)
+    believed = np.where(there, part * excess / (excess + noise), 0.0)
+    power, averaged = _averaged(_power(_near(part, there)) / there.mean())
+    # How far power is beyond the floor is believed by its own error: chance would take some of every wave.
+    beyond = np.maximum(power / floor - 1, 0.0)
+    waves = np.fft.fft2(believed) / (1 + beyond**3 / (beyond**2 + 1 / averaged))
+    waves[0, 0] = 0.0
+    return np.fft.ifft2(waves).real
 
 
-def _strength(values: np.ndarray) -> float:
-    """Mean square, 0 of none; of the most, where a few pixels are far off."""
-    if not values.size:
-        return 0.0
-    usual = _FAR * _NORMAL * float(np.median(np.abs(values)))
-    return float(np.mean(np.clip(values, -usual, usual) ** 2))
+def _near(values: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """The values, those of a few pixels that are far off brought nearer."""
+    usual = _FAR * _NORMAL * float(np.median(np.abs(values[there])))
+    return np.clip(values, -usual, usual)
 
 
 def _means(weight: np.ndarray, total: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -125,14 +119,16 @@ def _floor(power: np.ndarray) -> float:
     return float(np.median(power[short])) / _MEDIAN if short.any() else 0.0
 
 
-def _averaged(power: np.ndarray) -> np.ndarray:
-    """Power of waves averaged over those that are about as long in the same direction."""
+def _averaged(power: np.ndarray) -> tuple[np.ndarray, float]:
+    """Power of waves averaged over those about as long in the same direction, and how many of those are independent."""
     from scipy.ndimage import gaussian_filter
 
     power = power.copy()
     power[0, 0] = 0.0
     deviations = [_WAVES if n > 1 else 0.0 for n in power.shape]
-    return gaussian_filter(power, deviations, mode="wrap")
+    many = math.prod(2 * math.sqrt(math.pi) * deviation for deviation in deviations if deviation)
+    # A wave and its opposite are one, and so are those of an image that is alike on both sides of the axis.
+    return gaussian_filter(power, deviations, mode="wrap"), many / 4
 
 
 def drift_of_views(count: np.ndarray, total: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,13 +14,13 @@ from tomo_polysplat.fit.residual_sums import ResidualSums, residual_sums
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.nuisances.drift import Drift
-from tomo_polysplat.nuisances.gain_estimate import drift_of_views, gains_of_pixels, less_rings
+from tomo_polysplat.nuisances.gain_estimate import drift_of_views, gains_of_pixels
 from tomo_polysplat.nuisances.gains import Gains
 from tomo_polysplat.nuisances.light_factor import WORTH, LightFactor
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.settings import Settings
 
-__all__ = ["EARLY_LIGHT", "LightTold", "ask_light", "light_told", "wanted_light"]
+__all__ = ["EARLY_LIGHT", "LightTold", "ask_gains_again", "ask_light", "light_told", "wanted_light"]
 
 # The fact of a plan that some was taken out before its questions.
 EARLY_LIGHT = "early_light"
@@ -29,6 +29,9 @@ EARLY_LIGHT = "early_light"
 _FEWEST_RAYS = 30
 # A third of the views are looked at first, so many at most; fewer than these tell little.
 _FIRST, _FEWEST_FIRST = 128, 32
+# What the object holds as rings shows bit by bit, as smoothing pulls it out: each time one goes so much farther than is
+# seen. From 1 on what is seen at once would swing from time to time.
+_FURTHER = 0.8
 _KINDS: tuple[type[LightFactor], ...] = (Drift, Gains)
 
 
@@ -101,6 +104,22 @@ def ask_light(
     return light_told(problem, residual_sums(gaussians, scene, rays, settings), options)
 
 
+# Of a fit all that its residuals are made of.
+def ask_gains_again(
+    problem: Problem,
+    gaussians: Gaussians,
+    scene: FitScene,
+    rays: Rays,
+    settings: Settings,
+    options: Settings,
+) -> dict[str, LightTold]:
+    """What some views tell of gains that were found before; see `ask_light`."""
+    views = len(rays.views)
+    some = np.arange(_FIRST) * views // _FIRST if views >= 2 * _FIRST else None
+    sums = residual_sums(gaussians, scene, rays, settings, some)
+    return light_told(problem, sums, replace(options, drift=False))
+
+
 def light_told(problem: Problem, sums: ResidualSums, settings: Settings) -> dict[str, LightTold]:
     """By name, drift first, and the gains as they are without it; what a caller wants left in is missing.
 
@@ -119,10 +138,9 @@ def light_told(problem: Problem, sums: ResidualSums, settings: Settings) -> dict
         sums = sums.without_drift(drift.change)
     if wanted[Gains.name] is not False:
         taken = problem.taken.gains
-        found = gains_of_pixels(sums.weight, sums.total + sums.weight * taken)
-        axis = _axis_column(problem)
-        # An axis that no view sees makes no rings.
-        found = less_rings(found, axis) if math.isfinite(axis) else found
+        found = gains_of_pixels(sums.weight, sums.total + sums.weight * taken, _axis_column(problem))
+        if taken.any():
+            found += _FURTHER * (found - taken)
         told[Gains.name] = _judged(Gains, found, taken, sums, sums.pixel, settings)
     return told
 

@@ -11,7 +11,7 @@ import logging
 from tomo_polysplat.fit.optimise import Run
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.plan.answer import Answer, Status
-from tomo_polysplat.plan.light_told import ask_light, wanted_light
+from tomo_polysplat.plan.light_told import ask_gains_again, ask_light, wanted_light
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.settings import Settings
 
@@ -46,24 +46,30 @@ class SteadyLight:
                 self.asked = max(self.asked, int(plan.facts[name].evidence.get("asked", 0)))
 
     def between(self, run: Run) -> None:
-        """Ask the rays, where it is time."""
+        """Ask the rays, where it is time; once gains are taken out, about them after every pass."""
         share, before = run.clock.share(), self.asked
         while self.asked < len(_SHARES) and share >= _SHARES[self.asked]:
             self.asked += 1
-        if self.asked == before or share >= 1 or self._in_vain(before):
+        if share >= 1 or not self.asked or all(wanted is False for wanted in self.wanted.values()):
             return
-        if all(wanted is False for wanted in self.wanted.values()):
+        again = self.asked == before
+        if again and not self.problem.taken.gains.any() or self._in_vain(before):
             return
         fitter, taken = run.fitter, self.problem.taken
         before_it = len(taken.steps)
         parts = fitter.gaussians, fitter.scene, fitter.rays, fitter.settings
-        for name, told in ask_light(self.problem, *parts, self.settings).items():
+        asking = ask_gains_again if again else ask_light
+        for name, told in asking(self.problem, *parts, self.settings).items():
+            if again and not told.kept:
+                continue
             if told.change.any():
                 taken.add(**{name: told.change})
             answer = told.answer(asked=self.asked)
             self.plan.facts[name] = answer
             kept = "taken out" if told.kept else "none"
-            logger.info("%s: %s, %s.", name.capitalize(), kept, answer.why)
+            logger.log(
+                logging.DEBUG if again else logging.INFO, "%s: %s, %s.", name.capitalize(), kept, answer.why
+            )
         if len(taken.steps) > before_it:
             # As a run that goes on from a checkpoint weighs them.
             fitter.rays.weigh_anew()
