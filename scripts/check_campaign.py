@@ -100,16 +100,33 @@ def planted(scan: Scan, seed: int) -> list[tuple[str, str, Scan, Scan]]:
         values[..., scan.columns // 2 : scan.columns // 2 + columns] = 0
         return changed(values)
 
+    def column(light: float) -> np.ndarray:
+        """One near the axis that sees this share of the light."""
+        values, here = p.copy(), near_axis
+        values[..., here] -= np.log(light)
+        return values
+
+    def noise(deviation: float) -> np.ndarray:
+        """One near the axis that shows nothing but noise, as deep as the object in the mean."""
+        values, here = p.copy(), near_axis
+        values[..., here] = rng.normal(np.median(p[..., here]), deviation, p.shape[:2])
+        return values
+
     def longer(times: float) -> Scan:
         where, grid = from_astra(scan.proj_geom, scan.vol_geom)
         told, volume = to_astra(where.scaled(times), grid.scaled(times))
         return replace(scan, proj_geom=told, vol_geom=volume, truth=None, metal_mask=None)
 
+    middle = from_astra(scan.proj_geom, scan.vol_geom)[0].project_points(np.zeros((1, 3)))[:, 0, 0]
+    near_axis = int(np.clip(np.median(middle) + rng.integers(-3, 4), 1, scan.columns - 2))
+    deep = np.percentile(p, 99)
     fall = np.linspace(0, 1, scan.views)[:, None]
     return [
         ("axis off by 1, 3 columns", "centre", moved(1.0), moved(3.0)),
         ("1, 8 pairs of views swapped", "order of views", swapped(1), swapped(8)),
         ("gap of 1, 6 columns of zeros", "bad rays", gap(1), gap(6)),
+        ("column of 0.7, 0.5 of the light", "bad rays", changed(column(0.7)), changed(column(0.5))),
+        ("column of noise of 0.3, 1", "bad rays", changed(noise(0.3 * deep)), changed(noise(deep))),
         ("flats 0.9, 0.5 of the light", "open beam", changed(p + np.log(0.9)), changed(p + np.log(0.5))),
         (
             "source falls by 5, 20 %",
@@ -128,11 +145,17 @@ def planted(scan: Scan, seed: int) -> list[tuple[str, str, Scan, Scan]]:
     ]
 
 
+def unseen(number: int) -> int:
+    """The first number from this one on where all kinds follow with 3000 photons."""
+    turn = len(KINDS) * len(PHOTONS)
+    return number + (len(KINDS) * PHOTONS.index(3e3) - number) % turn
+
+
 def main() -> None:
     """Print both tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scans", type=int, nargs="?", default=55)
-    parser.add_argument("--planted", type=int, default=11, help="scans that defects are planted in")
+    parser.add_argument("--planted", type=int, default=11, help="scans, after the clean ones, for defects")
     parser.add_argument("--from", type=int, default=0, dest="first", help="number of the first clean scan")
     arguments = parser.parse_args()
     logging.disable(logging.CRITICAL)
@@ -155,7 +178,8 @@ def main() -> None:
         print(f"| {probe} | {' | '.join(str(counts[name]) for name in columns)} |")
     print("", *alarms, sep="\n")
     found: dict[str, tuple[Counter, Counter]] = {}
-    for number in range(2 * len(KINDS), 2 * len(KINDS) + arguments.planted):
+    first = unseen(arguments.first + arguments.scans)
+    for number in range(first, first + arguments.planted):
         for name, probe, *strengths in planted(simulated(number)[1], number):
             both = found.setdefault(name, (Counter(), Counter()))
             for counts, scan in zip(both, strengths):

@@ -231,6 +231,16 @@ def test_looking_for_bad_rays_takes_few_times_the_memory_of_what_is_looked_at():
     assert peak < 20 * large.projections.nbytes
 
 
+def test_a_column_of_half_of_the_light_is_found_or_named_with_what_would_tell():
+    scan = simulated("teeth", "cone")
+    for column, verdict in ((5, "defect"), (scan.columns // 2, "unknown")):
+        values = scan.projections.copy()
+        values[..., column] += np.log(2)
+        finding = check_scan(replace(scan, projections=values))[0]
+        assert finding.probe == "bad rays" and finding.verdict == verdict
+    assert f"column {column}" in finding.text and "without the object" in finding.remedy
+
+
 def test_the_command_prints_the_remedy_and_its_status_tells(tmp_path, capsys):
     scan = simulated("teeth", "cone")
     save_scan(scan, tmp_path / "good.npz")

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from tomo_polysplat.evenly_spread import evenly_spread
+from tomo_polysplat.scan.apart_columns import apart_columns
 from tomo_polysplat.scan.counts import Counts, Marks
 from tomo_polysplat.scan.defects import fill_invalid
 from tomo_polysplat.scan.dropouts import dropped_rays
@@ -93,6 +94,17 @@ class Measured:
     def air(self) -> Air | None:
         """Rays beside the object, or None where there are none."""
         return look_for_air(self.filled, self.span)
+
+    @cached_property
+    def apart(self) -> tuple[np.ndarray, np.ndarray]:
+        """Columns unlike their neighbours in nearly all rays: those that no object makes, and those one might."""
+        values = np.where(self.valid[self.chosen_rows], self._values, np.nan)
+        return apart_columns(values, self.level, self.axis_column, self.azimuth)
+
+    @property
+    def axis_column(self) -> float:
+        """Column on which the axis of rotation falls, in the median of the views."""
+        return float(np.median(self.geometry.project_points(self.axis[None])[:, 0, 0]))
 
     @cached_property
     def places(self) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 
 from tomo_polysplat.evenly_spread import evenly_spread
 from tomo_polysplat.scan.dropouts import dropped_rays
-from tomo_polysplat.scan.probes.finding import DEFECT, OK, Finding
+from tomo_polysplat.scan.probes.finding import DEFECT, OK, UNKNOWN, Finding
 from tomo_polysplat.scan.probes.measured import Measured
 from tomo_polysplat.scan.scale_end import ONE_PHOTON, dark_end
 from tomo_polysplat.scan.stuck import stuck_pixels
@@ -30,6 +30,9 @@ _THROUGH = 0.1
 _OFTEN = 3
 
 
+# Columns that an answer names.
+_NAMED = 5
+
 RAYS = "bad rays"
 MARKED = "marked as bad"
 DEAD, ZERO = "of dead pixels", "zero in the middle of the object"
@@ -47,10 +50,10 @@ def bad_rays(measured: Measured) -> dict[str, np.ndarray]:
     zero = dropped_rays(np.where(valid, projections, np.nan))
     # Few photons make few values, and that of air is one of them.
     zero &= _stands_out_as_value(projections[valid], 0.0)
-    column = float(np.median(measured.geometry.project_points(measured.axis[None])[:, 0, 0]))
-    pixels = stuck_pixels(np.where(valid, projections, np.nan).transpose(1, 0, 2), column)
+    pixels = stuck_pixels(np.where(valid, projections, np.nan).transpose(1, 0, 2), measured.axis_column)
     pixels |= _dead_pixels(projections, valid & ~pixels[:, None], measured.level)
     pixels |= (~valid & ~starved).mean(axis=1) > _MOSTLY
+    pixels |= measured.apart[0]
     dead = np.broadcast_to(pixels[:, None], valid.shape)
     return {
         DEAD: dead,
@@ -80,6 +83,12 @@ def probe_rays(measured: Measured, kinds: dict[str, np.ndarray]) -> Finding:
             "mark them in valid= (False is not used); correct flat fields, or saturation=, mend many of them"
         )
         return Finding(RAYS, DEFECT, listed, remedy, shares)
+    doubtful = np.flatnonzero(measured.apart[1] & ~kinds[DEAD].all(axis=(0, 1)))
+    if len(doubtful):
+        named = ", ".join(str(column) for column in doubtful[:_NAMED])
+        text = f"unlike both neighbours in all views, by the detector or what is round about the axis: column {named}"
+        remedy = "a picture without the object: if a column is off there, too, mark it in valid= (False is not used)"
+        return Finding(RAYS, UNKNOWN, text, remedy, shares)
     return Finding(RAYS, OK, listed or "none", "", shares)
 
 
