@@ -79,3 +79,27 @@ def test_a_part_of_the_views_rules_out_only_what_all_would_not_confirm():
             assert not Gains.ruled_out({"better": of_some, "error": 0.0}, 0.1)
     assert Gains.ruled_out({"better": 9e-5, "error": 0.0}, 0.1)
     assert not Gains.ruled_out({"better": float("nan"), "error": float("nan")}, 0.1)
+
+
+def test_what_changes_of_gains_is_followed_farther_than_it_is_seen(monkeypatch):
+    scan = _Scan(2 * NOISE)
+    monkeypatch.setattr(light_told, "residual_sums", scan.sums)
+    monkeypatch.setattr(light_told, "_axis_column", lambda problem: np.nan)
+    parts = scan, None, None, scan, None, Settings()
+    whole = light_told.ask_light(*parts)["gains"].change
+    scan.gains, scan.left = 0.5 * whole, scan.left - 0.5 * whole
+    some = light_told.ask_gains_again(*parts)
+    # Told of some views, and without the drift that only all of them tell.
+    assert scan.asked[-1] == 128 and list(some) == ["gains"]
+    times = float(np.vdot(some["gains"].change, whole) / np.vdot(whole, whole)) / 0.5
+    assert 1.5 < times < 2
+
+
+def test_going_farther_ends_where_the_rest_is():
+    # A share r of what is left comes back each time, as the object follows: all are found, and the slow ones sooner.
+    for r in (0.0, 0.5, 0.9, 0.99):
+        plain = farther = 1.0
+        for _ in range(10):
+            plain -= (1 - r) * plain
+            farther -= (1 + light_told._FURTHER) * (1 - r) * farther
+        assert abs(farther) < 0.2 if r < 0.9 else farther < plain**1.6

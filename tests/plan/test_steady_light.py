@@ -7,6 +7,8 @@ import pytest
 import small_scans
 
 import tomo_polysplat as tps
+from tomo_polysplat.plan import steady_light
+from tomo_polysplat.plan.light_told import LightTold
 from tomo_polysplat.report.residuals import residuals_of
 from tomo_polysplat.settings import Settings
 
@@ -95,6 +97,51 @@ def test_a_run_that_goes_on_is_the_run_without_interruption(tmp_path):
     on = reconstruct(spoilt(), checkpoint=path, resume=True)
     assert np.array_equal(on.volume, result().volume)
     assert np.array_equal(on.gains, result().gains) and np.array_equal(on.drift, result().drift)
+
+
+class _Gains:
+    """A problem, run and fit of which gains are found in the third look, or never."""
+
+    def __init__(self, monkeypatch, ever):
+        self.looks, self.taken, self.gains, self.steps = [], self, np.zeros(1), []
+        self.plan = self.fitter = self.rays = self.clock = self
+        self.facts, self.gaussians, self.scene, self.settings = {}, None, None, None
+        monkeypatch.setattr(steady_light, "ask_light", lambda *parts: self.told("all", ever))
+        monkeypatch.setattr(steady_light, "ask_gains_again", lambda *parts: self.told("again", ever))
+
+    def told(self, kind, ever):
+        self.looks.append((kind, self.now))
+        kept = ever and len(self.looks) > 2
+        evidence = {"rms": 0.01, "better": 0.1, "error": 0.0}
+        return {"gains": LightTold(kept, np.full(1, 0.01 if kept else 0.0), "", evidence)}
+
+    def add(self, gains):
+        self.gains = self.gains + gains
+
+    def share(self):
+        return self.now
+
+    def run(self):
+        steady = steady_light.SteadyLight(self, self, Settings(drift=False))
+        for self.now in np.arange(1, 21) / 20:
+            steady.between(self)
+        return self.looks
+
+
+def test_once_gains_are_found_every_pass_is_asked_about_them(monkeypatch):
+    looks = _Gains(monkeypatch, ever=True).run()
+    whole = [share for kind, share in looks if kind == "all"]
+    assert whole == pytest.approx(steady_light._SHARES)
+    assert [share for kind, share in looks if share > 0.3] == pytest.approx(np.arange(7, 20) / 20)
+    # A steady scanner is asked three times, and pays for no more.
+    assert [kind for kind, _ in _Gains(monkeypatch, ever=False).run()] == ["all"] * 3
+
+
+def test_a_run_of_many_passes_goes_on_as_well(tmp_path):
+    path, many = tmp_path / "run.npz", {"passes": 14.0}
+    reconstruct(spoilt(), settings=many, checkpoint=path, callbacks=[lambda state: state.share > 0.52])
+    on = reconstruct(spoilt(), settings=many, checkpoint=path, resume=True)
+    assert np.array_equal(on.volume, result(**many).volume) and np.array_equal(on.gains, result(**many).gains)
 
 
 def test_files_and_report_know_them(tmp_path):

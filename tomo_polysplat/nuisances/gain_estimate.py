@@ -53,7 +53,9 @@ def gains_of_pixels(weight: np.ndarray, total: np.ndarray, axis: float = math.na
     apart[~paired] = 0.0
     telling, where = (apart, paired) if paired.any() else (common, good)
     floor = _floor(_power(_near(telling, where)) / where.mean())
-    return np.where(good, _white(common, noise, good, floor) / size + _white(apart, noise, paired, floor), 0.0)
+    return np.where(
+        good, _white(common, noise, good, floor) / size + _white(apart, noise, paired, floor), 0.0
+    )
 
 
 def _opposite(good: np.ndarray, axis: float) -> tuple[np.ndarray, np.ndarray]:
@@ -73,10 +75,8 @@ def _white(part: np.ndarray, noise: np.ndarray, there: np.ndarray, floor: float)
     if not excess > 0.0:
         return np.zeros(part.shape)
     believed = np.where(there, part * excess / (excess + noise), 0.0)
-    power, averaged = _averaged(_power(_near(part, there)) / there.mean())
-    # How far power is beyond the floor is believed by its own error: chance would take some of every wave.
-    beyond = np.maximum(power / floor - 1, 0.0)
-    waves = np.fft.fft2(believed) / (1 + beyond**3 / (beyond**2 + 1 / averaged))
+    power = _averaged(_power(_near(part, there)) / there.mean())
+    waves = np.fft.fft2(believed) * np.minimum(1.0, floor / np.maximum(power, floor))
     waves[0, 0] = 0.0
     return np.fft.ifft2(waves).real
 
@@ -119,16 +119,14 @@ def _floor(power: np.ndarray) -> float:
     return float(np.median(power[short])) / _MEDIAN if short.any() else 0.0
 
 
-def _averaged(power: np.ndarray) -> tuple[np.ndarray, float]:
-    """Power of waves averaged over those about as long in the same direction, and how many of those are independent."""
+def _averaged(power: np.ndarray) -> np.ndarray:
+    """Power of waves averaged over those that are about as long in the same direction."""
     from scipy.ndimage import gaussian_filter
 
     power = power.copy()
     power[0, 0] = 0.0
     deviations = [_WAVES if n > 1 else 0.0 for n in power.shape]
-    many = math.prod(2 * math.sqrt(math.pi) * deviation for deviation in deviations if deviation)
-    # A wave and its opposite are one, and so are those of an image that is alike on both sides of the axis.
-    return gaussian_filter(power, deviations, mode="wrap"), many / 4
+    return gaussian_filter(power, deviations, mode="wrap")
 
 
 def drift_of_views(count: np.ndarray, total: np.ndarray) -> np.ndarray:

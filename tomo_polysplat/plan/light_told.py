@@ -30,7 +30,7 @@ _FEWEST_RAYS = 30
 # A third of the views are looked at first, so many at most; fewer than these tell little.
 _FIRST, _FEWEST_FIRST = 128, 32
 # What the object holds as rings shows bit by bit, as smoothing pulls it out: each time one goes so much farther than is
-# seen. From 1 on what is seen at once would swing from time to time.
+# seen, before what is no gain is left out. From 1 on what is seen at once would swing from time to time.
 _FURTHER = 0.8
 _KINDS: tuple[type[LightFactor], ...] = (Drift, Gains)
 
@@ -138,9 +138,8 @@ def light_told(problem: Problem, sums: ResidualSums, settings: Settings) -> dict
         sums = sums.without_drift(drift.change)
     if wanted[Gains.name] is not False:
         taken = problem.taken.gains
-        found = gains_of_pixels(sums.weight, sums.total + sums.weight * taken, _axis_column(problem))
-        if taken.any():
-            found += _FURTHER * (found - taken)
+        times = 1 + _FURTHER if taken.any() else 1.0
+        found = gains_of_pixels(sums.weight, times * sums.total + sums.weight * taken, _axis_column(problem))
         told[Gains.name] = _judged(Gains, found, taken, sums, sums.pixel, settings)
     return told
 
