@@ -12,14 +12,14 @@ __all__ = ["apart_columns"]
 # Of noise alone a third of the rays lies between both neighbours. Of a column apart fewer than this share are nearer to
 # them than the limit, a share of the scan's large values, or of a value of 1, where a tenth of the light is missing.
 _BETWEEN, _LIMIT, _FEW_ROWS = 0.2, 0.1, 3
-_FEWEST_RAYS, _FEWEST_VIEWS, _FEWEST_COLUMNS = 100, 8, 5
+_FEWEST_RAYS, _FEWEST_VIEWS, _FEWEST_COLUMNS = 60, 8, 5
 # Of each column, spread over the rows.
 _ENOUGH_RAYS = 20_000
 # -log of the least light that counts.
 _DARKEST = 20.0
 # Noise of a column is so many times what the object's detail and its light change from view to view. On 80 clean scans
 # of all kinds no column beyond the limit came to more than 1.5.
-_NOISE = 3.0
+_NOISE = 2.5
 # In fewer degrees what is off the axis may stay in its column.
 _ARC = np.deg2rad(170)
 
