@@ -51,7 +51,8 @@ def apart_columns(
     bad, doubtful = np.zeros((2, columns), bool)
     if columns < _FEWEST_COLUMNS or views < _FEWEST_VIEWS:
         return bad, doubtful
-    limit = _LIMIT * min(level, 1.0) * (1 if rows > 2 else _FEW_ROWS)
+    # Values of which a hundredth is more than that are no -log(I/I0).
+    limit = max(_LIMIT * min(level, 1.0), 0.01 * level) * (1 if rows > 2 else _FEW_ROWS)
     values = values[evenly_spread(rows, max(_FEW_ROWS, _ENOUGH_RAYS // views))]
     apart = np.array([0.0, *(_apart(values, k) for k in range(1, columns - 1)), 0.0])
     # A column beside one that is off may be the outermost of both its neighbours as well.
