@@ -82,7 +82,7 @@ def test_a_part_of_the_views_rules_out_only_what_all_would_not_confirm():
 
 
 def test_what_changes_of_gains_is_followed_farther_than_it_is_seen(monkeypatch):
-    scan = _Scan(2 * NOISE)
+    scan = _Scan(2 * NOISE, 300)
     monkeypatch.setattr(light_told, "residual_sums", scan.sums)
     monkeypatch.setattr(light_told, "_axis_column", lambda problem: np.nan)
     parts = scan, None, None, scan, None, Settings()
