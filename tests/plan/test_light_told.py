@@ -13,17 +13,22 @@ ROWS, COLUMNS, NOISE = 61, 83, 0.02
 
 
 class _Scan:
-    """What `ask_light` reads of a problem and of rays."""
+    """What `ask_light` reads of a problem, and the sums of its rays."""
 
     def __init__(self, gain, views):
         rng = np.random.default_rng(3)
         self.left = rng.normal(0, NOISE, (views, ROWS, COLUMNS)) + rng.normal(0, gain, (ROWS, COLUMNS))
         self.held = rng.random(self.left.shape) < 0.05
-        self.views, self.steps, self.asked = range(views), [], []
-        self.taken, self.gains, self.drift = self, np.zeros((ROWS, COLUMNS)), np.zeros(views)
+        self.views, self.steps, self.asked = views, [], []
+        self.geometry, self.taken, self.gains, self.drift = (
+            self,
+            self,
+            np.zeros((ROWS, COLUMNS)),
+            np.zeros(views),
+        )
 
-    def sums(self, gaussians, scene, rays, settings, some=None):
-        some = np.arange(len(self.views)) if some is None else some
+    def sums(self, some):
+        some = np.arange(self.views) if some is None else some
         self.asked.append(len(some))
         left, held = self.left[some], self.held[some]
         block = np.arange(len(some)) * 8 // len(some)
@@ -39,9 +44,8 @@ class _Scan:
 
 def asked(monkeypatch, gain, worth=WORTH, views=300, **options):
     scan = _Scan(gain, views)
-    monkeypatch.setattr(light_told, "residual_sums", scan.sums)
     monkeypatch.setattr(light_told, "_axis_column", lambda problem: np.nan)
-    told = light_told.ask_light(scan, None, None, scan, None, Settings(**options), worth)
+    told = light_told.ask_light(scan, scan.sums, Settings(**options), worth)
     return scan.asked, told["gains"]
 
 
@@ -83,9 +87,8 @@ def test_a_part_of_the_views_rules_out_only_what_all_would_not_confirm():
 
 def test_what_changes_of_gains_is_followed_farther_than_it_is_seen(monkeypatch):
     scan = _Scan(2 * NOISE, 300)
-    monkeypatch.setattr(light_told, "residual_sums", scan.sums)
     monkeypatch.setattr(light_told, "_axis_column", lambda problem: np.nan)
-    parts = scan, None, None, scan, None, Settings()
+    parts = scan, scan.sums, Settings()
     whole = light_told.ask_light(*parts)["gains"].change
     scan.gains, scan.left = 0.5 * whole, scan.left - 0.5 * whole
     some = light_told.ask_gains_again(*parts)

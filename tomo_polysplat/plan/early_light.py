@@ -6,8 +6,10 @@ The first fit tells the most of them. The run tells the whole anew, by fits that
 from __future__ import annotations
 
 import logging
+from functools import partial
 from typing import Any
 
+from tomo_polysplat.fit.residual_sums import residual_sums
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.first_look import Look
 from tomo_polysplat.plan.light_told import EARLY_LIGHT, LightTold, ask_light, wanted_light
@@ -40,7 +42,8 @@ def take_out_early(look: Look, settings: Settings) -> dict[str, Answer]:
     if all(one is False for one in wanted.values()):
         return {}
     lab = look.lab
-    told = ask_light(lab.problem, look.gaussians, lab.scene, lab.rays, look.settings, settings, _WORTH)
+    sums = partial(residual_sums, look.gaussians, lab.scene, lab.rays, look.settings)
+    told = ask_light(lab.problem, sums, settings, _WORTH)
     for name, one in told.items():
         logger.debug("%s before the questions: %s", name, one.why)
     kept = {name: one for name, one in told.items() if one.kept and _is_worth(one, wanted[name])}

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from tomo_polysplat.fit.problem import Problem
-from tomo_polysplat.fit.rays import Rays
-from tomo_polysplat.fit.residual_sums import ResidualSums, residual_sums
-from tomo_polysplat.fit.scene import FitScene
-from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.fit.residual_sums import ResidualSums
 from tomo_polysplat.nuisances.drift import Drift
 from tomo_polysplat.nuisances.gain_estimate import drift_of_views, gains_of_pixels
 from tomo_polysplat.nuisances.gains import Gains
@@ -20,7 +18,7 @@ from tomo_polysplat.nuisances.light_factor import WORTH, LightFactor
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.settings import Settings
 
-__all__ = ["EARLY_LIGHT", "LightTold", "ask_gains_again", "ask_light", "light_told", "wanted_light"]
+__all__ = ["EARLY_LIGHT", "LightTold", "Sums", "ask_gains_again", "ask_light", "light_told", "wanted_light"]
 
 # The fact of a plan that some was taken out before its questions.
 EARLY_LIGHT = "early_light"
@@ -33,6 +31,9 @@ _FIRST, _FEWEST_FIRST = 128, 32
 # seen, before what is no gain is left out. From 1 on what is seen at once would swing from time to time.
 _FURTHER = 0.8
 _KINDS: tuple[type[LightFactor], ...] = (Drift, Gains)
+
+# Adds up what a fit leaves of some views by their numbers, or of all: `fit.residual_sums` of its parts.
+Sums = Callable[[np.ndarray | None], ResidualSums]
 
 
 @dataclass(frozen=True)
@@ -67,16 +68,7 @@ def wanted_light(settings: Settings) -> dict[str, Any]:
     return {kind.name: getattr(settings, kind.name) for kind in _KINDS}
 
 
-# Of a fit all that its residuals are made of.
-def ask_light(
-    problem: Problem,
-    gaussians: Gaussians,
-    scene: FitScene,
-    rays: Rays,
-    settings: Settings,
-    options: Settings,
-    worth: float = WORTH,
-) -> dict[str, LightTold]:
+def ask_light(problem: Problem, sums: Sums, options: Settings, worth: float = WORTH) -> dict[str, LightTold]:
     """By name, what the rays tell: some views first, and all where these show anything.
 
     A look at all views takes as long as half a pass on a GPU, and a third of one on a CPU.
@@ -85,39 +77,34 @@ def ask_light(
     ----------
     problem, options
         As `light_told` takes them.
-    gaussians, scene, rays, settings
-        As `fit.residual_sums` takes them.
+    sums : callable
+        See `Sums`.
     worth : float
         What takes away less of the misfit of held-out rays is not looked for in all views.
     """
-    views = len(rays.views)
+    views = problem.geometry.views
     first = min(views // 3, _FIRST)
     if first >= _FEWEST_FIRST and not problem.taken.steps and True not in wanted_light(options).values():
-        some = np.arange(first) * views // first
-        told = light_told(problem, residual_sums(gaussians, scene, rays, settings, some), options)
+        told = light_told(problem, sums(_some(first, views)), options)
         if all(
             kind.ruled_out(told[kind.name].evidence, first / views, worth)
             for kind in _KINDS
             if kind.name in told
         ):
             return told
-    return light_told(problem, residual_sums(gaussians, scene, rays, settings), options)
+    return light_told(problem, sums(None), options)
 
 
-# Of a fit all that its residuals are made of.
-def ask_gains_again(
-    problem: Problem,
-    gaussians: Gaussians,
-    scene: FitScene,
-    rays: Rays,
-    settings: Settings,
-    options: Settings,
-) -> dict[str, LightTold]:
+def ask_gains_again(problem: Problem, sums: Sums, options: Settings) -> dict[str, LightTold]:
     """What some views tell of gains that were found before; see `ask_light`."""
-    views = len(rays.views)
-    some = np.arange(_FIRST) * views // _FIRST if views >= 2 * _FIRST else None
-    sums = residual_sums(gaussians, scene, rays, settings, some)
-    return light_told(problem, sums, replace(options, drift=False))
+    views = problem.geometry.views
+    some = _some(_FIRST, views) if views >= 2 * _FIRST else None
+    return light_told(problem, sums(some), replace(options, drift=False))
+
+
+def _some(count: int, views: int) -> np.ndarray:
+    """Numbers of so many views, evenly spread around."""
+    return np.arange(count) * views // count
 
 
 def light_told(problem: Problem, sums: ResidualSums, settings: Settings) -> dict[str, LightTold]:

@@ -7,9 +7,11 @@ told anew, so that what was wrong at first, when the fit was rough, does not sta
 from __future__ import annotations
 
 import logging
+from functools import partial
 
 from tomo_polysplat.fit.optimise import Run
 from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.fit.residual_sums import residual_sums
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.light_told import ask_gains_again, ask_light, wanted_light
 from tomo_polysplat.plan.plan import Plan
@@ -57,9 +59,9 @@ class SteadyLight:
             return
         fitter, taken = run.fitter, self.problem.taken
         before_it = len(taken.steps)
-        parts = fitter.gaussians, fitter.scene, fitter.rays, fitter.settings
+        sums = partial(residual_sums, fitter.gaussians, fitter.scene, fitter.rays, fitter.settings)
         asking = ask_gains_again if again else ask_light
-        for name, told in asking(self.problem, *parts, self.settings).items():
+        for name, told in asking(self.problem, sums, self.settings).items():
             if again and not told.kept:
                 continue
             if told.change.any():
