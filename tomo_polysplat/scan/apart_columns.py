@@ -83,13 +83,16 @@ def _is_noise(values: np.ndarray, k: int, limit: float) -> bool:
     """Whether a column changes from view to view by much, and far more than its neighbours with as much light do."""
     one, left, right = (values[..., k + step].astype(np.float64) for step in (0, -1, 1))
     own = np.abs(np.diff(one - 0.5 * (left + right), axis=1))
+    told = np.isfinite(own)
+    if (
+        np.count_nonzero(told) < max(_FEWEST_RAYS, 0.5 * own.size)
+        or not (much := np.median(own[told])) > limit
+    ):
+        return False
     # Photon noise goes with the root of the light; the difference of two has twice the variance of one.
     darker = np.exp(0.5 * np.clip(one - np.minimum(left, right), 0, _DARKEST))[:, 1:]
     usual = np.abs(np.diff(left - right, axis=1)) * darker
-    both = np.isfinite(own) & np.isfinite(usual)
-    if np.count_nonzero(both) < max(_FEWEST_RAYS, 0.5 * both.size):
-        return False
-    return float(np.median(own[both])) > max(limit, _NOISE * float(np.median(usual[both])))
+    return bool(much > _NOISE * np.median(usual[told]))
 
 
 def _arc(azimuth: np.ndarray) -> float:
