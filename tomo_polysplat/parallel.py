@@ -69,8 +69,11 @@ def shares(length: int, each: int, threads: int) -> list[tuple[int, int]]:
 def kept_threads() -> Iterator[None]:
     """Keep the threads that `run_tasks` starts until the end, instead of starting them anew for every call.
 
-    To start one takes some 150 us, as long as many a task of a small fit.
+    To start one takes some 150 us, as long as many a task of a small fit. Those that a caller keeps serve here, too.
     """
+    if _kept_pool() is not None:
+        yield
+        return
     with ThreadPoolExecutor(max(1, cpu_threads() - 1)) as pool:
         token = _kept.set((os.getpid(), pool))
         try:
@@ -79,12 +82,18 @@ def kept_threads() -> Iterator[None]:
             _kept.reset(token)
 
 
+def _kept_pool() -> ThreadPoolExecutor | None:
+    """The threads that a caller keeps; a forked process has none of its parent's."""
+    process, pool = _kept.get() or (0, None)
+    return pool if process == os.getpid() else None
+
+
 @contextmanager
 def _helpers(threads: int) -> Iterator[ThreadPoolExecutor]:
-    process, pool = _kept.get() or (0, None)
-    if pool is not None and process == os.getpid():
+    pool = _kept_pool()
+    if pool is not None:
         yield pool
-    else:  # a forked process has none of its parent's threads
+    else:
         with ThreadPoolExecutor(threads) as own:
             yield own
 

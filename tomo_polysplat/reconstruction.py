@@ -67,6 +67,7 @@ _VIEWS_OF_PIXELS = 16
 @usual_modes()
 @memory_limits()
 @sharing_ends()
+@kept_threads()
 def reconstruct(
     projections: Any,
     proj_geom: Mapping[str, Any] | None = None,
@@ -231,7 +232,7 @@ def reconstruct(
     saved = _checkpoint(checkpoint, resume, problem, options)
     before = 0.0 if saved is None else saved.seconds
     started, begun = started - before, begun - before
-    with one_torch_thread(run_options.device), kept_threads(), progress_reports(progress) as report:
+    with one_torch_thread(run_options.device), progress_reports(progress) as report:
         solver = Solver(run_options, saved, started, flipped, report, moved, bowtie)
         problem, prepared, outcome = solver.solve(problem, wanted, ask_scatter=calibrate is None)
         _note_ranks(prepared.plan)

@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from tomo_polysplat.scan.defects import attenuation, fill_invalid, flat_and_dark
+from tomo_polysplat.scan.defects import attenuation, fill_invalid, flat_and_dark, unusable
 
 
 def test_counts_become_line_integrals_and_bad_rays_are_marked_and_counted():
@@ -25,6 +25,7 @@ def test_counts_become_line_integrals_and_bad_rays_are_marked_and_counted():
     assert lost == {"not_finite": 0, "saturated": 1, "dead_pixel": 2, "no_light": 2}
     # Rounding to whole counts is worth exp(P) / 59500 / 2 at most.
     np.testing.assert_allclose(found[valid], lines[valid], atol=0.6 * np.exp(4) / 59500)
+    assert unusable(counts, "counts", flat, background) == lost
     lightless = np.zeros_like(expected)
     lightless[0, [0, 1], [0, 1]] = True
     np.testing.assert_array_equal(np.isposinf(found), lightless)
@@ -77,3 +78,25 @@ def test_a_dead_column_costs_little():
         fill_invalid(values, valid)
         seconds.append(time.perf_counter() - begun)
     assert min(seconds) < 0.02
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.uint8, np.float32])
+@pytest.mark.parametrize("saturation", [None, 90.0])
+def test_bad_rays_are_counted_alike_with_and_without_line_integrals(dtype, saturation):
+    """Each kind once at least, and rays that are of several kinds, of which the first counts."""
+    rng = np.random.default_rng(5)
+    counts = rng.integers(0, 100, (3, 7, 11)).astype(dtype)
+    flat, dark = rng.uniform(60, 120, (7, 11)), rng.uniform(0, 5, (7, 11))
+    flat[2, 3], flat[4], dark[5, 6] = np.nan, 1.0, np.nan
+    counts[0, 4] = 99
+    if dtype is np.float32:
+        counts[1, :2], counts[2, 3] = np.nan, np.inf
+    found = unusable(counts, "counts", flat, dark, saturation)
+    assert found == attenuation(counts, "counts", flat, dark, saturation)[2]
+    assert found["dead_pixel"] and found["no_light"] and (saturation is None or found["saturated"])
+
+
+@pytest.mark.parametrize("kind", ["transmission", "attenuation"])
+def test_other_rays_are_counted_alike(kind):
+    values = np.array([[[0.5, np.nan, -1.0, 0.0, np.inf, 2.0]]])
+    assert unusable(values, kind) == attenuation(values, kind)[2]

@@ -9,6 +9,7 @@ from start_phantoms import chords, distance
 
 from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.scan.moves import Scanner, moved_geometry
+from tomo_polysplat.start import bridged
 from tomo_polysplat.start.bridged import box_around, bridged_start
 from tomo_polysplat.start.initial import initial_volume_on
 from tomo_polysplat.start.voxel_projector import projector_pair
@@ -61,16 +62,32 @@ def rolled():
     return moved_geometry(Scanner(geometry), values), grid
 
 
+@pytest.mark.parametrize("most", [512, 18])
 @pytest.mark.parametrize("scan", [fan, cone, rolled])
-def test_matter_between_opaque_metal_is_not_lost(scan):
+def test_matter_between_opaque_metal_is_not_lost(scan, most, monkeypatch):
+    """By a prior of larger voxels and joined pixels as well, of numbers that cannot be divided evenly."""
+    monkeypatch.setattr(bridged, "_PRIOR", most)
     geometry, grid = scan()
-    volume, bridged, why = starts(geometry, grid)
+    volume, better, why = starts(geometry, grid)
     where = between(grid)
     assert int(where.sum()) > 10
     # Rays through both pieces are far too bright for what the others say: the first start is dark there.
     assert float(volume[where].mean()) < 0.6 * BODY
-    assert float(bridged[where].mean()) == pytest.approx(BODY, rel=0.15)
+    assert float(better[where].mean()) == pytest.approx(BODY, rel=0.15)
     assert "bridged, which misses" in why
+
+
+def test_joined_pixels_are_interpolated_at_the_pixels():
+    """A plane stays one, but at the ends, where there is nothing beyond to interpolate with."""
+    rows, columns = torch.meshgrid(torch.arange(11.0), torch.arange(17.0), indexing="ij")
+    plane = (2 * rows - 3 * columns)[None].repeat(2, 1, 1)
+    joined = bridged._joined(plane, 3)
+    assert joined.shape == (2, 3, 5)
+    fine = bridged._as_fine(joined, plane.shape[1:])
+    torch.testing.assert_close(fine[:, 1:8, 1:14], plane[:, 1:8, 1:14])
+    assert fine.shape == plane.shape
+    plane[0, 4, 7] = torch.nan
+    assert bool(torch.isfinite(bridged._joined(plane, 3)).all())
 
 
 @pytest.mark.parametrize("scan", [fan, cone, rolled])

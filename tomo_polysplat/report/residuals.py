@@ -13,6 +13,7 @@ from tomo_polysplat.evenly_spread import evenly_spread
 from tomo_polysplat.kernels.project.autograd import project
 from tomo_polysplat.kernels.select import choose, pick_fast_device
 from tomo_polysplat.kernels.views import DetectorViews
+from tomo_polysplat.parallel import kept_threads
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.detector_blur import LARGEST_BLUR, blurred
 from tomo_polysplat.physics.filter_map import FilterMap
@@ -45,6 +46,7 @@ _FAR = 3.0
 _BY_VIEW = ("ProjectionAngles", "Vectors")
 
 
+@kept_threads()
 def residuals_of(
     result: ResultData, scan: Scan, *, device: str = "auto", most_views: int = MOST_VIEWS
 ) -> Residuals:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from tomo_polysplat.checks import fail, require_array, require_number, require_shape
+from tomo_polysplat.parallel import run_tasks, split_range
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.materials import require_energies
 from tomo_polysplat.physics.spectrum import Spectrum
@@ -21,8 +22,8 @@ from tomo_polysplat.units import cm_per
 
 __all__ = ["GAUSSIAN_PARTS", "ResultData"]
 
-# Voxels of a slab.
-_AT_ONCE = 1 << 24
+# Voxels of a slab, and bytes of a part of it that one thread makes.
+_AT_ONCE, _PART = 1 << 24, 1 << 22
 GAUSSIAN_PARTS = {"position": (3,), "scale": (3,), "rotation": (4,), "density": (), "u": ()}
 
 
@@ -168,8 +169,15 @@ class ResultData:
     def _attenuation(self, kev: float | None, some: slice = slice(None)) -> np.ndarray:
         """(z, y, x) attenuation in some slices."""
         assert self.materials is not None and kev is not None
-        curves = self.materials.mass_attenuation([kev])[:, 0] * cm_per(self.unit)
-        return np.tensordot(curves.astype(np.float32), self.basis[:, some], axes=1)
+        curves = (self.materials.mass_attenuation([kev])[:, 0] * cm_per(self.unit)).astype(np.float32)
+        first, behind, _ = some.indices(self.grid.shape[0])
+        volume = np.empty((behind - first, *self.grid.shape[1:]), np.float32)
+
+        def add_up(a: int, b: int) -> None:
+            volume[a:b] = np.tensordot(curves, self.basis[:, first + a : first + b], axes=1)
+
+        run_tasks(add_up, split_range(len(volume), volume.nbytes // _PART))
+        return volume
 
     def _require_materials(self, name: str) -> None:
         if self.materials is None:

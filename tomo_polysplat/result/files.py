@@ -20,6 +20,7 @@ import numpy as np
 
 from tomo_polysplat.checks import fail, require_choice, require_number
 from tomo_polysplat.files import replacing, write_text
+from tomo_polysplat.parallel import kept_threads
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.plain_file import PlainFile
 from tomo_polysplat.plan.answer import Answer
@@ -87,6 +88,7 @@ def write_json(path: str | os.PathLike, content: Any, *, overwrite: bool) -> Non
     write_text(path, json.dumps(plain(content), indent=2) + "\n", overwrite=overwrite)
 
 
+@kept_threads()
 def save_hdf5(result: ResultData, path: str | os.PathLike, *, overwrite: bool = False) -> None:
     """See :meth:`Result.save`."""
     arrays = [result.basis, result.basis[0], *result.gaussians.values()]

@@ -14,7 +14,7 @@ import numpy as np
 
 from tomo_polysplat.checks import fail, require_array, require_number
 from tomo_polysplat.parallel import run_tasks, split_range
-from tomo_polysplat.scan.defects import attenuation, flat_and_dark
+from tomo_polysplat.scan.defects import attenuation, flat_and_dark, unusable
 
 __all__ = ["Block", "Counts", "Marks"]
 
@@ -199,12 +199,23 @@ class Counts(_MadeWhenLookedAt):
 
         `into`, a (views, rows, columns) float32 array, gets the line integrals, of which blocks then have views.
         """
+        with closing(self._stored()) as stored:
+            for part, values in stored:
+                made = None if into is None else into[part]
+                yield Block(part, *self._judged(values, self._flat, self._dark, made))
+
+    def unusable(self) -> Iterator[tuple[slice, dict[str, int]]]:
+        """Some views after others, and how many of their rays of each kind were not measured properly."""
+        with closing(self._stored()) as stored:
+            for part, values in stored:
+                yield part, self._counted(values)
+
+    def _stored(self) -> Generator[tuple[slice, np.ndarray], None, None]:
+        """All views as they are stored, some at a time, the next ones read meanwhile."""
         views = self.shape[1]
         chosen = [slice(k, min(k + self.at_once, views)) for k in range(0, views, self.at_once)]
         with self._opened() as read, closing(_ahead(read, chosen)) as ahead:
-            for part, stored in zip(chosen, ahead):
-                made = None if into is None else into[part]
-                yield Block(part, *self._judged(stored, self._flat, self._dark, made))
+            yield from zip(chosen, ahead)
 
     def some(
         self, rows: np.ndarray, views: np.ndarray, columns: np.ndarray
@@ -236,17 +247,24 @@ class Counts(_MadeWhenLookedAt):
         """What `attenuation` makes of some views, by several threads, in `made` where that is given."""
         values = np.empty(stored.shape, np.float32) if made is None else made
         usable = np.empty(stored.shape, bool)
-        # By rows, or by views where those are more.
-        by_rows = stored.shape[1] > len(stored)
 
-        def judge(a: int, b: int) -> dict[str, int]:
-            part = (slice(None), slice(a, b)) if by_rows else (slice(a, b),)
-            light, background = (image if image is None else image[part[1:]] for image in (flat, dark))
+        def judge(
+            part: tuple[slice, ...], light: np.ndarray | None, background: np.ndarray | None
+        ) -> dict[str, int]:
             into = values[part], usable[part]
             return attenuation(stored[part], self._kind, light, background, self._saturation, into)[2]
 
-        found = run_tasks(judge, split_range(stored.shape[int(by_rows)], -(-stored.size // _PART)))
-        return values, usable, {name: sum(part[name] for part in found) for name in found[0]}
+        return values, usable, _by_parts(judge, stored.shape, flat, dark)
+
+    def _counted(self, stored: np.ndarray) -> dict[str, int]:
+        """What `unusable` finds in some views, by several threads."""
+
+        def count(
+            part: tuple[slice, ...], light: np.ndarray | None, background: np.ndarray | None
+        ) -> dict[str, int]:
+            return unusable(stored[part], self._kind, light, background, self._saturation)
+
+        return _by_parts(count, stored.shape, self._flat, self._dark)
 
     def _made(self, rows: np.ndarray, views: np.ndarray, columns: np.ndarray) -> np.ndarray:
         made = np.empty((len(rows), len(views), len(columns)), np.float32)
@@ -298,6 +316,22 @@ def _needed(key: Any, length: int) -> tuple[np.ndarray, Any]:
         return (wanted, slice(None)) if key.step > 0 else (wanted[::-1], slice(None, None, -1))
     chosen, place = np.unique(wanted, return_inverse=True)
     return chosen, place.reshape(wanted.shape)
+
+
+def _by_parts(
+    look: Callable[..., dict[str, int]],
+    shape: tuple[int, ...],
+    flat: np.ndarray | None,
+    dark: np.ndarray | None,
+) -> dict[str, int]:
+    """Sums of what a function counts in parts of (views, rows, columns), with the light of their pixels."""
+    # By rows, or by views where those are more.
+    by_rows = shape[1] > shape[0]
+    ends = split_range(shape[int(by_rows)], -(-prod(shape) // _PART))
+    parts = [(slice(None), slice(a, b)) if by_rows else (slice(a, b),) for a, b in ends]
+    lights = [tuple(image if image is None else image[part[1:]] for image in (flat, dark)) for part in parts]
+    found = run_tasks(look, [(part, *light) for part, light in zip(parts, lights)])
+    return {name: sum(one[name] for one in found) for name in found[0]}
 
 
 def _ahead(read: Read, chosen: Sequence[slice]) -> Generator[np.ndarray, None, None]:

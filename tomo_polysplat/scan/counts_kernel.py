@@ -8,7 +8,7 @@ import numpy as np
 
 from tomo_polysplat.compiled import njit
 
-__all__ = ["KINDS", "line_integrals_of_counts"]
+__all__ = ["KINDS", "count_kinds", "line_integrals_of_counts"]
 
 # What a ray may be that was not measured properly, in the order in which it is asked.
 KINDS = ("not_finite", "saturated", "dead_pixel", "no_light")
@@ -50,3 +50,21 @@ def line_integrals_of_counts(counts, flat, dark, limit, made, usable, found):
             usable[row, column] = kind == 0
             if kind:
                 found[kind - 1] += 1
+
+
+@njit(nogil=True, cache=True)
+def count_kinds(counts, flat, dark, limit, found):
+    """What `line_integrals_of_counts` adds to ``found``, without a logarithm."""
+    not_finite, saturated, dead, no_light = 0, 0, 0, 0
+    for row in range(counts.shape[0]):
+        for column in range(counts.shape[1]):
+            value, background = np.float64(counts[row, column]), dark[row, column]
+            light = flat[row, column] - background
+            finite, below = math.isfinite(value), value < limit
+            lit = math.isfinite(light) and light > 0
+            not_finite += not finite
+            saturated += finite & (not below)
+            dead += finite & below & (not lit)
+            no_light += finite & below & lit & (value <= background)
+    for kind, number in enumerate((not_finite, saturated, dead, no_light)):
+        found[kind] += number

@@ -9,9 +9,9 @@ import numpy as np
 
 from tomo_polysplat.checks import fail, require_shape
 from tomo_polysplat.parallel import cpu_threads, run_tasks, split_range
-from tomo_polysplat.scan.counts_kernel import KINDS, line_integrals_of_counts
+from tomo_polysplat.scan.counts_kernel import KINDS, count_kinds, line_integrals_of_counts
 
-__all__ = ["attenuation", "fill_invalid", "flat_and_dark"]
+__all__ = ["attenuation", "fill_invalid", "flat_and_dark", "unusable"]
 
 logger = logging.getLogger(__name__)
 
@@ -84,10 +84,7 @@ def attenuation(
     """
     made, usable = (np.empty(values.shape, dtype) for dtype in (np.float32, bool)) if into is None else into
     if kind == "counts":
-        if flat is None or dark is None:
-            remedy = "counts cannot be used without them"
-            raise fail("flat, dark", "open-beam and dark images", "None", remedy)
-        return made, usable, _of_counts(values, flat, dark, saturation, made, usable)
+        return made, usable, _of_counts(values, flat, dark, saturation, (made, usable))
     if kind == "attenuation":
         # Values beyond float32 count as infinite.
         with np.errstate(over="ignore"):
@@ -107,21 +104,40 @@ def attenuation(
     return made, usable, counts
 
 
+def unusable(
+    values: np.ndarray,
+    kind: str,
+    flat: np.ndarray | None = None,
+    dark: np.ndarray | None = None,
+    saturation: float | None = None,
+) -> dict[str, int]:
+    """The counts that `attenuation` gives of the same parameters; of detector counts without a logarithm."""
+    if kind == "counts":
+        return _of_counts(values, flat, dark, saturation)
+    return attenuation(values, kind)[2]
+
+
 def _of_counts(
     values: np.ndarray,
-    flat: np.ndarray,
-    dark: np.ndarray,
+    flat: np.ndarray | None,
+    dark: np.ndarray | None,
     saturation: float | None,
-    made: np.ndarray,
-    usable: np.ndarray,
+    into: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> dict[str, int]:
+    """How many rays of each kind there are; line integrals, and which are valid, go into two arrays, if any."""
+    if flat is None or dark is None:
+        raise fail("flat, dark", "open-beam and dark images", "None", "counts cannot be used without them")
     limit = np.iinfo(values.dtype).max if saturation is None and values.dtype.kind in "iu" else saturation
     # Two types are compiled: that of most cameras, and one that holds the numbers of all others.
     one = np.dtype(np.uint16 if values.dtype == np.uint16 else np.float64)
     flat, dark = (np.ascontiguousarray(image, np.float64) for image in (flat, dark))
     found, end = np.zeros(len(KINDS), np.int64), math.inf if limit is None else float(limit)
-    for view, lines, good in zip(values, made, usable):
-        line_integrals_of_counts(np.ascontiguousarray(view, one), flat, dark, end, lines, good, found)
+    for number, view in enumerate(values):
+        given = np.ascontiguousarray(view, one), flat, dark, end
+        if into is None:
+            count_kinds(*given, found)
+        else:
+            line_integrals_of_counts(*given, into[0][number], into[1][number], found)
     counts = {name: int(number) for name, number in zip(KINDS, found)}
     return {name: number for name, number in counts.items() if name != "saturated" or limit is not None}
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
 from tomo_polysplat.checks import fail
 from tomo_polysplat.free_memory import available_memory
+from tomo_polysplat.parallel import kept_threads
 from tomo_polysplat.progress import progress_reports
 from tomo_polysplat.scan.counts import Counts
 
@@ -48,28 +50,36 @@ def line_integrals(
         sizes = (f"{size / 2**30:.1f} GiB" for size in (memory, needed))
         raise fail("path", f"at most {next(sizes)}, the free memory", next(sizes), remedy, MemoryError)
     projections, valid = np.empty(counts.shape, np.float32), np.empty(counts.shape, bool)
-    return projections, valid, _read(counts, progress, projections, valid)
+    with _reading(counts, progress) as add:
+        for block in counts.blocks():
+            projections[:, block.views] = block.values.transpose(1, 0, 2)
+            valid[:, block.views] = block.usable.transpose(1, 0, 2)
+            rays = add(block.views, block.found)
+    return projections, valid, rays
 
 
 def looked_through(counts: Counts, progress: Progress = None) -> dict[str, int]:
     """How many rays of each kind were found, without keeping any: a damaged file is refused at once."""
-    counts.found = _read(counts, progress)
+    with _reading(counts, progress) as add:
+        for views, found in counts.unusable():
+            counts.found = add(views, found)
+    assert counts.found is not None
     return counts.found
 
 
-def _read(
-    counts: Counts,
-    progress: Progress,
-    projections: np.ndarray | None = None,
-    valid: np.ndarray | None = None,
-) -> dict[str, int]:
+@contextmanager
+def _reading(
+    counts: Counts, progress: Progress
+) -> Iterator[Callable[[slice, dict[str, int]], dict[str, int]]]:
+    """What adds up how many rays of each kind some views have, and reports how far they are; by kept threads."""
     rays: dict[str, int] = {}
     at_once = progress is None and counts.shape[1] <= counts.at_once
-    with progress_reports(False if at_once else progress) as report:
-        for block in counts.blocks():
-            if projections is not None and valid is not None:
-                projections[:, block.views] = block.values.transpose(1, 0, 2)
-                valid[:, block.views] = block.usable.transpose(1, 0, 2)
-            rays = {name: rays.get(name, 0) + count for name, count in block.found.items()}
-            report(block.views.stop / counts.shape[1], "reading")
-    return rays
+    with kept_threads(), progress_reports(False if at_once else progress) as report:
+
+        def add(views: slice, found: dict[str, int]) -> dict[str, int]:
+            for name, count in found.items():
+                rays[name] = rays.get(name, 0) + count
+            report(views.stop / counts.shape[1], "reading")
+            return rays
+
+        yield add

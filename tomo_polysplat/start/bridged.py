@@ -38,6 +38,8 @@ _MOST_OF_RAYS = 0.5
 _JUDGES = 24
 # Steps along all rays beyond which the two more projections would take minutes on two CPU cores.
 _MOST_STEPS = 1e10
+# Voxels along the longest edge beyond which the prior has larger ones: what bridges need not be as fine as the volume.
+_PRIOR = 512
 # Rays that are looked at together: the memory is not to hold copies of all.
 _AT_ONCE = {"cuda": 1 << 28, "cpu": 1 << 22}
 
@@ -121,7 +123,7 @@ def _better(
         return volume, f"; metal not bridged: {covered:.0%} of the object's rays pass through it"
     views = evenly_spread(len(rays), _JUDGES)
     beside = rays[torch.from_numpy(views).to(rays.device)]
-    bridged = torch.where(mask, volume, _made_without(rays, mask, geometry, grid, pair, metal))
+    bridged = torch.where(mask, volume, _made_without(rays, mask, geometry, grid, metal))
     before, after = (_misfit(each, views, beside, pair) for each in (volume, bridged))
     words = f"misses the rays beside it by {after:.2g}, a start with all rays by {before:.2g}"
     if after < before:
@@ -189,29 +191,70 @@ def normalising_volume(volume: torch.Tensor, mask: torch.Tensor, soft: float, me
 
 
 def _made_without(
-    rays: torch.Tensor,
-    mask: torch.Tensor,
-    geometry: Geometry,
-    grid: VolumeGrid,
-    pair: ProjectorPair,
-    metal: float,
+    rays: torch.Tensor, mask: torch.Tensor, geometry: Geometry, grid: VolumeGrid, metal: float
 ) -> torch.Tensor:
     """The volume of rays of which those through metal, NaN, are bridged in place."""
-    first, _ = initial_volume_on(rays, geometry, grid)
-    main = mass_level(first.masked_fill_(mask, 0.0))
-    prior, thickness = normalising_volume(first, mask, main, metal), torch.empty_like(rays)
-    for some, lines in projected(prior, pair, geometry, grid, _portions(rays)):
-        thickness[some[0] : some[-1] + 1] = lines
+    thickness = _prior_seen(rays, mask, geometry, grid, metal)
     least = THIN * float(thickness.max())
     for some in _portions(rays):
         whole = slice(some[0], some[-1] + 1)
-        part, known = thickness[whole], rays[whole]
+        known = rays[whole]
+        part = _as_fine(thickness[whole], known.shape[1:])
         thick = part > least
         ratio = torch.where(thick, known / part.clamp(min=1e-12), 0.0)
         rays[whole] = torch.where(thick, fill_rows(ratio) * part, fill_rows(known))
-    del first, prior, thickness, part, known
+    del thickness, part, known
     second, _ = initial_volume_on(rays, geometry, grid)
     return second
+
+
+def _prior_seen(
+    rays: torch.Tensor, mask: torch.Tensor, geometry: Geometry, grid: VolumeGrid, metal: float
+) -> torch.Tensor:
+    """(views, rows, columns) line integrals of the prior, by joined pixels where the volume has many voxels."""
+    factor = -(-max(grid.shape) // _PRIOR)
+    if factor > 1:
+        rays, geometry = _joined(rays, factor), geometry.binned(factor, min(factor, geometry.rows))
+        nz, ny, nx = (max(n // factor, 1) for n in grid.shape)
+        grid = VolumeGrid((nz, ny, nx), grid.lower, grid.upper)
+        mask = _by_larger_voxels(mask, grid.shape)
+    first, _ = initial_volume_on(rays, geometry, grid)
+    prior = normalising_volume(first, mask, mass_level(first.masked_fill_(mask, 0.0)), metal)
+    thickness = torch.empty_like(rays)
+    with projector_pair(geometry, grid, prior.device) as pair:
+        for some, lines in projected(prior, pair, geometry, grid, _portions(rays)):
+            thickness[some[0] : some[-1] + 1] = lines
+    return thickness
+
+
+def _joined(rays: torch.Tensor, factor: int) -> torch.Tensor:
+    """Means of so many rows and columns together, of those that are no NaN; the rest at the far ends is dropped."""
+    rows, columns = min(factor, rays.shape[1]), factor
+    height, width = rays.shape[1] // rows, rays.shape[2] // columns
+    joined = rays.new_empty((len(rays), height, width))
+    for some in _portions(rays):
+        part = rays[some[0] : some[-1] + 1, : height * rows, : width * columns]
+        joined[some] = part.reshape(len(some), height, rows, width, columns).nanmean(dim=(2, 4))
+    return joined
+
+
+def _by_larger_voxels(mask: torch.Tensor, shape: tuple[int, ...]) -> torch.Tensor:
+    """Which of fewer voxels hold any of a mask's."""
+    sizes = torch.tensor(mask.shape, device=mask.device)
+    places = mask.nonzero() * torch.tensor(shape, device=mask.device) // sizes
+    larger = torch.zeros(shape, dtype=torch.bool, device=mask.device)
+    larger[places[:, 0], places[:, 1], places[:, 2]] = True
+    return larger
+
+
+def _as_fine(joined: torch.Tensor, shape: torch.Size) -> torch.Tensor:
+    """Images of joined pixels, interpolated at the pixels; what was dropped at the far ends is as what lies beside."""
+    if joined.shape[1:] == shape:
+        return joined
+    factors = [float(length // few) for length, few in zip(shape, joined.shape[1:])]
+    fine = torch.nn.functional.interpolate(joined[None], scale_factor=factors, mode="bilinear")
+    beyond = [length - there for length, there in zip(shape, fine.shape[2:])]
+    return torch.nn.functional.pad(fine, (0, beyond[1], 0, beyond[0]), mode="replicate")[0]
 
 
 def _portions(rays: torch.Tensor) -> Iterator[np.ndarray]:
