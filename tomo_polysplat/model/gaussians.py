@@ -14,7 +14,7 @@ import torch
 
 from tomo_polysplat.transfer import copied
 
-__all__ = ["OF_ALL", "Gaussians"]
+__all__ = ["OF_ALL", "Gaussians", "shares_of_curves"]
 
 # Parameters that belong to no single Gaussian.
 OF_ALL = ("shared_material", "blur")
@@ -121,5 +121,10 @@ class Gaussians:
         if curve is None:
             return self.attenuation[None]
         u = self.material()
-        mixture = torch.stack([(1 - u).square(), 2 * u * (1 - u), u.square()])
+        mixture = shares_of_curves(u)
         return mixture * (self.attenuation / (curve @ mixture))
+
+
+def shares_of_curves(u: torch.Tensor) -> torch.Tensor:
+    """(3, n) shares of the soft, middle and dense curve for material numbers (n,); sum 1."""
+    return torch.stack([(1 - u).square(), 2 * u * (1 - u), u.square()])

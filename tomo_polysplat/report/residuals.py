@@ -13,8 +13,8 @@ from tomo_polysplat.evenly_spread import evenly_spread
 from tomo_polysplat.kernels.project.autograd import project
 from tomo_polysplat.kernels.select import choose, pick_fast_device
 from tomo_polysplat.kernels.views import DetectorViews
+from tomo_polysplat.model.gaussians import shares_of_curves
 from tomo_polysplat.parallel import kept_threads
-from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.detector_blur import LARGEST_BLUR, blurred
 from tomo_polysplat.physics.filter_map import FilterMap
 from tomo_polysplat.physics.pixel_light import averaged_light
@@ -28,6 +28,7 @@ from tomo_polysplat.result.residuals import Residuals
 from tomo_polysplat.scan.geometry import from_astra, is_planar_geometry
 from tomo_polysplat.scan.noise import RayNoise, ray_noise
 from tomo_polysplat.scan.usable import usable_rays
+from tomo_polysplat.transfer import to_device
 from tomo_polysplat.units import cm_per
 
 if TYPE_CHECKING:
@@ -133,11 +134,16 @@ class _Model:
         self.kernel, _ = choose(device)
         self.physics: RayPhysics = ray_physics(result.plan)
         parts = {name: np.asarray(part, np.float32) for name, part in result.gaussians.items()}
-        density, u = parts["density"], parts["u"]
-        shares = np.ones((1, len(u))) if result.materials is None else Materials.mixture(u)
         dims = 2 if views.planar else 3
-        arrays = (parts["position"], parts["scale"][:, :dims], parts["rotation"], density * shares)
-        self.gaussians = [torch.from_numpy(np.ascontiguousarray(a, np.float32)).to(device) for a in arrays]
+        arrays = (
+            parts["position"],
+            parts["scale"][:, :dims],
+            parts["rotation"],
+            parts["density"][None],
+            parts["u"],
+        )
+        *where, weight, u = (to_device(np.ascontiguousarray(array), device) for array in arrays)
+        self.gaussians = [*where, weight if result.materials is None else weight * shares_of_curves(u)]
         self.lines = self._spectral_lines(result)
         self.dimmed = None
         self.behind: tuple[torch.Tensor, ...] = ()

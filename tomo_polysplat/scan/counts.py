@@ -249,7 +249,7 @@ class Counts(_MadeWhenLookedAt):
         usable = np.empty(stored.shape, bool)
 
         def judge(
-            part: tuple[slice, ...], light: np.ndarray | None, background: np.ndarray | None
+            part: tuple[slice, slice], light: np.ndarray | None, background: np.ndarray | None
         ) -> dict[str, int]:
             into = values[part], usable[part]
             return attenuation(stored[part], self._kind, light, background, self._saturation, into)[2]
@@ -260,7 +260,7 @@ class Counts(_MadeWhenLookedAt):
         """What `unusable` finds in some views, by several threads."""
 
         def count(
-            part: tuple[slice, ...], light: np.ndarray | None, background: np.ndarray | None
+            part: tuple[slice, slice], light: np.ndarray | None, background: np.ndarray | None
         ) -> dict[str, int]:
             return unusable(stored[part], self._kind, light, background, self._saturation)
 
@@ -318,6 +318,18 @@ def _needed(key: Any, length: int) -> tuple[np.ndarray, Any]:
     return chosen, place.reshape(wanted.shape)
 
 
+def _parts(shape: tuple[int, ...]) -> list[tuple[slice, slice]]:
+    """Views and rows of each part that a thread looks at: some rows of one view, or some whole views.
+
+    A view is one call of a compiled loop: threads that call it for a few rows each wait for the interpreter.
+    """
+    views, rows, columns = shape
+    if rows * columns >= _PART:
+        ends = split_range(rows, rows * columns // _PART)
+        return [(slice(view, view + 1), slice(a, b)) for view in range(views) for a, b in ends]
+    return [(slice(a, b), slice(rows)) for a, b in split_range(views, -(-prod(shape) // _PART))]
+
+
 def _by_parts(
     look: Callable[..., dict[str, int]],
     shape: tuple[int, ...],
@@ -325,11 +337,8 @@ def _by_parts(
     dark: np.ndarray | None,
 ) -> dict[str, int]:
     """Sums of what a function counts in parts of (views, rows, columns), with the light of their pixels."""
-    # By rows, or by views where those are more.
-    by_rows = shape[1] > shape[0]
-    ends = split_range(shape[int(by_rows)], -(-prod(shape) // _PART))
-    parts = [(slice(None), slice(a, b)) if by_rows else (slice(a, b),) for a, b in ends]
-    lights = [tuple(image if image is None else image[part[1:]] for image in (flat, dark)) for part in parts]
+    parts = _parts(shape)
+    lights = [tuple(image if image is None else image[part[1]] for image in (flat, dark)) for part in parts]
     found = run_tasks(look, [(part, *light) for part, light in zip(parts, lights)])
     return {name: sum(one[name] for one in found) for name in found[0]}
 
