@@ -38,10 +38,11 @@ _MOST_OF_RAYS = 0.5
 _JUDGES = 24
 # Steps along all rays beyond which the two more projections would take minutes on two CPU cores.
 _MOST_STEPS = 1e10
-# Voxels along the longest edge beyond which the prior has larger ones: what bridges need not be as fine as the volume.
-_PRIOR = 512
 # Rays that are looked at together: the memory is not to hold copies of all.
 _AT_ONCE = {"cuda": 1 << 28, "cpu": 1 << 22}
+
+# Rows and columns of a detector, the first and the one behind the last.
+Window = tuple[tuple[int, int], tuple[int, int]]
 
 
 # A scan, its first volume and how that was made: nothing else holds these together.
@@ -118,12 +119,12 @@ def _better(
 
     The rays are overwritten: copies of all of a large scan would not fit on a GPU.
     """
-    covered = _blanked(rays, mask, geometry, grid)
+    covered, window = _blanked(rays, mask, geometry, grid)
     if covered > _MOST_OF_RAYS:
         return volume, f"; metal not bridged: {covered:.0%} of the object's rays pass through it"
     views = evenly_spread(len(rays), _JUDGES)
     beside = rays[torch.from_numpy(views).to(rays.device)]
-    bridged = torch.where(mask, volume, _made_without(rays, mask, geometry, grid, metal))
+    bridged = torch.where(mask, volume, _made_without(rays, mask, geometry, grid, pair, metal, window))
     before, after = (_misfit(each, views, beside, pair) for each in (volume, bridged))
     words = f"misses the rays beside it by {after:.2g}, a start with all rays by {before:.2g}"
     if after < before:
@@ -134,8 +135,10 @@ def _better(
     return volume, f"; metal not bridged, which {words}"
 
 
-def _blanked(rays: torch.Tensor, mask: torch.Tensor, geometry: Geometry, grid: VolumeGrid) -> float:
-    """Make rays through metal NaN, and tell which share of the object's rays they are."""
+def _blanked(
+    rays: torch.Tensor, mask: torch.Tensor, geometry: Geometry, grid: VolumeGrid
+) -> tuple[float, Window]:
+    """Make rays through metal NaN, and tell which share of the object's rays they are, and where they end."""
     # Metal is a small part of the volume: no ray is followed outside of the box around it.
     within = box_around(mask)
     box = grid.box(within)
@@ -153,20 +156,31 @@ def box_around(mask: torch.Tensor) -> tuple[slice, slice, slice]:
     return found[0], found[1], found[2]
 
 
-def _blank(rays: torch.Tensor, dense: Iterable[tuple[np.ndarray, torch.Tensor]], wide: float) -> float:
+def _blank(
+    rays: torch.Tensor, dense: Iterable[tuple[np.ndarray, torch.Tensor]], wide: float
+) -> tuple[float, Window]:
     """What `_blanked` does, with how far each ray goes through metal, by portions of the views.
 
     ``wide`` is half a voxel: less is the
     blur of the threshold's edge, and a wider trace loses more than it heals.
     """
     least, through, known = THIN * float(largest_finite(rays)), 0, 0
+    rows, columns = (torch.zeros(n, dtype=torch.bool, device=rays.device) for n in rays.shape[1:])
     for some, lengths in dense:
         trace = lengths > wide
         part = rays[some[0] : some[-1] + 1]
         matter = part > least
         through, known = through + int((trace & matter).sum()), known + int(matter.sum())
         part.masked_fill_(trace, math.nan)
-    return through / max(known, 1)
+        met = trace.any(dim=0)
+        rows, columns = rows | met.any(dim=1), columns | met.any(dim=0)
+    return through / max(known, 1), (_ends(rows), _ends(columns))
+
+
+def _ends(met: torch.Tensor) -> tuple[int, int]:
+    """The first place that is met and the one behind the last, and one more to either side where there is one."""
+    places = met.nonzero()[:, 0].tolist() or [0]
+    return max(places[0] - 1, 0), min(places[-1] + 2, len(met))
 
 
 def normalising_volume(volume: torch.Tensor, mask: torch.Tensor, soft: float, metal: float) -> torch.Tensor:
@@ -190,71 +204,33 @@ def normalising_volume(volume: torch.Tensor, mask: torch.Tensor, soft: float, me
     return prior
 
 
+# Rays, and all that bridges them: nothing else holds these together.
 def _made_without(
-    rays: torch.Tensor, mask: torch.Tensor, geometry: Geometry, grid: VolumeGrid, metal: float
+    rays: torch.Tensor,
+    mask: torch.Tensor,
+    geometry: Geometry,
+    grid: VolumeGrid,
+    pair: ProjectorPair,
+    metal: float,
+    window: Window,
 ) -> torch.Tensor:
-    """The volume of rays of which those through metal, NaN, are bridged in place."""
-    thickness = _prior_seen(rays, mask, geometry, grid, metal)
-    least = THIN * float(thickness.max())
-    for some in _portions(rays):
-        whole = slice(some[0], some[-1] + 1)
-        known = rays[whole]
-        part = _as_fine(thickness[whole], known.shape[1:])
-        thick = part > least
-        ratio = torch.where(thick, known / part.clamp(min=1e-12), 0.0)
-        rays[whole] = torch.where(thick, fill_rows(ratio) * part, fill_rows(known))
-    del thickness, part, known
+    """The volume of rays of which those through metal, NaN, are bridged in place; they end in a window."""
+    first, _ = initial_volume_on(rays, geometry, grid)
+    main = mass_level(first.masked_fill_(mask, 0.0))
+    prior = normalising_volume(first, mask, main, metal)
+    del first
+    least = THIN * float(pair.forward(prior, evenly_spread(len(rays), _JUDGES)).max())
+    near = geometry.cropped(*window)
+    rows, columns = (slice(*ends) for ends in window)
+    with projector_pair(near, grid, prior.device) as beside:
+        for some, part in projected(prior, beside, near, grid, _portions(rays)):
+            known = rays[some[0] : some[-1] + 1, rows, columns]
+            thick = part > least
+            ratio = torch.where(thick, known / part.clamp(min=1e-12), 0.0)
+            known.copy_(torch.where(thick, fill_rows(ratio) * part, fill_rows(known)))
+    del prior, part, known, thick, ratio
     second, _ = initial_volume_on(rays, geometry, grid)
     return second
-
-
-def _prior_seen(
-    rays: torch.Tensor, mask: torch.Tensor, geometry: Geometry, grid: VolumeGrid, metal: float
-) -> torch.Tensor:
-    """(views, rows, columns) line integrals of the prior, by joined pixels where the volume has many voxels."""
-    factor = -(-max(grid.shape) // _PRIOR)
-    if factor > 1:
-        rays, geometry = _joined(rays, factor), geometry.binned(factor, min(factor, geometry.rows))
-        nz, ny, nx = (max(n // factor, 1) for n in grid.shape)
-        grid = VolumeGrid((nz, ny, nx), grid.lower, grid.upper)
-        mask = _by_larger_voxels(mask, grid.shape)
-    first, _ = initial_volume_on(rays, geometry, grid)
-    prior = normalising_volume(first, mask, mass_level(first.masked_fill_(mask, 0.0)), metal)
-    thickness = torch.empty_like(rays)
-    with projector_pair(geometry, grid, prior.device) as pair:
-        for some, lines in projected(prior, pair, geometry, grid, _portions(rays)):
-            thickness[some[0] : some[-1] + 1] = lines
-    return thickness
-
-
-def _joined(rays: torch.Tensor, factor: int) -> torch.Tensor:
-    """Means of so many rows and columns together, of those that are no NaN; the rest at the far ends is dropped."""
-    rows, columns = min(factor, rays.shape[1]), factor
-    height, width = rays.shape[1] // rows, rays.shape[2] // columns
-    joined = rays.new_empty((len(rays), height, width))
-    for some in _portions(rays):
-        part = rays[some[0] : some[-1] + 1, : height * rows, : width * columns]
-        joined[some] = part.reshape(len(some), height, rows, width, columns).nanmean(dim=(2, 4))
-    return joined
-
-
-def _by_larger_voxels(mask: torch.Tensor, shape: tuple[int, ...]) -> torch.Tensor:
-    """Which of fewer voxels hold any of a mask's."""
-    sizes = torch.tensor(mask.shape, device=mask.device)
-    places = mask.nonzero() * torch.tensor(shape, device=mask.device) // sizes
-    larger = torch.zeros(shape, dtype=torch.bool, device=mask.device)
-    larger[places[:, 0], places[:, 1], places[:, 2]] = True
-    return larger
-
-
-def _as_fine(joined: torch.Tensor, shape: torch.Size) -> torch.Tensor:
-    """Images of joined pixels, interpolated at the pixels; what was dropped at the far ends is as what lies beside."""
-    if joined.shape[1:] == shape:
-        return joined
-    factors = [float(length // few) for length, few in zip(shape, joined.shape[1:])]
-    fine = torch.nn.functional.interpolate(joined[None], scale_factor=factors, mode="bilinear")
-    beyond = [length - there for length, there in zip(shape, fine.shape[2:])]
-    return torch.nn.functional.pad(fine, (0, beyond[1], 0, beyond[0]), mode="replicate")[0]
 
 
 def _portions(rays: torch.Tensor) -> Iterator[np.ndarray]:
