@@ -42,6 +42,8 @@ scan = watched.simulate_scan("pins", size=12, views=20)
 for ending in ("npz", "h5"):
     watched.save_scan(scan, f"scan.{ending}")
     watched.load_scan(f"scan.{ending}")
+# It takes two seconds, and nothing so far has need of it.
+print(*{"torch"} & {*sys.modules})
 watched.register()
 import torch
 torch.set_num_threads(2)

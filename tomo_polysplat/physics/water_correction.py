@@ -17,7 +17,6 @@ from numpy.typing import DTypeLike
 from tomo_polysplat.checks import fail, require_array
 from tomo_polysplat.parallel import run_tasks, split_range
 from tomo_polysplat.physics.spectrum import Spectrum
-from tomo_polysplat.physics.water import water_linearised
 
 __all__ = [
     "describe_polynomial",
@@ -73,6 +72,9 @@ def usual_water_correction(spectrum: Spectrum, largest: float) -> tuple[float, .
     """
     if not 0 < largest < np.inf:
         raise fail("largest", "a value above 0", repr(largest), "give the largest value of the projections")
+    # Torch is not loaded where a scan is only read.
+    from tomo_polysplat.physics.water import water_linearised
+
     # Beyond what is needed, so that noise on the largest value is undone too.
     measured = 1.2 * largest * np.linspace(0.0, 1.0, _TABLE)[1:]
     wanted = water_linearised(measured, spectrum)
