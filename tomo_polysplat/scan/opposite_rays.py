@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -127,7 +128,7 @@ class OppositeRays:
         first, past, gap = self._met(offset, lines, columns)
         second, share = (first + 1) % many, past / np.where(gap > 0, gap, 1)
         usable = (gap > 0) & (gap <= _GAP * self._step)
-        (a, use_a), (b, use_b) = (self._mirrored(offset, view, columns) for view in (first, second))
+        (a, use_a), (b, use_b) = self._mirrored(offset, columns, first, second)
         opposite = (1 - share[..., None]) * a + share[..., None] * b
         own, steep = (part[lines][:, columns] for part in (self._smooth, self._steep))
         return own, -2 * steep, opposite, use_a & use_b & usable[..., None] & self._good[lines][:, columns]
@@ -156,7 +157,7 @@ class OppositeRays:
             return np.zeros((2, len(columns), self.values.shape[2]))
         first, past, gap = self._met(offset, lines, columns)
         views = [(first + step) % len(self.azimuth) for step in (-1, 0, 1, 2)]
-        values, good = zip(*(self._mirrored(offset, view, columns) for view in views))
+        values, good = zip(*self._mirrored(offset, columns, *views))
         gaps = [np.mod(self._gaps[view], 2 * np.pi)[..., None] for view in views[:3]]
         even = [(step > 0) & (step <= _GAP * self._step) for step in gaps]
         steep = [
@@ -203,16 +204,16 @@ class OppositeRays:
         """
         many = len(self.azimuth)
         place = {}
-        for k in (-3, -2, -1):
-            view = np.full((1, len(columns)), many + k)
-            place[k] = tuple(part[0] for part in self._mirrored(offset, view, columns))
+        views = [np.full((1, len(columns)), many + k) for k in (-3, -2, -1)]
+        for k, mirrored in zip((-3, -2, -1), self._mirrored(offset, columns, *views)):
+            place[k] = tuple(part[0] for part in mirrored)
         for k in (0, 1, 2):
             place[k] = self._smooth[k, columns], self._good[k, columns]
         return _across(place, columns)
 
     def _mirrored(
-        self, offset: float, views: np.ndarray, columns: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self, offset: float, columns: np.ndarray, *views: np.ndarray
+    ) -> list[tuple[np.ndarray, np.ndarray]]:
         """Values (lines, columns, rows) of views (lines, columns) at mirrored columns, and whether they are good."""
         most = self.values.shape[1] - 1
         where = 2 * (self.axis + offset) - columns
@@ -226,13 +227,23 @@ class OppositeRays:
             (1 + 3 * f + 3 * f**2 - 3 * f**3) / 6,
             f**3 / 6,
         )
-        values = np.zeros((*views.shape, self.values.shape[2]))
-        for step, weight in zip((-1, 0, 1, 2), weights):
-            column = np.abs(left + step)
-            column = np.clip(np.where(column > most, 2 * most - column, column), 0, most)
-            values += weight[:, None] * self._spline[views, column]
+        places = [np.abs(left + step) for step in (-1, 0, 1, 2)]
+        places = [np.clip(np.where(place > most, 2 * most - place, place), 0, most) for place in places]
         near = np.clip(np.round(where).astype(int), 0, most)
-        return values, self._good[views, near] & inside[:, None]
+
+        def summed(some: Any, shape: tuple[int, ...]) -> np.ndarray:
+            values = np.zeros((*shape, self.values.shape[2]))
+            for place, weight in zip(places, weights):
+                values += weight[:, None] * self._spline[some, place]
+            return values
+
+        good = [self._good[view, near] & inside[:, None] for view in views]
+        many = len(self.values)
+        if sum(len(view) for view in views) < many:
+            return [(summed(view, view.shape), usable) for view, usable in zip(views, good)]
+        # Of few views each one's are made once.
+        whole, all_columns = summed(slice(None), (many, len(columns))), np.arange(len(columns))
+        return [(whole[view, all_columns], usable) for view, usable in zip(views, good)]
 
     @cached_property
     def _share(self) -> np.ndarray:
