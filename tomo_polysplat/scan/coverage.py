@@ -35,40 +35,64 @@ def coverage(
     float32 array, shape (z, y, x)
         From 0, not measured, to 1.
     """
-    views = evenly_spread(geometry.views, most_views)
-    some = geometry.select(views)
-    x, y, z = grid.axes()
-    if geometry.planar:
-        # A fan sees its plane, whatever height its pixels are told to have.
-        z = np.full_like(z, float(geometry.centre[0, 2]))
+    some, (x, y, z) = _looked_at(geometry, grid, most_views)
+    pixels, views = None if pixels is None or pixels.all() else pixels, _matrices(some)
     layers = max(1, _AT_ONCE // (len(x) * len(y)))
     seen = np.zeros(grid.shape, np.float32)
     for first in range(0, len(z), layers):
-        seen[first : first + layers] = _share(some, (x, y, z[first : first + layers]), pixels)
-    return seen
+        part, places = seen[first : first + layers], (x, y[:, None], z[first : first + layers, None, None])
+        for view in views:
+            part += _sees(some, view, places, pixels)
+    return seen / some.views
 
 
 def unseen_share(geometry: Geometry, grid: VolumeGrid, pixels: np.ndarray | None = None) -> float:
     """Share of the volume that no view sees, by some voxels and views of it; see `coverage`."""
     slices, rows, columns = (min(n, _FEW_VOXELS) for n in grid.shape)
     coarse = VolumeGrid((slices, rows, columns), grid.lower, grid.upper)
-    return float(np.mean(coverage(geometry, coarse, pixels, _FEW_VIEWS) == 0))
+    some, (x, y, z) = _looked_at(geometry, coarse, _FEW_VIEWS)
+    pixels = None if pixels is None or pixels.all() else pixels
+    unseen = tuple(along.ravel() for along in np.meshgrid(x, y, z))
+    for view in _matrices(some):
+        if not len(unseen[0]):
+            break
+        left = ~_sees(some, view, unseen, pixels)
+        unseen = tuple(along[left] for along in unseen)
+    return len(unseen[0]) / (slices * rows * columns)
 
 
-def _share(geometry: Geometry, axes: tuple[np.ndarray, ...], pixels: np.ndarray | None) -> np.ndarray:
-    """Share of the views that see each voxel of some axes x, y and z, (z, y, x)."""
-    seen = np.zeros([len(along) for along in reversed(axes)], np.float32)
-    matrices, references = geometry.projection_matrices()
-    for matrix, reference in zip(matrices, references):
-        x, y, z = (along - origin for along, origin in zip(axes, reference))
-        # Sums of what the axes add: a product of such narrow matrices leaves BLAS's threads waiting for each other.
-        column, row, depth = (a * x + (b * y)[:, None] + (c * z)[:, None, None] for a, b, c in matrix)
-        if geometry.beam == "cone":
-            depth[depth <= 0] = np.nan
-            column, row = column / depth, row / depth
-        column, row = column + 0.5, row + 0.5
-        inside = (column >= 0) & (column < geometry.columns) & (row >= 0) & (row < geometry.rows)
-        if pixels is not None:
-            inside[inside] = pixels[row[inside].astype(int), column[inside].astype(int)]
-        seen += inside
-    return seen / geometry.views
+def _looked_at(
+    geometry: Geometry, grid: VolumeGrid, most: int
+) -> tuple[Geometry, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """So many views at most, evenly spread, and the voxels' places along x, y and z."""
+    x, y, z = grid.axes()
+    if geometry.planar:
+        # A fan sees its plane, whatever height its pixels are told to have.
+        z = np.full_like(z, float(geometry.centre[0, 2]))
+    return geometry.select(evenly_spread(geometry.views, most)), (x, y, z)
+
+
+def _matrices(geometry: Geometry) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Of each view, what takes places to the detector, and from where."""
+    return list(zip(*geometry.projection_matrices()))
+
+
+def _sees(
+    geometry: Geometry,
+    view: tuple[np.ndarray, np.ndarray],
+    places: tuple[np.ndarray, ...],
+    pixels: np.ndarray | None,
+) -> np.ndarray:
+    """Whether a view sees each place, of arrays x, y and z that are broadcast; with one of the ``pixels``, if told."""
+    matrix, reference = view
+    x, y, z = (along - origin for along, origin in zip(places, reference))
+    # Sums of what the axes add: a product of such narrow matrices leaves BLAS's threads waiting for each other.
+    column, row, depth = (a * x + b * y + c * z for a, b, c in matrix)
+    if geometry.beam == "cone":
+        depth[depth <= 0] = np.nan
+        column, row = column / depth, row / depth
+    column, row = column + 0.5, row + 0.5
+    inside = (column >= 0) & (column < geometry.columns) & (row >= 0) & (row < geometry.rows)
+    if pixels is not None:
+        inside[inside] = pixels[row[inside].astype(int), column[inside].astype(int)]
+    return inside
