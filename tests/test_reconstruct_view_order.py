@@ -80,4 +80,3 @@ def test_a_run_goes_on_with_the_views_in_another_order(tmp_path):
     assert path.exists()
     resumed = reconstruct(scan, projections, proj_geom, settings=settings, checkpoint=path, resume=True)
     assert np.array_equal(resumed.volume, whole.volume)
-

@@ -10,14 +10,32 @@ DISCS = (((0.0, 0.0, 0.0), 20.0, 0.02), ((8.0, -6.0, 0.0), 6.0, 0.03), ((-9.0, 1
 def chords(geometry, spheres, scale=1.0):
     """Projections (views, rows, columns) float32; lengths times ``scale``."""
     projections = np.zeros(geometry.shape)
-    for view in range(geometry.views):
-        origins, directions = geometry.rays(view)
-        for centre, radius, value in spheres:
-            to_centre = scale * np.asarray(centre) - origins
-            along = np.einsum("...i,...i", to_centre, directions)
-            missed = np.einsum("...i,...i", to_centre, to_centre) - along**2
-            projections[view] += 2 * value * np.sqrt(np.maximum((scale * radius) ** 2 - missed, 0))
+    for centre, radius, value in spheres:
+        projections += value * paths(geometry, scale * np.asarray(centre), scale * radius)
     return projections.astype(np.float32)
+
+
+def paths(geometry, centre, radius, flat=(1.0, 1.0, 1.0)):
+    """Lengths (views, rows, columns) of rays inside of an ellipsoid whose half-axes are ``radius / flat``.
+
+    A ray is at ``begin + t ahead``; numbers of axes, one by one, are several times as quick as vectors of three.
+    """
+    lengths, flat = np.empty(geometry.shape), np.asarray(flat)
+    column, row = np.arange(geometry.columns), np.arange(geometry.rows)[:, None]
+    for view in range(geometry.views):
+        origin, corner, u, v = (getattr(geometry, name)[view] for name in ("origin", "corner", "u", "v"))
+        parallel = geometry.beam == "parallel"
+        pixels = [
+            start + column * across + row * down
+            for start, across, down in zip(corner - (centre if parallel else origin), u, v)
+        ]
+        begin, ahead = (pixels, origin) if parallel else (origin - centre, pixels)
+        square = sum((f * d) ** 2 for f, d in zip(flat, ahead))
+        product = sum(f**2 * b * d for f, b, d in zip(flat, begin, ahead))
+        beyond = sum((f * b) ** 2 for f, b in zip(flat, begin)) - radius**2
+        inside = 2 * np.sqrt(np.maximum(product**2 - square * beyond, 0)) / square
+        lengths[view] = inside * np.sqrt(sum(d**2 for d in ahead))
+    return lengths
 
 
 def distance(grid, centre):

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from start_phantoms import SPHERES, chords, distance, relative_error
+from start_phantoms import SPHERES, chords, distance, paths, relative_error
 
 from tomo_polysplat.scan.geometry import from_astra, to_astra
 from tomo_polysplat.scan.moves import Scanner, moved_geometry
@@ -153,15 +153,9 @@ def plates():
 def of_plates(proj_geom):
     """Error of the volume against the truth, relative."""
     geometry, grid = from_astra(proj_geom, VOLUME)
-    projections = np.zeros(geometry.shape)
-    for centre, wide, high in PLATES:
-        flat = np.array([1.0, 1.0, wide / high])
-        for view in range(geometry.views):
-            origins, directions = ((part * flat) for part in geometry.rays(view))
-            local = origins - centre * flat
-            along, square = (np.einsum("...i,...i", part, directions) for part in (local, directions))
-            inside = along**2 - square * (np.einsum("...i,...i", local, local) - wide**2)
-            projections[view] += 2 * np.sqrt(np.maximum(inside, 0)) / square
+    projections = sum(
+        paths(geometry, np.array(centre), wide, (1.0, 1.0, wide / high)) for centre, wide, high in PLATES
+    )
     volume = fdk(projections.astype(np.float32), geometry, grid)
     return relative_error(volume, plates(), distance(grid, (0, 0, 0)) < 24)
 
