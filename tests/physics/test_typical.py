@@ -30,7 +30,9 @@ def test_it_is_what_sorting_gives(monkeypatch, dtype, kind):
             values = -values
         values[rng.random(values.shape) < 0.1] = np.nan
         values[0, 0, :3] = np.inf, -np.inf, np.nan
-        assert typical_value(torch.from_numpy(values)) == sorted_out(values)
+        for few in (0, len(values.ravel())):
+            monkeypatch.setattr(typical, "_FEW", few)
+            assert typical_value(torch.from_numpy(values)) == sorted_out(values)
         assert float(largest_finite(torch.from_numpy(values))) == values[np.isfinite(values)].max()
 
 
