@@ -13,7 +13,7 @@ from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.plan import axis
 from tomo_polysplat.plan.alignment import moves_of
 from tomo_polysplat.plan.coarse import joined_pixels
-from tomo_polysplat.plan.means import Means
+from tomo_polysplat.plan.fit_options import FitOptions
 from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.scan.layout import vector_form
 from tomo_polysplat.settings import make_settings
@@ -80,7 +80,7 @@ def test_what_no_ray_confirms_is_not_moved(align):
 def problem_off(columns):
     projections = np.ascontiguousarray(fan().projections.transpose(1, 0, 2))
     problem = Problem.of(projections, *from_astra(off(fan(), columns), fan().vol_geom), "cm", None, None)
-    return problem, Means(make_settings("balanced", None), None, 0, torch.device("cpu")), lambda *_: None
+    return problem, FitOptions(make_settings("balanced", None), None, 0, torch.device("cpu")), lambda *_: None
 
 
 def test_a_move_that_held_out_rays_do_not_confirm_is_not_made(monkeypatch):

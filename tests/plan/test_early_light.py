@@ -10,8 +10,8 @@ from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.plan import preparation
 from tomo_polysplat.plan.early_light import take_out_early
 from tomo_polysplat.plan.first_look import first_look
+from tomo_polysplat.plan.fit_options import FitOptions
 from tomo_polysplat.plan.light_told import EARLY_LIGHT, LightTold
-from tomo_polysplat.plan.means import Means
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.scan.geometry import from_astra, projections_from_astra
 from tomo_polysplat.settings import Settings
@@ -46,7 +46,9 @@ def looked_at(projections, **settings):
     geometry, grid = from_astra(scan().proj_geom, scan().vol_geom)
     values = projections_from_astra(projections, scan().proj_geom).copy()
     problem = Problem.of(values, geometry, grid, scan().unit, scan().spectrum, None)
-    look = first_look(preparation.lab_of(problem, Plan(), Means(chosen, None, 0, torch.device("cpu"))), 1.0)
+    look = first_look(
+        preparation.lab_of(problem, Plan(), FitOptions(chosen, None, 0, torch.device("cpu"))), 1.0
+    )
     return problem, take_out_early(look, chosen)
 
 

@@ -11,8 +11,8 @@ from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.plan import realignment
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.first_look import first_look
+from tomo_polysplat.plan.fit_options import FitOptions
 from tomo_polysplat.plan.lab import Lab
-from tomo_polysplat.plan.means import Means
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.preparation import lab_of
 from tomo_polysplat.ranks import Ranks, current_ranks, led_by
@@ -22,7 +22,7 @@ from tomo_polysplat.settings import make_settings
 
 AXIS = Answer({}, "the axis of rotation is where it was told", Status.ASKED, {"offset": 0.0, "error": 0.005})
 VIEWS = 48
-MEANS = Means(make_settings("balanced", None), None, 0, torch.device("cpu"))
+OPTIONS = FitOptions(make_settings("balanced", None), None, 0, torch.device("cpu"))
 
 
 @cache
@@ -44,11 +44,11 @@ def problem(moved):
 
 @cache
 def first(moved):
-    return first_look(lab_of(problem(moved), Plan(), MEANS), 1.0)
+    return first_look(lab_of(problem(moved), Plan(), OPTIONS), 1.0)
 
 
 def ask(moved, axis=AXIS):
-    return realignment.realigned(problem(moved), axis, first(moved), MEANS, lambda *_: None)
+    return realignment.realigned(problem(moved), axis, first(moved), OPTIONS, lambda *_: None)
 
 
 def test_a_scanner_that_is_right_is_left():
@@ -108,12 +108,14 @@ def test_a_fit_that_fails_moves_nothing_and_ends_no_run(monkeypatch, caplog):
     monkeypatch.setattr(realignment, "lab_of", failing)
     assert ask(True) is AXIS and "broken" in caplog.text
     monkeypatch.setattr(Lab, "trial", failing)
-    assert first_look(lab_of(problem(False), Plan(), MEANS), 1.0) is None and caplog.text.count("broken") == 2
+    assert (
+        first_look(lab_of(problem(False), Plan(), OPTIONS), 1.0) is None and caplog.text.count("broken") == 2
+    )
 
 
 def test_a_short_run_is_not_asked():
     """A pass would be more than the share of it that may be taken."""
-    quick = Means(make_settings("balanced", {"passes": 9.0}), None, 0, torch.device("cpu"))
+    quick = FitOptions(make_settings("balanced", {"passes": 9.0}), None, 0, torch.device("cpu"))
     assert first_look(lab_of(problem(False), Plan(), quick), 0.1) is None
     assert realignment.realigned(problem(False), AXIS, None, quick, lambda *_: None) is AXIS
 

@@ -29,7 +29,7 @@ from tomo_polysplat.plan.axis import axis_of, is_known
 from tomo_polysplat.plan.coarse import coarse_problem, coarse_settings, joined_pixels
 from tomo_polysplat.plan.first_gaussians import first_gaussians
 from tomo_polysplat.plan.first_volume import first_volume
-from tomo_polysplat.plan.means import Means
+from tomo_polysplat.plan.fit_options import FitOptions
 from tomo_polysplat.plan.model import rays_of, scene_of
 from tomo_polysplat.plan.order import plan_from_start
 from tomo_polysplat.scan.as_told import seen_as_told
@@ -75,7 +75,7 @@ def moves_of(wanted: Any, time_budget: float | None) -> str | list[str] | None:
 def align(
     problem: Problem,
     names: str | Sequence[str],
-    means: Means,
+    options: FitOptions,
     axis: Answer | None,
     report: Callable[[float, str], Any],
 ) -> Answer:
@@ -87,7 +87,7 @@ def align(
         As told.
     names : "usual" or names of moves
         See `nuisances.alignment.Alignment`.
-    means : Means
+    options : FitOptions
     axis : Answer or None
         Of `find_axis`, where that was asked: a move to begin with.
     report : callable
@@ -100,7 +100,7 @@ def align(
     """
     start = {} if axis is None else axis.value
     alignment = Alignment(problem.geometry, 1.0, names=names, pivot=axis_of(problem), start=start)
-    trials = _Levels(problem, alignment, means, report)
+    trials = _Levels(problem, alignment, options, report)
     factors = levels(problem.geometry.columns)
     # Where the axis is known, the coarsest detector has nothing to find that the next does not.
     skipped = int(axis is not None and is_known(axis) and len(factors) > 1)
@@ -126,7 +126,7 @@ class _Levels:
 
     problem: Problem
     alignment: Alignment
-    means: Means
+    options: FitOptions
     report: Callable[[float, str], Any]
 
     def fit(self, level: int, factor: int, names: tuple[str, ...]) -> float:
@@ -137,7 +137,7 @@ class _Levels:
         held = tuple(name for name in self.alignment.names if name not in names)
         step = _AligningStep(setup)
         step.alignment, step.joined = self.alignment, (factor, rows)
-        rng, views = np.random.default_rng(self.means.seed), len(setup.rays.views)
+        rng, views = np.random.default_rng(self.options.seed), len(setup.rays.views)
         batch = min(_VIEWS, views)
         steps_of_a_pass = max(1, round(views / batch))
         steps, pace, errors = _PASSES * steps_of_a_pass, schedule(level, factor), []
@@ -163,12 +163,12 @@ class _Levels:
             seen = seen_as_told(whole, self.alignment.scanner, self.alignment.values).numpy()
             rows = min(factor, self.problem.geometry.rows)
             told = replace(problem, projections=joined_pixels(seen, rows, factor))
-        settings = coarse_settings(self.means.settings)
-        start, _ = first_volume(told, self.means.device, settings)
-        plan = plan_from_start(start, told, settings, self.means.device)
-        gaussians, _ = first_gaussians(start, plan, told, settings, self.means.device)
-        scene = scene_of(problem, plan, settings, self.means.device)
-        rays = rays_of(problem, plan, settings, self.means.device)
+        settings = coarse_settings(self.options.settings)
+        start, _ = first_volume(told, self.options.device, settings)
+        plan = plan_from_start(start, told, settings, self.options.device)
+        gaussians, _ = first_gaussians(start, plan, told, settings, self.options.device)
+        scene = scene_of(problem, plan, settings, self.options.device)
+        rays = rays_of(problem, plan, settings, self.options.device)
         return FitSetup(gaussians, plan.spacing * problem.voxel, rays, scene, plan.adapted(settings))
 
 

@@ -12,7 +12,7 @@ from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.coarse import coarse_problem, coarse_settings
 from tomo_polysplat.plan.first_volume import first_volume
-from tomo_polysplat.plan.means import Means
+from tomo_polysplat.plan.fit_options import FitOptions
 from tomo_polysplat.plan.short_fit import short_fit
 from tomo_polysplat.ranks import current_ranks
 from tomo_polysplat.scan.axis_offset import AxisOffset, offset_of
@@ -36,14 +36,14 @@ _AGREED = 0.02
 _FEWEST_COLUMNS, _STEPS = 24, 60
 
 
-def find_axis(problem: Problem, means: Means, report: Callable[[float, str], Any]) -> Answer:
+def find_axis(problem: Problem, options: FitOptions, report: Callable[[float, str], Any]) -> Answer:
     """By how much the detector stood beside where it was told, along its columns.
 
     Parameters
     ----------
     problem : Problem
         As told.
-    means : Means
+    options : FitOptions
     report : callable
         Gets the share done, none, and words.
 
@@ -59,12 +59,12 @@ def find_axis(problem: Problem, means: Means, report: Callable[[float, str], Any
     moves: dict[str, Any] = {}
     if rays is not None and (found.doubt or found.error > _AGREED):
         _warn_of_angles(rays, found)
-    needed = _SURE if means.time_budget is None else _SURE_ALONE
+    needed = _SURE if options.time_budget is None else _SURE_ALONE
     words = _in_words(found)
     if not found.doubt and abs(found.columns) > _TOLERATED + needed * found.error:
         moves = {"u": found.columns}
-        if means.time_budget is None:
-            misfits, why = _asked_of_fits(problem, moves, means)
+        if options.time_budget is None:
+            misfits, why = _asked_of_fits(problem, moves, options)
             evidence = evidence | misfits if misfits else {}
             if not misfits or not misfits["moved"] < misfits["without"]:
                 moves, words = {}, f"opposite rays tell {_moved_by(found)}, which {why}"
@@ -141,13 +141,15 @@ def _warn_of_angles(rays: OppositeRays, told: AxisOffset) -> None:
         )
 
 
-def _asked_of_fits(problem: Problem, moves: dict[str, Any], means: Means) -> tuple[dict[str, float], str]:
+def _asked_of_fits(
+    problem: Problem, moves: dict[str, Any], options: FitOptions
+) -> tuple[dict[str, float], str]:
     """Misfit of held-out rays without the moves and moved, and what is to be said where the latter is not less.
 
     A fit that fails confirms nothing. Of one over several processes the others may be left behind: then the run fails.
     """
     try:
-        told, moved = (_held_out(one, means) for one in (problem, aligned(problem, moves)))
+        told, moved = (_held_out(one, options) for one in (problem, aligned(problem, moves)))
     except Exception as error:
         if current_ranks().count > 1:
             raise
@@ -156,12 +158,12 @@ def _asked_of_fits(problem: Problem, moves: dict[str, Any], means: Means) -> tup
     return {"without": told, "moved": moved}, "rays held out of two short fits do not confirm"
 
 
-def _held_out(problem: Problem, means: Means) -> float:
+def _held_out(problem: Problem, options: FitOptions) -> float:
     """Misfit of rays that are held out of a short fit by joined pixels."""
     factor = 1
     while problem.geometry.columns // (2 * factor) >= _FEWEST_COLUMNS:
         factor *= 2
     coarse, _ = coarse_problem(problem, factor)
-    short = Means(coarse_settings(means.settings), None, means.seed, means.device)
-    start, _ = first_volume(coarse, means.device, short.settings)
+    short = FitOptions(coarse_settings(options.settings), None, options.seed, options.device)
+    start, _ = first_volume(coarse, options.device, short.settings)
     return short_fit(coarse, start, {}, short, fewest_steps=_STEPS).held_out

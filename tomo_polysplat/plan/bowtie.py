@@ -33,7 +33,7 @@ from tomo_polysplat.physics.materials import density
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.coarse import coarse_problem, coarse_settings
 from tomo_polysplat.plan.fall_of_misfits import fall_of_misfits
-from tomo_polysplat.plan.means import Means
+from tomo_polysplat.plan.fit_options import FitOptions
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.preparation import lab_of
 
@@ -50,19 +50,19 @@ _COLUMNS, _VIEWS, _PASSES, _BATCH = 36, 1.25, 12, 4
 _FROM, _UNTIL, _FURTHER = 0.3, 0.8, 1.5
 
 
-def find_bowtie(problem: Problem, means: Means, report: Callable[[float, str], Any]) -> Answer:
+def find_bowtie(problem: Problem, options: FitOptions, report: Callable[[float, str], Any]) -> Answer:
     """Coefficients in cm of aluminium, as `behind_bowtie` takes them; empty where none is confirmed.
 
     Parameters
     ----------
     problem : Problem
         Without a filter.
-    means : Means
+    options : FitOptions
     report : callable
         Gets the share done, none, and words.
     """
     report(0.0, "bowtie")
-    search = _Search(_fewer(problem), means)
+    search = _Search(_fewer(problem), options)
     plain, _ = search.fit(moving=False)
     behind, found = search.fit(moving=True)
     better, error = fall_of_misfits(plain.held_out, behind.held_out, -math.inf)
@@ -96,19 +96,19 @@ def _fewer(problem: Problem) -> Problem:
 class _Search:
     """Fits of a scan whose pixels may have a filter."""
 
-    def __init__(self, problem: Problem, means: Means) -> None:
+    def __init__(self, problem: Problem, options: FitOptions) -> None:
         rows, columns = problem.projections.shape[1:]
         self.names, self.shape = tuple(Bowtie.parameters), (rows, columns)
         self.shapes, self.grams = filter_shapes(rows, columns, self.names), density("Al")
-        settings = replace(coarse_settings(means.settings), passes=float(_PASSES))
+        settings = replace(coarse_settings(options.settings), passes=float(_PASSES))
         nothing = np.zeros(self.shape, np.float32)
         problem = problem.behind(FilterMap("Al", nothing, self.grams, _THICKEST * self.grams))
-        lab = lab_of(problem, Plan(), replace(means, settings=settings))
+        lab = lab_of(problem, Plan(), replace(options, settings=settings))
         self.scene, self.rays = lab.scene, lab.rays
         if self.scene.quadrature is None:
             raise fail("filter_map", "a scan whose rays are hardened beside 'fit'", "one of thin rays")
         self.seeds = lab.seeds()
-        self.spacing, self.seed = lab.plan.spacing * problem.voxel, means.seed
+        self.spacing, self.seed = lab.plan.spacing * problem.voxel, options.seed
         self.batch = min(_BATCH, len(self.rays.views))
         self.steps_of_a_pass = max(1, round(len(self.rays.views) / self.batch))
         self.settings = hurried(lab.plan.adapted(settings), _PASSES * self.steps_of_a_pass)

@@ -31,8 +31,8 @@ from tomo_polysplat.plan.calibrated_physics import (
     with_fitted,
 )
 from tomo_polysplat.plan.first_volume import first_volume
+from tomo_polysplat.plan.fit_options import FitOptions
 from tomo_polysplat.plan.lab import Untold
-from tomo_polysplat.plan.means import Means
 from tomo_polysplat.plan.short_fit import ShortFit, short_fit
 from tomo_polysplat.plan.trial import TOO_SHORT
 from tomo_polysplat.settings import Settings
@@ -184,9 +184,9 @@ class _Trials:
         physics, settings, device = with_fitted(self.problem, fitted), self.settings, self.device
         start, _ = first_volume(physics, device, settings)
         density = self.wanted.soft_density is not None
-        means = Means(settings, self.budget, self.seed, device)
+        options = FitOptions(settings, self.budget, self.seed, device)
         steps = {"fewest_steps": _STEPS_FOR_DENSITY} if density else {}
-        self.made.append(short_fit(physics, start, dict(fitted), means, density=density, **steps))
+        self.made.append(short_fit(physics, start, dict(fitted), options, density=density, **steps))
         return self.made[-1]
 
     def another(self, fitted: Mapping[str, float]) -> ShortFit:

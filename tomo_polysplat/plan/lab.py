@@ -17,7 +17,7 @@ from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.kernels.compile_time import working_time
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.plan.first_gaussians import first_gaussians
-from tomo_polysplat.plan.means import Means
+from tomo_polysplat.plan.fit_options import FitOptions
 from tomo_polysplat.plan.model import rays_of, scene_of
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.trial import TOO_SHORT, fitted_shortly
@@ -110,9 +110,9 @@ class Lab:
         """The settings of the fit to come, with what the search for an agent has changed."""
         return self.plan.with_agent(self.settings)
 
-    def means(self, settings: Settings) -> Means:
+    def fit_options(self, settings: Settings) -> FitOptions:
         """What a short fit under these settings may use."""
-        return Means(settings, self.time_budget, self.seed, self.device)
+        return FitOptions(settings, self.time_budget, self.seed, self.device)
 
     def branch(self, **changes: Any) -> Fitter:
         """Another way for the run to go on, with changes to its scene by name.
@@ -155,7 +155,7 @@ class Lab:
         if key not in self._trials:
             seeds = self._seeded(plan)[0].copy()
             parts = (seeds, plan, self.problem, self.scene, rays)
-            self._trials[key] = fitted_shortly(*parts, self.means(settings))
+            self._trials[key] = fitted_shortly(*parts, self.fit_options(settings))
         outcome = self._trials[key]
         if outcome.stop is not None and outcome.stop.by_time:
             raise Untold(TOO_SHORT)

@@ -13,8 +13,8 @@ from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.physics.water_correction import usual_water_correction
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.first_volume import first_volume
+from tomo_polysplat.plan.fit_options import FitOptions
 from tomo_polysplat.plan.lab import Lab
-from tomo_polysplat.plan.means import Means
 from tomo_polysplat.plan.order import decide_start
 from tomo_polysplat.plan.short_fit import short_fit
 from tomo_polysplat.scan.mass_of_views import hardening_shown
@@ -33,7 +33,7 @@ _CLEARLY = 0.9
 _MOST_VOXELS = 1 << 24
 
 
-def doubt_spectrum(problem: Problem, misfit: float, means: Means) -> Answer | None:
+def doubt_spectrum(problem: Problem, misfit: float, options: FitOptions) -> Answer | None:
     """What to do about a spectrum whose hardening the rays do not show, or that one energy beats; None for no doubt.
 
     Parameters
@@ -41,18 +41,18 @@ def doubt_spectrum(problem: Problem, misfit: float, means: Means) -> Answer | No
     problem : Problem
     misfit : float
         Of its first Gaussians.
-    means : Means
+    options : FitOptions
         Of the fit to come.
     """
-    if (linear := _doubt_hardening(problem, means.device)) is not None:
+    if (linear := _doubt_hardening(problem, options.device)) is not None:
         return linear
     if not problem.polychromatic or math.prod(problem.grid.shape) > _MOST_VOXELS or misfit <= 0:
         return None
     one = problem.with_one_energy()
     try:
-        if _by_seeds(one, means) >= _CLEARLY * misfit:
+        if _by_seeds(one, options) >= _CLEARLY * misfit:
             return None
-        left = [_after_short_fit(of, means) for of in (one, problem)]
+        left = [_after_short_fit(of, options) for of in (one, problem)]
     except (ValueError, RuntimeError, MemoryError) as error:  # no room for it, or no such start
         logger.info("The spectrum is not compared with one energy: %s", error)
         return None
@@ -88,16 +88,16 @@ def _doubt_hardening(problem: Problem, device: torch.device) -> Answer | None:
     return Answer("doubted", words, Status.FOUND, shown._asdict())
 
 
-def _by_seeds(one: Problem, means: Means) -> float:
+def _by_seeds(one: Problem, options: FitOptions) -> float:
     """Misfit of the first Gaussians, of a start that bridges no metal: that takes longer, and is for the short fit."""
     # How a volume is smoothed is nothing to its seeds, and takes two more volumes to decide.
-    settings, device = replace(means.settings, tv_weight=0.0), means.device
+    settings, device = replace(options.settings, tv_weight=0.0), options.device
     start, _ = initial_volume_on(one.primary(device), one.geometry, one.grid)
     lab = Lab(one, start, settings, device)
     decide_start(lab)
     return misses(lab.seeds(), lab.scene, lab.rays, one.noise(device), settings).misfit
 
 
-def _after_short_fit(of: Problem, means: Means) -> float:
-    start, _ = first_volume(of, means.device, means.settings)
-    return short_fit(of, start, {}, means).held_out
+def _after_short_fit(of: Problem, options: FitOptions) -> float:
+    start, _ = first_volume(of, options.device, options.settings)
+    return short_fit(of, start, {}, options).held_out

@@ -25,8 +25,8 @@ from tomo_polysplat.plan.calibration import Calibration, calibrated
 from tomo_polysplat.plan.checkpoint import Checkpoint
 from tomo_polysplat.plan.decision import When
 from tomo_polysplat.plan.first_volume import first_volume
+from tomo_polysplat.plan.fit_options import FitOptions
 from tomo_polysplat.plan.lab import Lab
-from tomo_polysplat.plan.means import Means
 from tomo_polysplat.plan.model import rays_of, scene_of
 from tomo_polysplat.plan.no_object import doubt_object
 from tomo_polysplat.plan.order import alternatives, decide, decide_start
@@ -52,7 +52,7 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class RunOptions(Means):
+class RunOptions(FitOptions):
     """How a caller wants a scan fitted, checked.
 
     Attributes
@@ -202,11 +202,11 @@ def no_result_yet() -> Iterator[None]:
         raise KeyboardInterrupt("interrupted before the fit had begun: there is no result yet") from None
 
 
-def lab_of(problem: Problem, plan: Plan, means: Means, end: float | None = None) -> Lab:
+def lab_of(problem: Problem, plan: Plan, options: FitOptions, end: float | None = None) -> Lab:
     """A lab for all questions of a problem, with what its start volume answers in the ``plan``."""
-    settings, device = means.settings, means.device
+    settings, device = options.settings, options.device
     start, why = first_volume(problem, device, settings)
-    lab = Lab(problem, start, settings, device, means.seed, means.time_budget, plan, fit_start, end=end)
+    lab = Lab(problem, start, settings, device, options.seed, options.time_budget, plan, fit_start, end=end)
     decide_start(lab)
     plan.note("start", why)
     return lab
@@ -222,7 +222,7 @@ def _warn_of_late_start(budget: float | None) -> None:
 def fit_start(lab: Lab, settings: Settings, steps: int) -> ShortFit:
     """A short fit of the start of a ``lab`` under other settings."""
     assert lab.start is not None
-    return short_fit(lab.problem, lab.start, {}, lab.means(settings), fewest_steps=steps)
+    return short_fit(lab.problem, lab.start, {}, lab.fit_options(settings), fewest_steps=steps)
 
 
 def _tell(plan: Plan, problem: Problem, facts: Mapping[str, tuple[Any, str]]) -> None:

@@ -29,7 +29,7 @@ from tomo_polysplat.plan.axis import axis_of
 from tomo_polysplat.plan.coarse import coarse_problem, coarse_settings
 from tomo_polysplat.plan.fall_of_misfits import fall_of_misfits
 from tomo_polysplat.plan.first_look import Look
-from tomo_polysplat.plan.means import Means
+from tomo_polysplat.plan.fit_options import FitOptions
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.preparation import lab_of
 from tomo_polysplat.ranks import ALONE, current_ranks, led_by
@@ -92,7 +92,7 @@ def realigned(
     problem: Problem,
     axis: Answer,
     first: Look | None,
-    means: Means,
+    options: FitOptions,
     report: Callable[[float, str], Any],
 ) -> Answer:
     """Where the scanner stood: a fit of one pass tells whether it moved, and a few more find out by how much.
@@ -105,7 +105,7 @@ def realigned(
         Of `plan.axis.find_axis`, with which it begins.
     first : Look or None
         By the scanner with that axis. Nothing is asked without one, but of a large detector, by joined pixels.
-    means : Means
+    options : FitOptions
     report : callable
         Gets the share done, none, and words.
 
@@ -115,13 +115,13 @@ def realigned(
         That of the axis, where there is no more to move, or where held-out rays do not confirm it.
     """
     joined = is_joined(problem)
-    if (means.settings.passes or math.inf) < _LEAST_PASSES if joined else first is None:
+    if (options.settings.passes or math.inf) < _LEAST_PASSES if joined else first is None:
         return axis
     report(0.0, "alignment")
     try:
         coarse, pixel = _joined(problem)
         start = _times(_tensors(axis.value), 1 / pixel)
-        fits = _Realignment(coarse, axis, means)
+        fits = _Realignment(coarse, axis, options)
         if first is not None and not joined and not fits.is_clear(first, start):
             logger.info("Alignment: no more has moved")
             return axis
@@ -172,8 +172,8 @@ def _times(moves: Mapping[str, torch.Tensor], pixel: np.ndarray) -> dict[str, to
 class _Realignment:
     """Fits of a pass or two, and what they say of the scanner."""
 
-    def __init__(self, problem: Problem, axis: Answer, means: Means) -> None:
-        self.problem, self.means = problem, means
+    def __init__(self, problem: Problem, axis: Answer, options: FitOptions) -> None:
+        self.problem, self.options = problem, options
         self.scanner = Scanner(problem.geometry, axis_of(problem))
         whole = ["u"] if problem.geometry.planar else list(_WHOLE)
         if axis.evidence.get("error", math.inf) <= _AXIS_KNOWN:
@@ -182,7 +182,7 @@ class _Realignment:
         self.names = tuple(name for name, effect in found.items() if effect.told >= _TOLD)
         self.seen = np.array([found[name].pixels for name in self.names])
         self.gauge = view_gauge(self.scanner).numpy()
-        self.settings = replace(coarse_settings(means.settings), passes=_PASSES)
+        self.settings = replace(coarse_settings(options.settings), passes=_PASSES)
 
     def is_clear(self, look: Look, values: dict[str, torch.Tensor]) -> bool:
         """Whether a fit says that the scanner moved from where these moves have it."""
@@ -256,8 +256,8 @@ class _Realignment:
         """A fit by the scanner as it stood."""
         # What is told of one start is not kept for another.
         geometry = moved_geometry(self.scanner, values) if values else self.problem.geometry
-        means = replace(self.means, settings=self.settings)
-        lab = lab_of(self.problem.seen_by(geometry), Plan(), means)
+        options = replace(self.options, settings=self.settings)
+        lab = lab_of(self.problem.seen_by(geometry), Plan(), options)
         return lab.trial(self.settings).gaussians, lab.scene, lab.rays
 
 

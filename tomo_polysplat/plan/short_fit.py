@@ -19,7 +19,7 @@ from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.plan.depth import weights_by_depth
 from tomo_polysplat.plan.first_gaussians import first_gaussians
-from tomo_polysplat.plan.means import Means
+from tomo_polysplat.plan.fit_options import FitOptions
 from tomo_polysplat.plan.model import rays_of, scene_of
 from tomo_polysplat.plan.order import plan_from_start
 from tomo_polysplat.plan.ray_sample import RaySample, sample_rays
@@ -82,7 +82,7 @@ def short_fit(
     problem: Problem,
     start: torch.Tensor,
     fitted: dict[str, float],
-    means: Means,
+    options: FitOptions,
     fewest_steps: int = _FEWEST_STEPS,
     *,
     density: bool = False,
@@ -97,7 +97,7 @@ def short_fit(
         Its start volume on the device.
     fitted : dict
         See `ShortFit`.
-    means : Means
+    options : FitOptions
         Its settings are those of the fit to come.
     fewest_steps : int
         Steps of the optimiser at least.
@@ -109,7 +109,7 @@ def short_fit(
     KeyboardInterrupt
         After Ctrl-C: what a calibration has so far is no result.
     """
-    settings, device = means.settings, means.device
+    settings, device = options.settings, options.device
     # What is calibrated is judged by the areal densities of all three curves.
     plan = plan_from_start(start, problem, replace(settings, curves=3), device)
     passes = max(_PASSES, fewest_steps * views_of_short_steps(plan, problem) / problem.geometry.views)
@@ -118,13 +118,13 @@ def short_fit(
     scene, rays = scene_of(problem, plan, short, device), rays_of(problem, plan, short, device)
     seeds, _ = first_gaussians(start, plan, problem, short, device)
     short = replace(short, tv_weight=weights_by_depth(plan.depth, rays)[0] * settings.tv_weight)
-    outcome = fitted_shortly(seeds, plan, problem, scene, rays, replace(means, settings=short))
+    outcome = fitted_shortly(seeds, plan, problem, scene, rays, replace(options, settings=short))
     main = None
     with torch.no_grad():
         if density:
             volume = scene.volume(outcome.gaussians).cpu().numpy() * plan.reference
             main = main_density(volume, settings.metal_level * plan.reference)
-        sample = sample_rays(outcome.gaussians, scene, rays, means.seed)
+        sample = sample_rays(outcome.gaussians, scene, rays, options.seed)
         darkest = _darkest(outcome.gaussians, scene, rays, short)
     errors = [entry["held_out"] or entry["loss"] for entry in outcome.history] or [np.inf]
     level = problem.scatter_level(device)

@@ -14,7 +14,7 @@ from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.fit.stopping import StopReason
 from tomo_polysplat.kernels.compile_time import working_time
 from tomo_polysplat.model.gaussians import Gaussians
-from tomo_polysplat.plan.means import Means
+from tomo_polysplat.plan.fit_options import FitOptions
 from tomo_polysplat.plan.plan import Plan
 
 __all__ = ["TOO_SHORT", "fitted_shortly", "views_of_short_steps"]
@@ -36,7 +36,7 @@ def fitted_shortly(
     problem: Problem,
     scene: FitScene,
     rays: Rays,
-    means: Means,
+    options: FitOptions,
 ) -> FitOutcome:
     """Seeds fitted for the settings' passes, or for a share of the seconds of the whole reconstruction.
 
@@ -47,12 +47,14 @@ def fitted_shortly(
     """
     started = working_time()
     outcome = fit(
-        FitSetup(seeds, plan.spacing * problem.voxel, rays, scene, replace(means.settings, growth=1.0)),
+        FitSetup(seeds, plan.spacing * problem.voxel, rays, scene, replace(options.settings, growth=1.0)),
         Course(
             views_per_step=views_of_short_steps(plan, problem),
-            rng=np.random.default_rng(means.seed),
+            rng=np.random.default_rng(options.seed),
             started=started,
-            deadline=None if means.time_budget is None else started + _SHARE_OF_BUDGET * means.time_budget,
+            deadline=None
+            if options.time_budget is None
+            else started + _SHARE_OF_BUDGET * options.time_budget,
             volume=lambda gaussians: scene.volume(gaussians).cpu().numpy(),
         ),
     )

@@ -8,11 +8,11 @@ import torch
 
 from tomo_polysplat.settings import Settings
 
-__all__ = ["Means"]
+__all__ = ["FitOptions"]
 
 
 @dataclass(frozen=True)
-class Means:
+class FitOptions:
     """How fits are made.
 
     Attributes
