@@ -53,8 +53,8 @@ def taken(tmp_path_factory):
         patch.setattr(FitScene, "basis_on_host", counted("volume", FitScene.basis_on_host))
         settings = {
             "passes": 1,
-            "views_per_step": 4,
-            "seed_spacing": 3.0,
+            "views_per_step": 2,
+            "seed_spacing": 4.0,
             "curves": 3,
             "pixel_rays": 1,
             "growth": 1,
@@ -77,7 +77,7 @@ def test_a_step(taken):
     found, voxels, pixels = taken
     most, step = found["step"]
     gaussians = len(step.gaussians)
-    told = memory.step_bytes(CPU, memory.StepSize(gaussians, views=4, pixels=pixels, voxels=voxels))
+    told = memory.step_bytes(CPU, memory.StepSize(gaussians, views=2, pixels=pixels, voxels=voxels))
     # Samples of thin Gaussians are for the volume; parameters and their moments are there before.
     counted = sum(told.values()) - min(memory._SAMPLES, 27 * 12 * voxels)
     assert 0.5 * counted < most + 132 * gaussians <= counted

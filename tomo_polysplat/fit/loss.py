@@ -17,7 +17,8 @@ __all__ = [
     "away_from_edges",
     "misfit",
     "misfit_by_view",
-    "roughness",
+    "pull_of_roughness",
+    "slope_of_variation",
     "total_variation",
     "variation_of_slab",
     "weighted_huber",
@@ -77,15 +78,46 @@ def weighted_huber(
     return value.sum(dims) / weight.sum(dims).clamp(min=1e-12)
 
 
-def roughness(
-    gaussians: Gaussians, scene: FitScene, settings: Settings, part: Part | None = None
+def pull_of_roughness(
+    gaussians: Gaussians, scene: FitScene, settings: Settings, weight: float, part: Part | None = None
 ) -> torch.Tensor:
-    """Total variation of the volume; with a rank's ``part`` of the fit, that of its planes in the sum over ranks."""
-    chosen = scene.tv_corners, settings.bone_level
-    if part is None:
-        return total_variation(scene.attenuation(gaussians, scene.box), *chosen)
-    volume = part.volume_of_all(scene.attenuation(gaussians, part.box(scene.box)))
-    return variation_of_slab(volume, scene.box.shape[0], *chosen)
+    """A zero whose slope is ``weight`` times that of the volume's total variation: all that a step needs of it.
+
+    With a rank's ``part`` of the fit, that of its planes in the sum over ranks.
+    """
+    volume = scene.attenuation(gaussians, scene.box if part is None else part.box(scene.box))
+    volume = volume if part is None else part.volume_of_all(volume)
+    chosen = scene.box.shape[0], scene.tv_corners, settings.bone_level
+    return _Pull.apply(volume, slope_of_variation(volume.detach(), *chosen, weight))
+
+
+class _Pull(torch.autograd.Function):
+    """Nothing, with a slope that is known."""
+
+    @staticmethod
+    def forward(ctx: Any, volume: torch.Tensor, slope: torch.Tensor) -> torch.Tensor:
+        ctx.save_for_backward(slope)
+        return volume.new_zeros(())
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, None]:
+        (slope,) = ctx.saved_tensors
+        return slope * gradient, None
+
+
+def slope_of_variation(
+    slab: torch.Tensor, planes: int, corners: tuple[float, float], dense: float, factor: float
+) -> torch.Tensor:
+    """``factor`` times the slope of `variation_of_slab`, (nz, ny, nx)."""
+    if slab.device.type != "cpu" or slab.dtype != torch.float32:
+        with torch.enable_grad():
+            slab = slab.detach().requires_grad_()
+            return torch.autograd.grad(factor * variation_of_slab(slab, planes, corners, dense), slab)[0]
+    from tomo_polysplat.kernels.step.numba_variation import variation_gradient
+
+    away = _away(slab, planes, corners, dense)
+    return variation_gradient(slab, away, corners, dense, factor, planes)
 
 
 def total_variation(

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.fit.adam import Adam, Moments
-from tomo_polysplat.fit.loss import misfit, roughness
+from tomo_polysplat.fit.loss import misfit, pull_of_roughness
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.fit.shares import Part
@@ -200,7 +200,7 @@ class EagerStep:
         settings = self.settings
         total: torch.Tensor | float = 0.0
         if weight_now := smoothing(settings, self.scene, self._done):
-            total = total + weight_now * roughness(self.gaussians, self.scene, settings, self.part)
+            total = total + pull_of_roughness(self.gaussians, self.scene, settings, weight_now, self.part)
         if settings.ssim_weight:
             total = total + settings.ssim_weight * dissimilarity(predicted, measured, weight)
         return total
