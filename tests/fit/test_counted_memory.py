@@ -50,6 +50,7 @@ def taken(tmp_path_factory):
             first_gaussians, "seed_gaussians", counted("seeds", first_gaussians.seed_gaussians, at=2)
         )
         patch.setattr(EagerStep, "__call__", counted("step", EagerStep.__call__, lambda step, *_: step, at=3))
+        patch.setattr(EagerStep, "_regularisation", counted("smoothing", EagerStep._regularisation))
         patch.setattr(FitScene, "basis_on_host", counted("volume", FitScene.basis_on_host))
         settings = {
             "passes": 1,
@@ -83,6 +84,13 @@ def test_a_step(taken):
     assert 0.5 * counted < most + 132 * gaussians <= counted
     smoothed = memory.step_bytes(CPU, memory.StepSize(0, 0, 0, voxels))["volumes"]
     assert smoothed > 0.5 * counted, "mostly voxels"
+
+
+def test_smoothing(taken):
+    """Besides the volume itself, which is not torch's."""
+    found, voxels, _ = taken
+    smoothed = memory._SMOOTHED["cpu"] * voxels
+    assert 0.5 * smoothed < found["smoothing"][0] <= smoothed - 4 * voxels
 
 
 def test_a_volume(taken):
