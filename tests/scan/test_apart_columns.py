@@ -1,8 +1,12 @@
 """Columns of noise, and of a wrong share of the light, beside what an object makes of a column."""
 
+import logging
+
+import astra
 import numpy as np
 import pytest
 
+from tomo_polysplat.scan.usable import usable_rays
 from tomo_polysplat.scan.apart_columns import apart_columns
 
 ROWS, VIEWS, COLUMNS, AXIS = 12, 60, 41, 20.0
@@ -82,3 +86,33 @@ def test_too_few_rays_tell_nothing():
     for part in (values[:, :6], values[..., 6:10], values[:1, :50]):
         bad, doubtful = apart_columns(part, 1.0, AXIS, AZIMUTH[: part.shape[1]])
         assert not bad.any() and not doubtful.any()
+
+
+def test_rays_without_light_are_no_columns_of_noise():
+    # Counts of 0 and 1: half of the rays of a column are as their neighbours are, and the others far from them.
+    counts = np.random.default_rng(1).poisson(0.15, (ROWS, VIEWS, COLUMNS))
+    assert asked(-np.log(np.maximum(counts, 0.5) / 30)) == ([], [])
+
+
+def test_what_changes_slowly_or_in_all_rows_alike_is_no_noise():
+    rng = np.random.default_rng(3)
+    slow = np.cumsum(rng.normal(0, 0.3, (ROWS, VIEWS)), axis=1)
+    alike = np.broadcast_to(rng.normal(0, 0.5, VIEWS), (ROWS, VIEWS))
+    for change in (slow, alike):
+        values = scan()
+        values[..., 21] += change - change.mean()
+        assert asked(values)[0] == []
+
+
+def test_a_run_leaves_them_out_and_says_so(caplog):
+    told = astra.create_proj_geom("parallel3d", 1.0, 1.0, ROWS, COLUMNS, AZIMUTH)
+    clean = scan().astype(np.float32)
+    values = clean + np.float32(np.log(2)) * (np.arange(COLUMNS) == 8)
+    with caplog.at_level(logging.WARNING):
+        rays = usable_rays(values, told, None)
+    assert "unlike both neighbours in all views, are left out: 8" in caplog.text
+    assert rays.counts["rays_of_columns_apart"] == ROWS * VIEWS
+    assert np.isnan(rays.values[..., 8]).all()
+    rays = usable_rays(clean, told, None)
+    assert rays.counts["rays_of_columns_apart"] == 0
+    np.testing.assert_array_equal(rays.values, clean.swapaxes(0, 1))

@@ -145,7 +145,7 @@ def _doubts_of_counts(result: ResultData) -> list[str]:
         return doubts
     if (opaque := counts.get("rays_opaque", 0) / rays) > _LIGHTLESS:
         doubts.append(f"the inside of matter that lets no light through ({opaque:.2%} of the rays)")
-    names = ("rays_not_finite", "rays_out_of_range", "rays_of_stuck_pixels")
+    names = ("rays_not_finite", "rays_out_of_range", "rays_of_stuck_pixels", "rays_of_columns_apart")
     if (lost := sum(counts.get(name, 0) for name in names) / rays) > _LEFT_OUT:
         doubts.append(f"the shadow of the rays left out ({lost:.1%}; the counts below say why)")
     return doubts

@@ -6,20 +6,26 @@ import numpy as np
 
 from tomo_polysplat.evenly_spread import evenly_spread
 from tomo_polysplat.scan.axis_offset import LARGEST_SHARE
+from tomo_polysplat.scan.rotation_axis import axis_column, azimuth_of_views
+from tomo_polysplat.scan.view_geometry import Geometry
 
-__all__ = ["apart_columns"]
+__all__ = ["apart_columns", "columns_not_measured"]
 
 # Of noise alone a third of the rays lies between both neighbours. Of a column apart fewer than this share are nearer to
 # them than the limit, a share of the scan's large values, or of a value of 1, where a tenth of the light is missing.
 _BETWEEN, _LIMIT, _FEW_ROWS = 0.2, 0.1, 3
 _FEWEST_RAYS, _FEWEST_VIEWS, _FEWEST_COLUMNS = 60, 8, 5
-# Of each column, spread over the rows.
-_ENOUGH_RAYS = 20_000
+# Of each column, spread over the rows; views that tell how large values are.
+_ENOUGH_RAYS, _LEVEL_VIEWS = 20_000, 64
+# Share of the rays by which a column may fall short of what is asked, and is asked about.
+_SLACK = 0.05
 # -log of the least light that counts.
 _DARKEST = 20.0
 # Noise of a column is so many times what the object's detail and its light change from view to view. On 80 clean scans
 # of all kinds no column beyond the limit came to more than 1.5.
-_NOISE = 2.5
+_NOISE, _MOST = 1.5, 0.75
+# Of independent values those next to each other differ by as much as those a share of the scan apart.
+_FAR, _EACH_ANEW = 8, 0.75
 # In fewer degrees what is off the axis may stay in its column.
 _ARC = np.deg2rad(170)
 
@@ -35,7 +41,7 @@ def apart_columns(
     Parameters
     ----------
     values : (rows, views, columns) array
-        -log(I/I0); NaN where there is none.
+        -log(I/I0); not finite where there is none.
     level : float
         What counts as large among them.
     axis : float
@@ -54,11 +60,16 @@ def apart_columns(
     # Values of which a hundredth is more than that are no -log(I/I0).
     limit = max(_LIMIT * min(level, 1.0), 0.01 * level) * (1 if rows > 2 else _FEW_ROWS)
     values = values[evenly_spread(rows, max(_FEW_ROWS, _ENOUGH_RAYS // views))]
-    apart = np.array([0.0, *(_apart(values, k) for k in range(1, columns - 1)), 0.0])
+    values = np.where(np.isfinite(values), values, np.nan)
+    beyond, changes = _likely(values, limit)
+    apart, noise = np.zeros(columns), np.zeros(columns, bool)
+    for k in beyond:
+        apart[k] = _apart(values, k)
+    for k in changes:
+        noise[k] = _is_noise(values, k, limit)
     # A column beside one that is off may be the outermost of both its neighbours as well.
     most = np.fmax(apart, np.fmax(np.r_[0.0, apart[:-1]], np.r_[apart[1:], 0.0]))
     found = np.flatnonzero((apart > limit) & (apart == most))
-    noise = np.array([False, *(_is_noise(values, k, limit) for k in range(1, columns - 1)), False])
     whole, doubt = _arc(azimuth) > _ARC, 1 + LARGEST_SHARE * columns
     for k in found:
         other = 2 * axis - k
@@ -67,6 +78,35 @@ def apart_columns(
         certain = whole and alone or np.nanmedian(values[..., k]) < -limit
         (bad if certain else doubtful)[k] = True
     return bad | noise, doubtful & ~noise
+
+
+def columns_not_measured(values: np.ndarray, geometry: Geometry) -> np.ndarray:
+    """The bad columns of :func:`apart_columns`, (columns,), of a run's rays (views, rows, columns)."""
+    views, rows, columns = values.shape
+    some = values[evenly_spread(views, _LEVEL_VIEWS), rows // 2]
+    some = some[np.isfinite(some)]
+    if not some.size:
+        return np.zeros(columns, bool)
+    level = float(np.percentile(some, 99))
+    return apart_columns(values.swapaxes(0, 1), level, axis_column(geometry), azimuth_of_views(geometry))[0]
+
+
+def _likely(values: np.ndarray, limit: float) -> tuple[np.ndarray, np.ndarray]:
+    """Columns that may lie beyond their neighbours, and those that may change, by more than the limit.
+
+    Rays beyond it are counted, row by row: their quantiles would have to be sorted, of all columns.
+    """
+    counts = np.zeros((4, values.shape[2] - 2), int)
+    for row in values:
+        one, left, right = row[:, 1:-1], row[:, :-2], row[:, 2:]
+        beyond = np.maximum(one - np.maximum(left, right), np.minimum(left, right) - one)
+        own = np.abs(np.diff(one - 0.5 * (left + right), axis=0))
+        parts = beyond > limit, np.isfinite(beyond), own > limit, np.isfinite(own)
+        counts += [np.count_nonzero(part, axis=0) for part in parts]
+    far, told, much, compared = counts
+    # A little fewer than it takes: the quantile lies between two rays.
+    beyond = far > (1 - _BETWEEN - _SLACK) * told
+    return np.flatnonzero(beyond) + 1, np.flatnonzero(much > (0.5 - _SLACK) * compared) + 1
 
 
 def _apart(values: np.ndarray, k: int) -> float:
@@ -80,19 +120,42 @@ def _apart(values: np.ndarray, k: int) -> float:
 
 
 def _is_noise(values: np.ndarray, k: int, limit: float) -> bool:
-    """Whether a column changes from view to view by much, and far more than its neighbours with as much light do."""
+    """Whether a column changes by much from view to view and from row to row, and each view anew, as noise does.
+
+    An edge near the axis changes a column alone, too, but slowly from view to view, or in many rows alike.
+    """
     one, left, right = (values[..., k + step].astype(np.float64) for step in (0, -1, 1))
-    own = np.abs(np.diff(one - 0.5 * (left + right), axis=1))
-    told = np.isfinite(own)
-    if (
-        np.count_nonzero(told) < max(_FEWEST_RAYS, 0.5 * own.size)
-        or not (much := np.median(own[told])) > limit
-    ):
-        return False
+    own, others = one - 0.5 * (left + right), left - right
     # Photon noise goes with the root of the light; the difference of two has twice the variance of one.
-    darker = np.exp(0.5 * np.clip(one - np.minimum(left, right), 0, _DARKEST))[:, 1:]
-    usual = np.abs(np.diff(left - right, axis=1)) * darker
-    return bool(much > _NOISE * np.median(usual[told]))
+    darker = np.exp(0.5 * np.clip(one - np.minimum(left, right), 0, _DARKEST))
+    far = max(2, values.shape[1] // _FAR)
+    return (
+        _changes(own, others, darker, limit, 1)
+        and (len(values) == 1 or _changes(own, others, darker, limit, 0))
+        and _middle(_differences(own, 1)) > _EACH_ANEW * _middle(_differences(own, 1, far))
+    )
+
+
+def _changes(own: np.ndarray, others: np.ndarray, darker: np.ndarray, limit: float, along: int) -> bool:
+    """Whether most rays change by much, and far more than those beside them with as much light do in the mean."""
+    change = _differences(own, along)
+    told = np.isfinite(change)
+    if np.count_nonzero(told) < max(_FEWEST_RAYS, 0.5 * change.size):
+        return False
+    much = _middle(change)
+    usual = _differences(others, along) * (darker[:, 1:] if along else darker[1:])
+    return much > limit and much > _NOISE * float(np.quantile(usual[told], _MOST))
+
+
+def _differences(values: np.ndarray, along: int, step: int = 1) -> np.ndarray:
+    """Size of the change to the view, or row, so many steps on."""
+    ahead = values[:, step:] if along else values[step:]
+    return np.abs(ahead - (values[:, :-step] if along else values[:-step]))
+
+
+def _middle(values: np.ndarray) -> float:
+    told = values[np.isfinite(values)]
+    return float(np.median(told)) if told.size else np.inf
 
 
 def _arc(azimuth: np.ndarray) -> float:

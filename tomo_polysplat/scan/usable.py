@@ -12,8 +12,10 @@ from tomo_polysplat.checks import fail, require_array, require_shape
 from tomo_polysplat.parallel import run_tasks, split_range
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.water_correction import undo_water_correction
+from tomo_polysplat.scan.apart_columns import columns_not_measured
 from tomo_polysplat.scan.counts import Counts, Marks
 from tomo_polysplat.scan.geometry import (
+    Geometry,
     geometry_from_astra,
     is_planar_geometry,
     projections_from_astra,
@@ -81,12 +83,17 @@ def usable_rays(
     ]
     found = run_tasks(_take_out, parts)
     counts = {"rays": values.size} | {name: sum(part[name] for part in found) for name in found[0]}
-    stuck = stuck_pixels(values, _axis_column(proj_geom))
-    counts["rays_of_stuck_pixels"] = int(np.isfinite(values[:, stuck]).sum()) if stuck.any() else 0
-    used = counts.pop("used") - counts["rays_of_stuck_pixels"]
+    geometry = geometry_from_astra(proj_geom)
+    stuck = stuck_pixels(values, _axis_column(geometry))
+    counts["rays_of_stuck_pixels"] = _left_out(values, stuck)
     if stuck.any():
-        values[:, stuck] = np.nan
         logger.warning("Pixels that show the same value in every view are left out: %d.", stuck.sum())
+    apart = columns_not_measured(values, geometry)
+    counts["rays_of_columns_apart"] = _left_out(values, np.broadcast_to(apart, stuck.shape))
+    if apart.any():
+        words = ", ".join(map(str, np.flatnonzero(apart)))
+        logger.warning("Columns of noise, or unlike both neighbours in all views, are left out: %s.", words)
+    used = counts.pop("used") - counts["rays_of_stuck_pixels"] - counts["rays_of_columns_apart"]
     if used == 0:
         remedy = "give -log(I/I0), not intensities, and check the flat fields and the mask"
         raise fail("projections", "at least one usable ray", "none", remedy)
@@ -118,9 +125,17 @@ def usable_rays(
     return UsableRays(values, counts, tuple(given))
 
 
-def _axis_column(proj_geom: Mapping[str, Any]) -> float | None:
+def _left_out(values: np.ndarray, pixels: np.ndarray) -> int:
+    """Make the rays of these pixels NaN, and count them."""
+    if not pixels.any():
+        return 0
+    count = int(np.isfinite(values[:, pixels]).sum())
+    values[:, pixels] = np.nan
+    return count
+
+
+def _axis_column(geometry: Geometry) -> float | None:
     """The column on which the world's axis falls in all views, to a column; None where it does in none or another."""
-    geometry = geometry_from_astra(proj_geom)
     columns = geometry.project_points(np.zeros((1, 3)))[:, 0, 0]
     return float(np.median(columns)) if np.ptp(columns) < 1.0 else None
 

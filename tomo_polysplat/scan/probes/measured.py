@@ -14,6 +14,7 @@ from tomo_polysplat.scan.defects import fill_invalid
 from tomo_polysplat.scan.dropouts import dropped_rays
 from tomo_polysplat.scan.geometry import Geometry, from_astra
 from tomo_polysplat.scan.probes.air import Air, look_for_air
+from tomo_polysplat.scan.rotation_axis import axis_column, azimuth_of_views, rotation_axis
 from tomo_polysplat.scan.scan import Scan
 from tomo_polysplat.scan.volume_grid import VolumeGrid
 
@@ -104,7 +105,7 @@ class Measured:
     @property
     def axis_column(self) -> float:
         """Column on which the axis of rotation falls, in the median of the views."""
-        return float(np.median(self.geometry.project_points(self.axis[None])[:, 0, 0]))
+        return axis_column(self.geometry)
 
     @cached_property
     def places(self) -> np.ndarray:
@@ -125,18 +126,9 @@ class Measured:
     @cached_property
     def azimuth(self) -> np.ndarray:
         """Angle of the source, or of the beam, about z in radians, per view."""
-        geometry = self.geometry
-        origin = geometry.origin if geometry.beam == "parallel" else geometry.origin - self.axis
-        return np.arctan2(origin[:, 1], origin[:, 0])
+        return azimuth_of_views(self.geometry)
 
     @cached_property
     def axis(self) -> np.ndarray:
         """A point (x, y, z) of the rotation axis: the centre of the sources' circle, or the origin."""
-        if self.geometry.beam == "parallel":
-            return np.zeros(3)
-        # |p|^2 = 2 c.p + (r^2 - |c|^2), in coordinates about the mean.
-        mean = self.geometry.origin.mean(axis=0)
-        local = (self.geometry.origin - mean)[:, :2]
-        system = np.column_stack([2 * local, np.ones(len(local))])
-        solution = np.linalg.lstsq(system, (local**2).sum(axis=1), rcond=None)[0]
-        return mean + np.array([solution[0], solution[1], 0.0])
+        return rotation_axis(self.geometry)
