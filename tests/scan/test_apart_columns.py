@@ -6,8 +6,8 @@ import astra
 import numpy as np
 import pytest
 
-from tomo_polysplat.scan.usable import usable_rays
 from tomo_polysplat.scan.apart_columns import apart_columns
+from tomo_polysplat.scan.usable import usable_rays
 
 ROWS, VIEWS, COLUMNS, AXIS = 12, 60, 41, 20.0
 AZIMUTH = np.arange(VIEWS) * 2 * np.pi / VIEWS
