@@ -7,7 +7,9 @@ import pytest
 import torch
 
 import tomo_polysplat as tps
+from tomo_polysplat.fit.move_sums import MoveSums
 from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.nuisances.move_estimate import WholeMoves
 from tomo_polysplat.plan import realignment
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.first_look import first_look
@@ -123,3 +125,20 @@ def test_a_short_run_is_not_asked():
 def test_a_roll_that_hides_from_a_fit_is_reached_by_longer_steps():
     left, before, step = np.array([0.2, 0.3, -0.1]), np.array([0.4, 0.0, 0.2]), np.array([0.4, 0.0, 0.2])
     np.testing.assert_allclose(realignment._secant(left, before, step), [0.4, 0.3, -0.1])
+
+
+@pytest.mark.parametrize(("first_told", "roll"), [(1.0, 0.9), (0.15, 0.0)])
+def test_what_is_left_of_a_roll_that_was_made_needs_not_be_sure(first_told, roll, monkeypatch):
+    """Two standard errors tell that there is one. How large it is, is told best by where no more is left."""
+    told = iter([first_told, -0.1, 0.0])
+    many = np.zeros((2, VIEWS, 4, 4))
+    sums = MoveSums(many, many[..., 0], np.ones(VIEWS))
+    monkeypatch.setattr(realignment, "move_sums", lambda *_: sums)
+    monkeypatch.setattr(realignment, "falls_of", lambda *_: None)
+    monkeypatch.setattr(
+        realignment, "whole_moves", lambda *_: WholeMoves(np.array([next(told)]), np.array([0.08]))
+    )
+    fits = realignment._Realignment(problem(False), AXIS, MEANS)
+    fits._fitted = lambda values: (None, None, None)
+    assert fits.names == ("roll",)
+    assert float(fits.moved({})[0].get("roll", 0.0)) == pytest.approx(roll)

@@ -70,7 +70,7 @@ class _Left:
     Attributes
     ----------
     whole : (moves,) array
-        Moves of the whole scanner, those alone that are sure.
+        Moves of the whole scanner, those alone that are sure, or were made before.
     views : (views, 2) array
         Shifts of single views, likewise.
     pixels : float
@@ -181,6 +181,8 @@ class _Realignment:
         found = effects(self.scanner, whole, 1.0)
         self.names = tuple(name for name, effect in found.items() if effect.told >= _TOLD)
         self.seen = np.array([found[name].pixels for name in self.names])
+        # Those that were moved: what is left of them is made as far as it is told, sure or not.
+        self.made = np.zeros(len(self.names), bool)
         self.gauge = view_gauge(self.scanner).numpy()
         self.settings = replace(coarse_settings(options.settings), passes=_PASSES)
 
@@ -201,7 +203,7 @@ class _Realignment:
                 values, before = self._without_axis(values, start), None
                 continue
             step = left.whole if before is None else _secant(left.whole, *before)
-            before = left.whole, step
+            before, self.made = (left.whole, step), self.made | (step != 0)
             values = self._stepped(values, step, left.views)
             if number and left.pixels < _SETTLED:
                 break
@@ -219,7 +221,8 @@ class _Realignment:
     ) -> dict[str, torch.Tensor]:
         """The values with the axis where it was at the start, where it now stays."""
         stay = np.array([name != "u" for name in self.names])
-        self.names, self.seen = tuple(name for name in self.names if name != "u"), self.seen[stay]
+        self.names = tuple(name for name in self.names if name != "u")
+        self.seen, self.made = self.seen[stay], self.made[stay]
         rest = {name: value for name, value in values.items() if name != "u"}
         return rest | {name: value for name, value in start.items() if name == "u"}
 
@@ -232,7 +235,7 @@ class _Realignment:
         normal, told, many = sums.normal, sums.told, len(self.names)
         moves = whole_moves(normal.sum(axis=0), told.sum(axis=0), range(many))
         size, error = np.abs(moves.value) * self.seen, moves.error * self.seen
-        whole = np.where(size > _FOUND * error, moves.value, 0.0)
+        whole = np.where((size > _FOUND * error) | self.made, moves.value, 0.0)
         told = told - normal[..., :many] @ whole
         single = slice(many, many + 3)
         shifts = shifts_of_views(normal[:, :, single, single], told[:, :, single], self.gauge)
