@@ -56,7 +56,9 @@ def test_scatter_that_nobody_told_of_is_modelled():
     scan = pins(0.05)
     found, told, without = (reconstruct(scan, settings=QUICK, calibrate=each) for each in (None, True, False))
     assert found.plan["scatter"].why.startswith("modelled: ")
-    assert found.plan["calibration"].value["fitted"]["scatter"] == pytest.approx(0.05, rel=0.1)
+    # Beside the object, where all light is around a ray: pins hardly tell one part from the other.
+    fitted = found.plan["calibration"].value["fitted"]
+    assert fitted["scatter"] + fitted.get("scatter_of_light", 0.0) == pytest.approx(0.05, rel=0.1)
     assert found.plan["scatter"].value == told.plan["scatter"].value
     # Begun anew, the run is that of a scan whose scatter was known from the first.
     assert np.array_equal(found.volume, told.volume)

@@ -64,6 +64,7 @@ def more_likely(scatter: Mapping[str, float], beam: Mapping[str, float]) -> str:
     Both cannot be left out then: the rays beside the object have more light than the open field. A brighter beam is
     the smaller change, and takes nothing away from dark rays. Yet it is as much brighter everywhere: scatter that
     varies, and explains more, is no beam. Without metal that tells more than the darkest rays, which have much light.
+    Nor is what explains all rays far better: under scatter metal is denser, and a short fit does not get there.
 
     Parameters
     ----------
@@ -71,6 +72,7 @@ def more_likely(scatter: Mapping[str, float], beam: Mapping[str, float]) -> str:
         See `light_gate`; ``of_light`` of the scatter is how much it varies, 0 for a constant.
     """
     held_out = scatter["held_out_after"] / beam["held_out_after"]
-    better, darkest = held_out < 1 - _MARGIN, 1 + _MARGIN if held_out < _FAR_BETTER else 1.0
-    darker = scatter["darkest_after"] < darkest * beam["darkest_after"]
-    return "scatter" if better and (darker or scatter.get("of_light", 0.0) != 0) else "beam"
+    darker = scatter["darkest_after"] < beam["darkest_after"]
+    varies = scatter.get("of_light", 0.0) != 0
+    tells = darker or varies or held_out < _FAR_BETTER
+    return "scatter" if held_out < 1 - _MARGIN and tells else "beam"
