@@ -24,7 +24,8 @@ _DARKEST = 20.0
 # Noise of a column is so many times what the object's detail and its light change from view to view. On 80 clean scans
 # of all kinds no column beyond the limit came to more than 1.5.
 _NOISE, _MOST = 1.5, 0.75
-# Of independent values those next to each other differ by as much as those a share of the scan apart.
+# Of independent values those in views next to each other differ by as much as those a share of the scan apart, and as
+# those in rows next to each other.
 _FAR, _EACH_ANEW = 8, 0.75
 # In fewer degrees what is off the axis may stay in its column.
 _ARC = np.deg2rad(170)
@@ -128,23 +129,16 @@ def _is_noise(values: np.ndarray, k: int, limit: float) -> bool:
     own, others = one - 0.5 * (left + right), left - right
     # Photon noise goes with the root of the light; the difference of two has twice the variance of one.
     darker = np.exp(0.5 * np.clip(one - np.minimum(left, right), 0, _DARKEST))
-    far = max(2, values.shape[1] // _FAR)
-    return (
-        _changes(own, others, darker, limit, 1)
-        and (len(values) == 1 or _changes(own, others, darker, limit, 0))
-        and _middle(_differences(own, 1)) > _EACH_ANEW * _middle(_differences(own, 1, far))
-    )
-
-
-def _changes(own: np.ndarray, others: np.ndarray, darker: np.ndarray, limit: float, along: int) -> bool:
-    """Whether most rays change by much, and far more than those beside them with as much light do in the mean."""
-    change = _differences(own, along)
+    change = _differences(own, 1)
     told = np.isfinite(change)
     if np.count_nonzero(told) < max(_FEWEST_RAYS, 0.5 * change.size):
         return False
-    much = _middle(change)
-    usual = _differences(others, along) * (darker[:, 1:] if along else darker[1:])
-    return much > limit and much > _NOISE * float(np.quantile(usual[told], _MOST))
+    much, usual = _middle(change), (_differences(others, 1) * darker[:, 1:])[told]
+    if not much > max(limit, _NOISE * float(np.quantile(usual, _MOST))):
+        return False
+    far = _middle(_differences(own, 1, max(2, values.shape[1] // _FAR)))
+    rows = _middle(_differences(own, 0)) if len(values) > 1 else np.inf
+    return much > _EACH_ANEW * far and rows > _EACH_ANEW * much
 
 
 def _differences(values: np.ndarray, along: int, step: int = 1) -> np.ndarray:
