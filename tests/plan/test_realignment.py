@@ -138,7 +138,7 @@ def test_what_is_left_of_a_roll_that_was_made_needs_not_be_sure(first_told, roll
     monkeypatch.setattr(
         realignment, "whole_moves", lambda *_: WholeMoves(np.array([next(told)]), np.array([0.08]))
     )
-    fits = realignment._Realignment(problem(False), AXIS, MEANS)
+    fits = realignment._Realignment(problem(False), AXIS, OPTIONS)
     fits._fitted = lambda values: (None, None, None)
     assert fits.names == ("roll",)
     assert float(fits.moved({})[0].get("roll", 0.0)) == pytest.approx(roll)
