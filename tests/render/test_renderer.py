@@ -151,13 +151,23 @@ def test_gaussians_beside_the_volume_leave_it_empty():
     assert not bool(voxelise_means(gaussians, gaussians.weights(None), voxel_box(cube(16)), KERNEL).any())
 
 
-def test_where_voxels_are_fine_their_centres_do():
-    gaussians = cloud()
+@pytest.mark.parametrize("shape", [(20, 20, 20), (20, 18, 6), (1, 20, 12)])
+def test_means_of_wide_gaussians_are_means_of_finer_voxels(shape):
+    """By a wider Gaussian at the centre: of 0.6 to 1.2 of the longest edge, turned any way."""
+    edge = 2 / min(n for n in shape if n > 1)
+    gaussians = cloud(2 if shape[0] == 1 else 3, widest=1.2 * edge, narrowest=0.6 * edge)
     weights = gaussians.weights(None)
-    centres, means = (
-        f(gaussians, weights, voxel_box(cube(20)), KERNEL) for f in (voxelise_gaussians, voxelise_means)
+    grid, finer = (
+        VolumeGrid(n, [-1.0] * 3, [1.0] * 3) for n in (shape, [5 * n if n > 1 else 1 for n in shape])
     )
-    assert bool(centres.any()) and torch.allclose(centres, means, rtol=1e-5)
+    centres, means = (
+        f(gaussians, weights, voxel_box(grid), KERNEL)[0] for f in (voxelise_gaussians, voxelise_means)
+    )
+    fine = voxelise_gaussians(gaussians, weights, voxel_box(finer), KERNEL)[0]
+    expected = fine.reshape([n for pair in zip(shape, finer.shape) for n in (pair[0], pair[1] // pair[0])])
+    expected = expected.mean(dim=(1, 3, 5))
+    assert float((means - expected).norm() / expected.norm()) < 0.01
+    assert float((centres - expected).norm() / expected.norm()) > 0.02, "else there was nothing to do"
 
 
 @pytest.mark.parametrize("planar", [False, True])

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import torch
 
 from tomo_polysplat.kernels.project.autograd import project
+from tomo_polysplat.kernels.project.reference import whitening_matrices
 from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.kernels.voxelise.autograd import voxelise
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
@@ -96,13 +98,14 @@ def voxelise_means(gaussians: Gaussians, weights: torch.Tensor, box: VoxelBox, k
     """(channels, nz, ny, nx) means of the Gaussians over the voxels; not differentiable.
 
     Whether a Gaussian thinner than half a voxel shows at voxel centres depends on where it lies between them. So thin
-    Gaussians are sampled at several points per voxel, and at more along the long edges of an oblong voxel.
+    Gaussians are sampled at several points per voxel, and at more along the long edges of an oblong voxel. The mean of
+    a wider one is that of a Gaussian of `_widened` variance at the centre.
     """
     dims = gaussians.log_scale.shape[1]
     edge = float(box.spacing[:dims].max())
     thinnest = gaussians.log_scale.exp().amin(dim=1) / edge
     wide = (thinnest >= 0.5).nonzero()[:, 0]
-    volume = voxelise_gaussians(gaussians.select(wide), weights[:, wide], box, kernel)
+    volume = voxelise_gaussians(*_widened(gaussians.select(wide), weights[:, wide], box), box, kernel)
     enough = [0.5, *(1 / (_SAMPLE_STEP * (n + _ROUNDING)) for n in _SAMPLES[:-1]), 0.0]
     for least, below in zip(enough[1:], enough):
         thin = ((thinnest >= least) & (thinnest < below)).nonzero()[:, 0]
@@ -117,6 +120,22 @@ def voxelise_means(gaussians: Gaussians, weights: torch.Tensor, box: VoxelBox, k
         ):
             part[where] += means
     return volume
+
+
+def _widened(gaussians: Gaussians, weights: torch.Tensor, box: VoxelBox) -> tuple[Gaussians, torch.Tensor]:
+    """Gaussians whose values at voxel centres are means over the voxels, and their weights, of the same mass.
+
+    A mean over an edge h adds its variance, h^2 / 12. The peak of a Gaussian of half a voxel is 1 % off along each axis
+    then, that of one voxel 0.1 %, as its fourth moment differs.
+    """
+    dims = gaussians.log_scale.shape[1]
+    of_edges = box.spacing[:dims] ** 2 / 12
+    own = gaussians.log_scale.exp().square()
+    wider = own + float(of_edges[0])
+    if not np.allclose(of_edges, of_edges[0]):
+        axes = whitening_matrices(torch.ones_like(gaussians.position), gaussians.rotation)[:, :dims, :dims]
+        wider = own + axes.square() @ torch.from_numpy(of_edges).to(axes)
+    return replace(gaussians, log_scale=0.5 * wider.log()), weights * (own / wider).prod(dim=1).sqrt()
 
 
 def _reached(gaussians: Gaussians, box: VoxelBox) -> tuple[tuple[int, int, int], tuple[int, int, int]]:
