@@ -60,14 +60,17 @@ def apart_columns(
         return bad, doubtful
     # Values of which a hundredth is more than that are no -log(I/I0).
     limit = max(_LIMIT * min(level, 1.0), 0.01 * level) * (1 if rows > 2 else _FEW_ROWS)
-    values = values[evenly_spread(rows, max(_FEW_ROWS, _ENOUGH_RAYS // views))]
-    values = np.where(np.isfinite(values), values, np.nan)
-    beyond, changes = _likely(values, limit)
+    some = evenly_spread(rows, max(_FEW_ROWS, _ENOUGH_RAYS // views))
+    beyond, changes = _likely(values, some, limit)
+
+    def around(k: int) -> np.ndarray:
+        return _finite(values[some, :, k - 1 : k + 2])
+
     apart, noise = np.zeros(columns), np.zeros(columns, bool)
     for k in beyond:
-        apart[k] = _apart(values, k)
+        apart[k] = _apart(around(k))
     for k in changes:
-        noise[k] = _is_noise(values, k, limit)
+        noise[k] = _is_noise(around(k), limit)
     # A column beside one that is off may be the outermost of both its neighbours as well.
     most = np.fmax(apart, np.fmax(np.r_[0.0, apart[:-1]], np.r_[apart[1:], 0.0]))
     found = np.flatnonzero((apart > limit) & (apart == most))
@@ -76,7 +79,7 @@ def apart_columns(
         other = 2 * axis - k
         off_axis = abs(other - k) > 2 * doubt and 0 <= other <= columns - 1
         alone = off_axis and not (np.abs(found - other) <= 2 * doubt).any()
-        certain = whole and alone or np.nanmedian(values[..., k]) < -limit
+        certain = whole and alone or np.nanmedian(around(k)[..., 1]) < -limit
         (bad if certain else doubtful)[k] = True
     return bad | noise, doubtful & ~noise
 
@@ -92,13 +95,18 @@ def columns_not_measured(values: np.ndarray, geometry: Geometry) -> np.ndarray:
     return apart_columns(values.swapaxes(0, 1), level, axis_column(geometry), azimuth_of_views(geometry))[0]
 
 
-def _likely(values: np.ndarray, limit: float) -> tuple[np.ndarray, np.ndarray]:
-    """Columns that may lie beyond their neighbours, and those that may change, by more than the limit.
+def _finite(values: np.ndarray) -> np.ndarray:
+    return np.where(np.isfinite(values), values, np.nan)
 
-    Rays beyond it are counted, row by row: their quantiles would have to be sorted, of all columns.
+
+def _likely(values: np.ndarray, rows: np.ndarray, limit: float) -> tuple[np.ndarray, np.ndarray]:
+    """Columns that may lie beyond their neighbours, and those that may change, by more than the limit in some rows.
+
+    Rays beyond it are counted, row by row: their quantiles would have to be sorted, of all columns. No more is copied.
     """
     counts = np.zeros((4, values.shape[2] - 2), int)
-    for row in values:
+    for number in rows:
+        row = _finite(values[number])
         one, left, right = row[:, 1:-1], row[:, :-2], row[:, 2:]
         beyond = np.maximum(one - np.maximum(left, right), np.minimum(left, right) - one)
         own = np.abs(np.diff(one - 0.5 * (left + right), axis=0))
@@ -110,9 +118,9 @@ def _likely(values: np.ndarray, limit: float) -> tuple[np.ndarray, np.ndarray]:
     return np.flatnonzero(beyond) + 1, np.flatnonzero(much > (0.5 - _SLACK) * compared) + 1
 
 
-def _apart(values: np.ndarray, k: int) -> float:
-    """By how much most rays of a column lie beyond both neighbours; 0 where they do not, or too few tell."""
-    one, left, right = values[..., k], values[..., k - 1], values[..., k + 1]
+def _apart(values: np.ndarray) -> float:
+    """By how much most rays of the middle one of three columns lie beyond both others; 0 where too few tell."""
+    left, one, right = np.moveaxis(values, -1, 0)
     beyond = np.maximum(one - np.maximum(left, right), np.minimum(left, right) - one)
     told = beyond[np.isfinite(beyond)]
     if len(told) < max(_FEWEST_RAYS, 0.5 * beyond.size):
@@ -120,12 +128,12 @@ def _apart(values: np.ndarray, k: int) -> float:
     return max(0.0, float(np.quantile(told, _BETWEEN)))
 
 
-def _is_noise(values: np.ndarray, k: int, limit: float) -> bool:
-    """Whether a column changes by much from view to view and from row to row, and each view anew, as noise does.
+def _is_noise(values: np.ndarray, limit: float) -> bool:
+    """Whether the middle one of three columns changes by much from view to view, and row to row, and anew, as noise does.
 
     An edge near the axis changes a column alone, too, but slowly from view to view, or in many rows alike.
     """
-    one, left, right = (values[..., k + step].astype(np.float64) for step in (0, -1, 1))
+    left, one, right = np.moveaxis(values.astype(np.float64), -1, 0)
     own, others = one - 0.5 * (left + right), left - right
     # Photon noise goes with the root of the light; the difference of two has twice the variance of one.
     darker = np.exp(0.5 * np.clip(one - np.minimum(left, right), 0, _DARKEST))
