@@ -129,7 +129,7 @@ def _apart(values: np.ndarray) -> float:
 
 
 def _is_noise(values: np.ndarray, limit: float) -> bool:
-    """Whether the middle one of three columns changes by much, from view to view and row to row and anew, as noise does.
+    """Whether the middle one of three columns changes by much, from view to view and row to row, as noise does.
 
     An edge near the axis changes a column alone, too, but slowly from view to view, or in many rows alike.
     """
