@@ -170,6 +170,31 @@ def test_means_of_wide_gaussians_are_means_of_finer_voxels(shape):
     assert float((centres - expected).norm() / expected.norm()) > 0.02, "else there was nothing to do"
 
 
+def rays_through_slices(rows_a_slice, tilt=0.0):
+    """A parallel beam through slices of 0.1, with so many rows each, that rises by ``tilt`` on a unit of its way."""
+    zero, one = np.zeros((3, 1)), np.ones((3, 1))
+    u, v = np.hstack([one, zero, zero]), np.hstack([zero, zero, one]) * 0.1 / rows_a_slice
+    return Geometry("parallel", np.hstack([zero, one, tilt * one]), -10 * u - v, u, v, 20 * rows_a_slice, 20)
+
+
+def test_what_no_ray_sees_between_slices_does_not_count():
+    """With one row a slice its centre stands for it along z, and voxels are means within the slice alone."""
+    grid = cube(20)
+    assert not voxel_box(grid).flat and voxel_box(grid, rays_through_slices(1)).flat
+    assert not voxel_box(grid, rays_through_slices(2)).flat
+    assert not voxel_box(grid, rays_through_slices(1, tilt=0.1)).flat
+    gaussians = cloud()
+    weights = gaussians.weights(None)
+    box = voxel_box(grid, rays_through_slices(1))
+    means = voxelise_means(gaussians, weights, box, KERNEL)[0]
+    fine = voxelise_gaussians(gaussians, weights, box.refined(np.array([1, 5, 5])), KERNEL)[0]
+    expected = fine.reshape(20, 20, 5, 20, 5).mean(dim=(2, 4))
+    # Turned Gaussians are widened along their own axes.
+    assert float((means - expected).norm() / expected.norm()) < 0.02
+    of_voxels = voxelise_means(gaussians, weights, voxel_box(grid), KERNEL)[0]
+    assert float((of_voxels - expected).norm() / expected.norm()) > 0.03
+
+
 @pytest.mark.parametrize("planar", [False, True])
 def test_means_keep_the_mass_of_gaussians_thinner_than_a_voxel(planar):
     gaussians = cloud(2 if planar else 3, widest=0.03, narrowest=0.02)

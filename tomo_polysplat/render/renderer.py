@@ -38,6 +38,8 @@ _PEAK_SAMPLES = 5
 # Distance of samples in deviations. The mean of a Gaussian over such samples is right within
 # 2 exp(-2 pi^2 / 1.67^2) = 0.2 % wherever they fall (Poisson's summation formula).
 _SAMPLE_STEP = 5 / 3
+# Heights that a ray changes by on its way, and rows are apart, in those of slices, which then have one row each.
+_LEVEL, _ROW = 0.5, 0.8
 # Rounding, as a share of a sample: the least deviation that a fit allows needs a whole number of samples.
 _ROUNDING = 1e-3
 
@@ -51,9 +53,21 @@ def detector_views(geometry: Geometry, planar: bool) -> DetectorViews:
     return DetectorViews(cone, origin, matrix, geometry.rows, geometry.columns, planar)
 
 
-def voxel_box(grid: VolumeGrid) -> VoxelBox:
-    """All voxels of a grid."""
-    return VoxelBox(grid.lower + 0.5 * grid.voxel_size, grid.voxel_size, grid.shape)
+def voxel_box(grid: VolumeGrid, geometry: Geometry | None = None) -> VoxelBox:
+    """All voxels of a grid, as rays of a geometry see them."""
+    flat = geometry is not None and _one_height_a_slice(geometry, grid)
+    return VoxelBox(grid.lower + 0.5 * grid.voxel_size, grid.voxel_size, grid.shape, flat)
+
+
+def _one_height_a_slice(geometry: Geometry, grid: VolumeGrid) -> bool:
+    """Whether parallel rays run within slices, and each slice has hardly more than one row of them."""
+    if geometry.beam != "parallel":
+        return False
+    direction, height = geometry.origin, float(grid.voxel_size[2])
+    level = np.abs(direction[:, 2]) * grid.extent[:2].max() < _LEVEL * height * np.linalg.norm(
+        direction, axis=1
+    )
+    return bool(level.all() and (np.abs(geometry.v[:, 2]) > _ROW * height).all())
 
 
 def project_gaussians(
@@ -130,6 +144,7 @@ def _widened(gaussians: Gaussians, weights: torch.Tensor, box: VoxelBox) -> tupl
     """
     dims = gaussians.log_scale.shape[1]
     of_edges = box.spacing[:dims] ** 2 / 12
+    of_edges[2:] *= not box.flat
     own = gaussians.log_scale.exp().square()
     wider = own + float(of_edges[0])
     if not np.allclose(of_edges, of_edges[0]):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -21,21 +21,25 @@ class VoxelBox:
     spacing : (3,) float64
         Distance of neighbouring centres along x, y, z.
     shape : (nz, ny, nx)
+    flat : bool
+        Whether rays meet slices at one height each: what lies between these is not measured, and does not count.
     """
 
     first: np.ndarray
     spacing: np.ndarray
     shape: tuple[int, int, int]
+    flat: bool = False
 
     def part(self, start: tuple[int, int, int], shape: tuple[int, int, int]) -> VoxelBox:
         """The sub-block of ``shape`` that begins at voxel ``start`` (z, y, x)."""
-        return VoxelBox(self.first + np.array(start[::-1]) * self.spacing, self.spacing, shape)
+        return replace(self, first=self.first + np.array(start[::-1]) * self.spacing, shape=shape)
 
     def refined(self, factor: np.ndarray) -> VoxelBox:
         """The same block cut into ``factor`` (z, y, x) times as many voxels an axis."""
         spacing = self.spacing / factor[::-1]
         shape = tuple(int(n * f) for n, f in zip(self.shape, factor))
-        return VoxelBox(self.first - 0.5 * (self.spacing - spacing), spacing, shape)  # type: ignore[arg-type]
+        first = self.first - 0.5 * (self.spacing - spacing)
+        return replace(self, first=first, spacing=spacing, shape=shape)  # type: ignore[arg-type]
 
     def voxels_of(self, points: torch.Tensor) -> torch.Tensor:
         """(n, 3) indices (z, y, x) of the voxels that hold points (n, 3), or of the nearest ones."""
