@@ -170,6 +170,14 @@ def test_means_of_wide_gaussians_are_means_of_finer_voxels(shape):
     assert float((centres - expected).norm() / expected.norm()) > 0.02, "else there was nothing to do"
 
 
+def test_a_coarse_cloud_is_not_blurred_once_more():
+    gaussians = cloud()
+    weights, box = gaussians.weights(None), voxel_box(cube(20), distance=1.8)
+    centres, means = (f(gaussians, weights, box, KERNEL) for f in (voxelise_gaussians, voxelise_means))
+    assert bool(centres.any()) and torch.allclose(centres, means, rtol=1e-5)
+    assert all(voxel_box(cube(20), distance=1.3).whole)
+
+
 def rays_through_slices(rows_a_slice, tilt=0.0):
     """A parallel beam through slices of 0.1, with so many rows each, that rises by ``tilt`` on a unit of its way."""
     zero, one = np.zeros((3, 1)), np.ones((3, 1))
@@ -180,9 +188,9 @@ def rays_through_slices(rows_a_slice, tilt=0.0):
 def test_what_no_ray_sees_between_slices_does_not_count():
     """With one row a slice its centre stands for it along z, and voxels are means within the slice alone."""
     grid = cube(20)
-    assert not voxel_box(grid).flat and voxel_box(grid, rays_through_slices(1)).flat
-    assert not voxel_box(grid, rays_through_slices(2)).flat
-    assert not voxel_box(grid, rays_through_slices(1, tilt=0.1)).flat
+    assert all(voxel_box(grid).whole) and voxel_box(grid, rays_through_slices(1)).whole == (True, True, False)
+    assert all(voxel_box(grid, rays_through_slices(2)).whole)
+    assert all(voxel_box(grid, rays_through_slices(1, tilt=0.1)).whole)
     gaussians = cloud()
     weights = gaussians.weights(None)
     box = voxel_box(grid, rays_through_slices(1))

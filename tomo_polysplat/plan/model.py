@@ -38,7 +38,7 @@ def scene_of(problem: Problem, plan: Plan, settings: Settings, device: torch.dev
     closed, words = problem.closed(device)
     plan.note("window", "closed" if closed else "open", words)
     return FitScene(
-        box=voxel_box(problem.grid, problem.geometry),
+        box=voxel_box(problem.grid, problem.geometry, plan.spacing),
         quadrature=None if straight else quadrature,
         areal_scale=problem.depth * plan.reference * slope,
         reference_curve=reference_curve,

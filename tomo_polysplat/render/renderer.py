@@ -38,6 +38,9 @@ _PEAK_SAMPLES = 5
 # Distance of samples in deviations. The mean of a Gaussian over such samples is right within
 # 2 exp(-2 pi^2 / 1.67^2) = 0.2 % wherever they fall (Poisson's summation formula).
 _SAMPLE_STEP = 5 / 3
+# Distance of seeds in voxels up to which a cloud can be as sharp as voxels. A coarser one is not, and means would blur
+# it once more (docs/decisions/smallest_scale.md).
+_FINE = 1.4
 # Heights that a ray changes by on its way, and rows are apart, in those of slices, which then have one row each.
 _LEVEL, _ROW = 0.5, 0.8
 # Rounding, as a share of a sample: the least deviation that a fit allows needs a whole number of samples.
@@ -53,10 +56,12 @@ def detector_views(geometry: Geometry, planar: bool) -> DetectorViews:
     return DetectorViews(cone, origin, matrix, geometry.rows, geometry.columns, planar)
 
 
-def voxel_box(grid: VolumeGrid, geometry: Geometry | None = None) -> VoxelBox:
-    """All voxels of a grid, as rays of a geometry see them."""
+def voxel_box(grid: VolumeGrid, geometry: Geometry | None = None, distance: float = 0.0) -> VoxelBox:
+    """All voxels of a grid, as rays of a geometry and a cloud of seeds so many voxels apart show them."""
+    fine = distance <= _FINE
     flat = geometry is not None and _one_height_a_slice(geometry, grid)
-    return VoxelBox(grid.lower + 0.5 * grid.voxel_size, grid.voxel_size, grid.shape, flat)
+    whole = fine, fine, fine and not flat
+    return VoxelBox(grid.lower + 0.5 * grid.voxel_size, grid.voxel_size, grid.shape, whole)
 
 
 def _one_height_a_slice(geometry: Geometry, grid: VolumeGrid) -> bool:
@@ -143,8 +148,9 @@ def _widened(gaussians: Gaussians, weights: torch.Tensor, box: VoxelBox) -> tupl
     then, that of one voxel 0.1 %, as its fourth moment differs.
     """
     dims = gaussians.log_scale.shape[1]
-    of_edges = box.spacing[:dims] ** 2 / 12
-    of_edges[2:] *= not box.flat
+    if not any(box.whole[:dims]):
+        return gaussians, weights
+    of_edges = box.whole[:dims] * box.spacing[:dims] ** 2 / 12
     own = gaussians.log_scale.exp().square()
     wider = own + float(of_edges[0])
     if not np.allclose(of_edges, of_edges[0]):
