@@ -150,7 +150,7 @@ def _widened(gaussians: Gaussians, weights: torch.Tensor, box: VoxelBox) -> tupl
     dims = gaussians.log_scale.shape[1]
     if not any(box.whole[:dims]):
         return gaussians, weights
-    of_edges = box.whole[:dims] * box.spacing[:dims] ** 2 / 12
+    of_edges = np.array(box.whole[:dims]) * box.spacing[:dims] ** 2 / 12
     own = gaussians.log_scale.exp().square()
     wider = own + float(of_edges[0])
     if not np.allclose(of_edges, of_edges[0]):
