@@ -152,8 +152,9 @@ def _widened(gaussians: Gaussians, weights: torch.Tensor, box: VoxelBox) -> tupl
         return gaussians, weights
     of_edges = np.array(box.whole[:dims]) * box.spacing[:dims] ** 2 / 12
     own = gaussians.log_scale.exp().square()
-    wider = own + float(of_edges[0])
-    if not np.allclose(of_edges, of_edges[0]):
+    if np.allclose(of_edges, of_edges[0]):
+        wider = own + float(of_edges[0])
+    else:
         axes = whitening_matrices(torch.ones_like(gaussians.position), gaussians.rotation)[:, :dims, :dims]
         wider = own + axes.square() @ torch.from_numpy(of_edges).to(axes)
     return replace(gaussians, log_scale=0.5 * wider.log()), weights * (own / wider).prod(dim=1).sqrt()

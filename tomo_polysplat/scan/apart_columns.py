@@ -21,8 +21,8 @@ _ENOUGH_RAYS, _LEVEL_VIEWS = 20_000, 64
 _SLACK = 0.05
 # -log of the least light that counts.
 _DARKEST = 20.0
-# Noise of a column is so many times what the object's detail and its light change from view to view. On 80 clean scans
-# of all kinds no column beyond the limit came to more than 1.5.
+# Noise of a column is more than so many times what this share of the rays beside it change from view to view, by the
+# object's detail and their light.
 _NOISE, _MOST = 1.5, 0.75
 # Of independent values those in views next to each other differ by as much as those a share of the scan apart, and as
 # those in rows next to each other.
@@ -99,6 +99,11 @@ def _finite(values: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(values), values, np.nan)
 
 
+def _beyond(left: np.ndarray, one: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """By how much values lie beyond both neighbours, above or below; negative between them."""
+    return np.maximum(one - np.maximum(left, right), np.minimum(left, right) - one)
+
+
 def _likely(values: np.ndarray, rows: np.ndarray, limit: float) -> tuple[np.ndarray, np.ndarray]:
     """Columns that may lie beyond their neighbours, and those that may change, by more than the limit in some rows.
 
@@ -108,7 +113,7 @@ def _likely(values: np.ndarray, rows: np.ndarray, limit: float) -> tuple[np.ndar
     for number in rows:
         row = _finite(values[number])
         one, left, right = row[:, 1:-1], row[:, :-2], row[:, 2:]
-        beyond = np.maximum(one - np.maximum(left, right), np.minimum(left, right) - one)
+        beyond = _beyond(left, one, right)
         own = np.abs(np.diff(one - 0.5 * (left + right), axis=0))
         parts = beyond > limit, np.isfinite(beyond), own > limit, np.isfinite(own)
         counts += [np.count_nonzero(part, axis=0) for part in parts]
@@ -120,8 +125,7 @@ def _likely(values: np.ndarray, rows: np.ndarray, limit: float) -> tuple[np.ndar
 
 def _apart(values: np.ndarray) -> float:
     """By how much most rays of the middle one of three columns lie beyond both others; 0 where too few tell."""
-    left, one, right = np.moveaxis(values, -1, 0)
-    beyond = np.maximum(one - np.maximum(left, right), np.minimum(left, right) - one)
+    beyond = _beyond(*np.moveaxis(values, -1, 0))
     told = beyond[np.isfinite(beyond)]
     if len(told) < max(_FEWEST_RAYS, 0.5 * beyond.size):
         return 0.0

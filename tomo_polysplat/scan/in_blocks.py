@@ -50,36 +50,35 @@ def line_integrals(
         sizes = (f"{size / 2**30:.1f} GiB" for size in (memory, needed))
         raise fail("path", f"at most {next(sizes)}, the free memory", next(sizes), remedy, MemoryError)
     projections, valid = np.empty(counts.shape, np.float32), np.empty(counts.shape, bool)
-    with _reading(counts, progress) as add:
+    with _reading(counts, progress) as (rays, add):
         for block in counts.blocks():
             projections[:, block.views] = block.values.transpose(1, 0, 2)
             valid[:, block.views] = block.usable.transpose(1, 0, 2)
-            rays = add(block.views, block.found)
+            add(block.views, block.found)
     return projections, valid, rays
 
 
 def looked_through(counts: Counts, progress: Progress = None) -> dict[str, int]:
     """How many rays of each kind were found, without keeping any: a damaged file is refused at once."""
-    with _reading(counts, progress) as add:
+    with _reading(counts, progress) as (rays, add):
         for views, found in counts.unusable():
-            counts.found = add(views, found)
-    assert counts.found is not None
-    return counts.found
+            add(views, found)
+    counts.found = rays
+    return rays
 
 
 @contextmanager
 def _reading(
     counts: Counts, progress: Progress
-) -> Iterator[Callable[[slice, dict[str, int]], dict[str, int]]]:
-    """What adds up how many rays of each kind some views have, and reports how far they are; by kept threads."""
+) -> Iterator[tuple[dict[str, int], Callable[[slice, dict[str, int]], None]]]:
+    """How many rays of each kind there are so far, and what adds those of some views and reports; by kept threads."""
     rays: dict[str, int] = {}
     at_once = progress is None and counts.shape[1] <= counts.at_once
     with kept_threads(), progress_reports(False if at_once else progress) as report:
 
-        def add(views: slice, found: dict[str, int]) -> dict[str, int]:
+        def add(views: slice, found: dict[str, int]) -> None:
             for name, count in found.items():
                 rays[name] = rays.get(name, 0) + count
             report(views.stop / counts.shape[1], "reading")
-            return rays
 
-        yield add
+        yield rays, add
