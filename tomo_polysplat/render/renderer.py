@@ -38,8 +38,8 @@ _PEAK_SAMPLES = 5
 # Distance of samples in deviations. The mean of a Gaussian over such samples is right within
 # 2 exp(-2 pi^2 / 1.67^2) = 0.2 % wherever they fall (Poisson's summation formula).
 _SAMPLE_STEP = 5 / 3
-# Distance of seeds in voxels up to which a cloud can be as sharp as voxels. A coarser one is not, and means would blur
-# it once more (docs/decisions/smallest_scale.md).
+# Distance of seeds in voxels up to which a cloud can be as sharp as voxels. A coarser one is not, nor are the round
+# seeds of slices, and means would blur them once more (docs/decisions/smallest_scale.md).
 _FINE = 1.4
 # Heights that a ray changes by on its way, and rows are apart, in those of slices, which then have one row each.
 _LEVEL, _ROW = 0.5, 0.8
@@ -58,14 +58,15 @@ def detector_views(geometry: Geometry, planar: bool) -> DetectorViews:
 
 def voxel_box(grid: VolumeGrid, geometry: Geometry | None = None, distance: float = 0.0) -> VoxelBox:
     """All voxels of a grid, as rays of a geometry and a cloud of seeds so many voxels apart show them."""
-    fine = distance <= _FINE
-    flat = geometry is not None and _one_height_a_slice(geometry, grid)
-    whole = fine, fine, fine and not flat
+    slices = geometry is not None and _by_slices(geometry, grid)
+    whole = distance <= _FINE and not slices
     return VoxelBox(grid.lower + 0.5 * grid.voxel_size, grid.voxel_size, grid.shape, whole)
 
 
-def _one_height_a_slice(geometry: Geometry, grid: VolumeGrid) -> bool:
-    """Whether parallel rays run within slices, and each slice has hardly more than one row of them."""
+def _by_slices(geometry: Geometry, grid: VolumeGrid) -> bool:
+    """Whether rays run within slices: within a single one, or parallel with hardly more than one row a slice."""
+    if geometry.planar and grid.planar:
+        return True
     if geometry.beam != "parallel":
         return False
     direction, height = geometry.origin, float(grid.voxel_size[2])
@@ -147,10 +148,10 @@ def _widened(gaussians: Gaussians, weights: torch.Tensor, box: VoxelBox) -> tupl
     A mean over an edge h adds its variance, h^2 / 12. The peak of a Gaussian of half a voxel is 1 % off along each axis
     then, that of one voxel 0.1 %, as its fourth moment differs.
     """
-    dims = gaussians.log_scale.shape[1]
-    if not any(box.whole[:dims]):
+    if not box.whole:
         return gaussians, weights
-    of_edges = np.array(box.whole[:dims]) * box.spacing[:dims] ** 2 / 12
+    dims = gaussians.log_scale.shape[1]
+    of_edges = box.spacing[:dims] ** 2 / 12
     own = gaussians.log_scale.exp().square()
     if np.allclose(of_edges, of_edges[0]):
         wider = own + float(of_edges[0])

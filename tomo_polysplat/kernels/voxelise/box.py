@@ -21,14 +21,14 @@ class VoxelBox:
     spacing : (3,) float64
         Distance of neighbouring centres along x, y, z.
     shape : (nz, ny, nx)
-    whole : (3,) bool
-        Along which axes x, y and z wide Gaussians count over all of a voxel, and not at its centre alone.
+    whole : bool
+        Whether wide Gaussians count over all of a voxel, and not at its centre alone.
     """
 
     first: np.ndarray
     spacing: np.ndarray
     shape: tuple[int, int, int]
-    whole: tuple[bool, bool, bool] = (True, True, True)
+    whole: bool = True
 
     def part(self, start: tuple[int, int, int], shape: tuple[int, int, int]) -> VoxelBox:
         """The sub-block of ``shape`` that begins at voxel ``start`` (z, y, x)."""
