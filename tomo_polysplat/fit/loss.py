@@ -188,6 +188,10 @@ def away_from_edges(volume: torch.Tensor, corner: float, dense: float) -> torch.
     -------
     (nz, ny, nx) bool tensor
     """
+    if volume.device.type == "cpu" and volume.dtype == torch.float32:
+        from tomo_polysplat.kernels.step import numba_away
+
+        return numba_away.away_from_edges(volume, corner, dense)
     most, least = volume, -volume
     for axis in range(volume.ndim):
         most, least = _largest_beside(most, axis), _largest_beside(least, axis)

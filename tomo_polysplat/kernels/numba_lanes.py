@@ -255,24 +255,28 @@ def ceiling(typing, value):
     return _lanes(_lanes), generate
 
 
+def _lanes_or_number(kind: Any) -> Any:
+    return kind if kind == _lanes else types.float32
+
+
 @_intrinsic
-def larger(typing, value, number):
-    """These, or ``number`` where that is larger."""
+def larger(typing, value, other):
+    """These, or ``other``, lanes or a number, where that is larger."""
 
     def generate(context, builder, signature, values):
         return _called(builder, "maxnum", values)
 
-    return _lanes(_lanes, types.float32), generate
+    return _lanes(_lanes, _lanes_or_number(other)), generate
 
 
 @_intrinsic
-def smaller(typing, value, number):
-    """These, or ``number`` where that is smaller."""
+def smaller(typing, value, other):
+    """These, or ``other``, lanes or a number, where that is smaller."""
 
     def generate(context, builder, signature, values):
         return _called(builder, "minnum", values)
 
-    return _lanes(_lanes, types.float32), generate
+    return _lanes(_lanes, _lanes_or_number(other)), generate
 
 
 @_intrinsic
