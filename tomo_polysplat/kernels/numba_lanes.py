@@ -10,6 +10,7 @@ every block inside its array.
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Callable
 from typing import Any
@@ -35,6 +36,7 @@ __all__ = [
     "lane_sums",
     "load",
     "load_blocks",
+    "logarithm",
     "power_of_two",
     "ramp",
     "store",
@@ -58,6 +60,9 @@ _LEAST = 1e-20
 _SHIFT = 1.5 * 2.0**23
 # 2^f for -1/2 <= f <= 1/2, from f^5 down: of the polynomials that are 1 at 0, the one closest there (9e-8 relative).
 _POWERS = (0.0013264727, 0.0096715126, 0.055507337, 0.24022242, 0.69314698, 1.0)
+# The bits of 2/3, and 2 / k from k = 11 down: log((1 + s) / (1 - s)) = 2 s + 2 s^3 / 3 + ...
+_TWO_THIRDS = 0x3F2AAAAB
+_ODD = tuple(2 / k for k in (11, 9, 7, 5, 3, 1))
 
 # Their type hints count the typing context among the arguments of a call.
 _intrinsic: Any = intrinsic
@@ -324,6 +329,33 @@ def power_of_two(typing, value):
             power = builder.fadd(builder.fmul(power, rest, flags=_FLAGS), _all(coefficient), flags=_FLAGS)
         exponent = builder.shl(builder.bitcast(shifted, _INTS), _all(23, _INTS))
         return builder.bitcast(builder.add(builder.bitcast(power, _INTS), exponent), _VECTOR)
+
+    return _lanes(_lanes), generate
+
+
+@_intrinsic
+def logarithm(typing, value):
+    """``log(value)`` within 2e-7 of 1 or relative, of normal positive numbers, and any number elsewhere.
+
+    The exponent is taken off so that f, what is left, is between 2/3 and 4/3. Of s = (f - 1) / (f + 1) an odd series is
+    left.
+    """
+
+    def generate(context, builder, signature, values):
+        bits = builder.bitcast(values[0], _INTS)
+        above = builder.sub(bits, _all(_TWO_THIRDS, _INTS))
+        exponent = builder.ashr(above, _all(23, _INTS))
+        power = builder.sitofp(exponent, _VECTOR)
+        rest = builder.bitcast(builder.sub(bits, builder.shl(exponent, _all(23, _INTS))), _VECTOR)
+        below, beyond = (builder.fadd(rest, _all(shift), flags=_FLAGS) for shift in (-1.0, 1.0))
+        s = builder.fdiv(below, beyond, flags=_FLAGS)
+        square = builder.fmul(s, s, flags=_FLAGS)
+        series = _all(_ODD[0])
+        for coefficient in _ODD[1:]:
+            series = builder.fadd(builder.fmul(series, square, flags=_FLAGS), _all(coefficient), flags=_FLAGS)
+        return builder.fadd(
+            builder.fmul(power, _all(math.log(2.0)), flags=_FLAGS), builder.fmul(series, s, flags=_FLAGS), flags=_FLAGS
+        )
 
     return _lanes(_lanes), generate
 

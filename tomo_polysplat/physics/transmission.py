@@ -75,6 +75,14 @@ class _Projection(torch.autograd.Function):
     def forward(
         ctx: Any, areal: torch.Tensor, log_weights: torch.Tensor, attenuation: torch.Tensor
     ) -> torch.Tensor:
+        ctx.compiled = areal.device.type == "cpu" and areal.dtype == torch.float32
+        if ctx.compiled:
+            from tomo_polysplat.kernels.step.numba_beer_lambert import beer_lambert
+
+            rays = areal.reshape(len(areal), -1)
+            value, slopes = beer_lambert(rays, log_weights, attenuation, ctx.needs_input_grad[0])
+            ctx.save_for_backward(slopes)
+            return value.reshape(areal.shape[1:])
         value = torch.logsumexp(_exponents(areal, log_weights, attenuation), dim=0)
         ctx.save_for_backward(areal, log_weights, attenuation, value)
         return -value.reshape(areal.shape[1:])
@@ -82,6 +90,9 @@ class _Projection(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, None, None]:
+        if ctx.compiled:
+            (slopes,) = ctx.saved_tensors
+            return (slopes * gradient.reshape(1, -1)).reshape(-1, *gradient.shape), None, None
         areal, log_weights, attenuation, value = ctx.saved_tensors
         # Recomputed rather than kept: the exponents take as many times the memory of P as there are nodes.
         share = _exponents(areal, log_weights, attenuation).sub_(value).exp_()
