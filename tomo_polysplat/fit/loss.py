@@ -17,6 +17,7 @@ __all__ = [
     "away_from_edges",
     "misfit",
     "misfit_by_view",
+    "misfits_of_step",
     "pull_of_roughness",
     "slope_of_variation",
     "total_variation",
@@ -41,6 +42,45 @@ def misfit(
     if settings.loss == "huber":
         return weighted_huber(predicted, measured, weight, settings.huber_corner * settings.model_error, dims)
     return weighted_l1(predicted, measured, weight, dims)
+
+
+def misfits_of_step(
+    predicted: torch.Tensor, measured: torch.Tensor, weight: torch.Tensor, aside: torch.Tensor, settings: Settings
+) -> tuple[torch.Tensor, torch.Tensor | float, torch.Tensor | float]:
+    """`misfit` of the fitted rays, differentiable; that of those held ``aside``, times their weight, and this."""
+    if predicted.device.type == "cpu" and predicted.dtype == torch.float32:
+        width = settings.huber_corner * settings.model_error if settings.loss == "huber" else 0.0
+        return _Misfits.apply(predicted, measured, weight, aside, width)
+    fitted = misfit(predicted, measured, weight, settings)
+    with torch.no_grad():
+        total = aside.sum()
+        return fitted, misfit(predicted, measured, aside, settings) * total, total
+
+
+class _Misfits(torch.autograd.Function):
+    """The mean misfit of the fitted rays, and of those held out the sum and their weight, with slopes of the first."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        predicted: torch.Tensor,
+        measured: torch.Tensor,
+        weight: torch.Tensor,
+        aside: torch.Tensor,
+        width: float,
+    ) -> tuple[torch.Tensor, float, float]:
+        from tomo_polysplat.kernels.step.numba_misfit import misfit_sums
+
+        (loss, total, held_out, total_aside), slopes = misfit_sums((predicted, measured, weight, aside), width)
+        ctx.total = max(float(total), 1e-12)
+        ctx.save_for_backward(slopes)
+        return predicted.new_tensor(loss / ctx.total), float(held_out), float(total_aside)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: torch.Tensor, *_: None) -> tuple[torch.Tensor | None, ...]:
+        (slopes,) = ctx.saved_tensors
+        return slopes * (gradient / ctx.total), None, None, None, None
 
 
 def misfit_by_view(

@@ -81,14 +81,17 @@ class Rays:
         The variance of -log(I/I0) is exp(P)/I0 for Poisson counts, to which that of the model is added; the
         weight is the inverse deviation, 1 for a ray without noise.
         """
-        values = _chosen(self.projections, chosen).to(self.target)
+        values, aside = _chosen(self.projections, chosen).to(self.target), self.aside(chosen)
+        if values.device.type == "cpu":
+            from tomo_polysplat.kernels.step.numba_misfit import weigh
+
+            return self.views.select(chosen), *weigh(values, aside, self.noise, self.dimmed)
         usable = torch.isfinite(values)
         values = torch.where(usable, values, torch.zeros_like(values))
         weight = usable.to(values.dtype)
         if self.noise:
             depth = values if self.dimmed is None else values + self.dimmed
             weight = weight * torch.rsqrt(1 + torch.exp(depth) * self.noise)
-        aside = self.aside(chosen)
         return self.views.select(chosen), values, weight * ~aside, weight * aside
 
     @functools.cached_property

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.fit.adam import Adam, Moments
-from tomo_polysplat.fit.loss import misfit, pull_of_roughness
+from tomo_polysplat.fit.loss import misfits_of_step, pull_of_roughness
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.fit.shares import Part
@@ -124,7 +124,7 @@ class EagerStep:
         self.adam = Adam(gaussians.parameters())
         self.moments = self.adam.moments
         self.largest: list[float] = []
-        self._sums: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor, int | torch.Tensor]] = []
+        self._sums: list[tuple[torch.Tensor | float, ...]] = []
         self._done = 0
 
     @property
@@ -143,7 +143,7 @@ class EagerStep:
         rates["rotation"] *= turning(self._done)
         chosen, measured, weight, aside = self.rays.batch(views)
         predicted, skipped = self._predict(views, chosen)
-        fitted = misfit(predicted, measured, weight, self.settings)
+        fitted, *held_out = misfits_of_step(predicted, measured, weight, aside, self.settings)
         loss = fitted + self._regularisation(predicted, measured, weight)
         self.adam.forget_gradients()
         # On this thread: autograd's own would be woken and waited for at every step.
@@ -156,10 +156,7 @@ class EagerStep:
         self.adam.step(rates)
         self._done += 1
         self._bound()
-        with torch.no_grad():
-            weight = aside.sum()
-            held_out = misfit(predicted, measured, aside, self.settings) * weight
-            self._sums.append((fitted.detach(), held_out, weight, skipped))
+        self._sums.append((fitted.detach(), *held_out, skipped))
 
     def _add_up(self) -> None:
         """Make the gradient of what all Gaussians share that of all ranks; each has the blur's, of the whole images."""

@@ -15,7 +15,7 @@ import torch
 
 from tomo_polysplat.baselines.arrays.voxel_model import VoxelModel, start_voxels
 from tomo_polysplat.fit.adam import Adam
-from tomo_polysplat.fit.loss import misfit, total_variation
+from tomo_polysplat.fit.loss import misfits_of_step, total_variation
 from tomo_polysplat.fit.problem import OPAQUE
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.step import held_out_mean
@@ -192,16 +192,13 @@ class _Fit:
         weights = self.model.weights(self.reference_curve)
         areal = project_voxels(weights, self.pair, views) * self.cm
         predicted = polychromatic_projection(areal, self.quadrature)
-        fitted = misfit(predicted, measured, weight, self.settings)
+        fitted, *held_out = misfits_of_step(predicted, measured, weight, aside, self.settings)
         rough = total_variation(self._output(weights), self.corners, self.settings.bone_level)
         self.adam.forget_gradients()
         (fitted + self.settings.tv_weight * rough).backward()
         self.adam.step({"attenuation": RATE_ATTENUATION * falling, "material": RATE_MATERIAL * falling})
         self.model.hold()
-        with torch.no_grad():
-            weight = aside.sum()
-            held_out = misfit(predicted, measured, aside, self.settings) * weight
-            return torch.stack([fitted.detach(), held_out, weight])
+        return torch.stack([torch.as_tensor(part) for part in (fitted.detach(), *held_out)])
 
     def _output(self, weights: torch.Tensor) -> torch.Tensor:
         """(nz, ny, nx) attenuation at the effective energy in soft references."""
