@@ -3,7 +3,7 @@
 The compiler takes a loop over numbers side by side into vectors only where it can prove much of it, and what it took so
 it holds in memory from one loop to the next. These say it, and are compiled sooner than such a loop.
 
-A value knows ``+``, ``-`` and ``*``, with others and with single float32 numbers. Its two halves may lie in different
+A value knows ``+``, ``-``, ``*`` and ``/``, with others and with single float32 numbers. Its two halves may lie in different
 places, as two short rows of an image: so the arrays' blocks are halves, too. No index is checked: the caller keeps
 every block inside its array.
 """
@@ -15,6 +15,7 @@ import operator
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from llvmlite import ir
 from llvmlite.binding import get_host_cpu_features
 from numba import types
@@ -37,6 +38,7 @@ __all__ = [
     "load",
     "load_blocks",
     "logarithm",
+    "padded",
     "power_of_two",
     "ramp",
     "store",
@@ -113,8 +115,18 @@ def _operator(function: Callable[..., Any], name: str) -> None:
         lower_builtin(function, *pair)(generate)
 
 
-for _function, _name in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul")):
-    _operator(_function, _name)
+_operator(operator.add, "fadd")
+_operator(operator.sub, "fsub")
+_operator(operator.mul, "fmul")
+_operator(operator.truediv, "fdiv")
+
+
+def padded(array: np.ndarray) -> np.ndarray:
+    """The array, C-contiguous, with zeros behind its last axis where that has fewer numbers than there are lanes."""
+    missing = LANES - array.shape[-1]
+    if missing > 0:
+        array = np.pad(array, [*[(0, 0)] * (array.ndim - 1), (0, missing)])
+    return np.ascontiguousarray(array)
 
 
 def _pointer(context, builder, array_type, array, start, kind=_VECTOR):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 
@@ -120,9 +121,31 @@ class Gaussians:
         """
         if curve is None:
             return self.attenuation[None]
+        if curve.device.type == "cpu" and curve.dtype == torch.float32:
+            return _Weights.apply(self.attenuation, self.own_material, self.shared_material, self.group, curve)
         u = self.material()
         mixture = shares_of_curves(u)
         return mixture * (self.attenuation / (curve @ mixture))
+
+
+class _Weights(torch.autograd.Function):
+    """`Gaussians.weights` on a CPU, where torch takes some thirty operations forth and back."""
+
+    @staticmethod
+    def forward(ctx: Any, *parts: torch.Tensor) -> torch.Tensor:
+        from tomo_polysplat.kernels.step.numba_weights import weights
+
+        ctx.parts = tuple(part.detach().contiguous().numpy() for part in parts)
+        made, ctx.numbers = weights(ctx.parts)
+        return torch.from_numpy(made[:, : len(parts[0])])
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        from tomo_polysplat.kernels.step.numba_weights import pull_weights
+
+        pulled = pull_weights(ctx.parts, ctx.numbers, gradient.numpy())
+        return *(torch.from_numpy(part) for part in pulled), None, None
 
 
 def shares_of_curves(u: torch.Tensor) -> torch.Tensor:

@@ -15,6 +15,8 @@ metal at the edges of opaque metal. A model that mixes light then adds metal whe
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 
 __all__ = ["LARGEST_BLUR", "blurred"]
@@ -38,6 +40,8 @@ def blurred(projections: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
     (views, rows, columns) tensor
         Differentiable by both. An axis of one pixel is not blurred.
     """
+    if projections.device.type == "cpu" and projections.dtype == torch.float32:
+        return _Blurred.apply(projections, variance)
     beside, same = 0.5 * variance, 1 - variance
     for axis in (1, 2):
         count = projections.shape[axis]
@@ -47,3 +51,22 @@ def blurred(projections: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
             before, after = (wide.narrow(axis, k, count) for k in (0, 2))
             projections = same * projections + beside * (before + after)
     return projections
+
+
+class _Blurred(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, projections: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
+        from tomo_polysplat.kernels.step.numba_blur import blur
+
+        ctx.save_for_backward(projections, variance)
+        return torch.from_numpy(blur(projections.detach().numpy(), variance.item())[0])
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        from tomo_polysplat.kernels.step.numba_blur import blur
+
+        projections, variance = ctx.saved_tensors
+        # The blur is its own adjoint.
+        pulled, slope = blur(gradient.numpy(), variance.item(), projections.detach().numpy())
+        return torch.from_numpy(pulled), variance.new_full((1,), slope)

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.compiled import njit
-from tomo_polysplat.kernels.numba_lanes import LANES, halves, larger, load, logarithm, power_of_two, store
+from tomo_polysplat.kernels.numba_lanes import LANES, halves, larger, load, logarithm, padded, power_of_two, store
 
 __all__ = ["beer_lambert"]
 
@@ -30,16 +30,12 @@ def beer_lambert(
     -------
     (rays) tensor, (curves, rays) tensor or one without numbers
     """
-    curves, rays = areal.shape
-    # Lanes need as many rays.
-    missing = max(LANES - rays, 0)
-    if missing:
-        areal = torch.nn.functional.pad(areal, (0, missing))
-        log_weights = torch.nn.functional.pad(log_weights, (0, missing)) if log_weights.shape[1] > 1 else log_weights
-    value, by_areal = areal.new_empty(rays + missing), areal.new_empty((curves if slopes else 0, rays + missing))
-    parts = (part.contiguous().numpy() for part in (areal, log_weights, attenuation, value, by_areal))
-    _project(*parts)
-    return value[:rays], by_areal[:, :rays]
+    rays = areal.shape[1]
+    paths, attenuation = padded(areal.numpy()), attenuation.numpy()
+    weights = log_weights.numpy() if log_weights.shape[1] == 1 else padded(log_weights.numpy())
+    value, by_areal = np.empty(paths.shape[1], np.float32), np.empty_like(paths if slopes else paths[:0])
+    _project(paths, weights, attenuation, value, by_areal)
+    return torch.from_numpy(value[:rays]), torch.from_numpy(by_areal[:, :rays])
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

@@ -17,6 +17,7 @@ from tomo_polysplat.kernels.numba_lanes import (
     inverse_root,
     larger,
     load,
+    padded,
     power_of_two,
     ramp,
     smaller,
@@ -56,9 +57,7 @@ def weigh(
 
 
 def _flat(rays: torch.Tensor) -> np.ndarray:
-    """The numbers of rays, with zeros behind those of fewer rays than lanes."""
-    flat = rays.detach().reshape(-1).numpy()
-    return flat if len(flat) >= LANES else np.pad(flat, (0, LANES - len(flat)))
+    return padded(rays.detach().reshape(-1).numpy())
 
 
 def _shaped(flat: np.ndarray, like: torch.Tensor) -> torch.Tensor:
