@@ -1,6 +1,7 @@
 """Losses in closed form."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from tomo_polysplat.fit.loss import (
     away_from_edges,
     misfit,
     misfit_by_view,
+    misfits_of_step,
     slope_of_variation,
     total_variation,
     variation_of_slab,
@@ -156,6 +158,41 @@ def test_nothing_dense_is_faint_nor_what_is_beside_it():
     assert not away_from_edges(row, 0.1, 2.2).any() and away_from_edges(row, 0.1, 3.0).all()
     row[..., 4] = 3.2
     assert away_from_edges(row, 0.1, 3.0)[0, 0].tolist() == [True] + [False] * 7 + [True]
+
+
+@pytest.mark.parametrize("shape", [(1, 3, 5), (2, 1, 1), (9, 2, 3), (12, 13, 40)])
+def test_what_a_step_finds_away_from_edges_is_what_torch_finds(shape):
+    """Which has it in float64: blobs of faint matter, some of them dense, in no matter."""
+    volume = torch.rand(shape, generator=torch.Generator().manual_seed(5))
+    volume[volume < 0.02] = 2.0
+    for corner in (0.2, 0.33, 0.7):
+        assert torch.equal(
+            away_from_edges(volume, corner, 1.5), away_from_edges(volume.double(), corner, 1.5)
+        )
+
+
+@pytest.mark.parametrize("rays", [3, 41, 40_009])
+@pytest.mark.parametrize("loss", ["huber", "weighted-l1"])
+def test_the_misfits_of_a_step_are_the_means_and_their_slopes(loss, rays):
+    """In lanes of float32 as by autograd in float64; a ray without weight may have any prediction."""
+    settings, random = replace(Settings(), loss=loss), torch.Generator().manual_seed(2)
+    measured, weight = torch.rand((2, rays), generator=random)
+    predicted = measured + 0.03 * torch.randn(rays, generator=random)
+    held_out = torch.rand(rays, generator=random) < 0.2
+    weight[::7], predicted[::5] = 0.0, measured[::5]
+    parts = (predicted, measured, weight * ~held_out, weight * held_out)
+    found = []
+    for kind in (torch.float32, torch.float64):
+        leaf, *rest = (part.to(kind, copy=True) for part in parts)
+        fitted, *aside = misfits_of_step(leaf.requires_grad_(), *rest, settings)
+        (3 * fitted).backward()
+        means = torch.tensor([float(part) for part in (fitted.detach(), *aside)], dtype=torch.float64)
+        found.append((means, leaf.grad.double()))
+    for one, other in zip(*found):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6 * float(other.abs().max()))
+    parts[0][::7] = math.nan
+    again = misfits_of_step(*parts, settings)
+    assert [float(part) for part in again] == pytest.approx(found[0][0].tolist(), rel=1e-6)
 
 
 def test_the_pull_on_an_edge_falls_with_its_height():

@@ -29,6 +29,23 @@ def test_the_attenuation_at_the_reference_energy_does_not_depend_on_the_material
     assert torch.allclose(CURVE @ cloud.weights(CURVE), cloud.attenuation, rtol=1e-6)
 
 
+@pytest.mark.parametrize("count", [2, 37])
+def test_densities_and_their_slopes_in_lanes_of_float32_are_those_of_float64(count):
+    random, found = torch.Generator().manual_seed(3), []
+    own, slopes = torch.rand(count, generator=random), torch.randn((3, count), generator=random)
+    for kind in (torch.float32, torch.float64):
+        cloud = gaussians(own.tolist(), (0.1, 0.6), [k % 3 - 1 for k in range(count)])
+        parts = [part.to(kind) for part in (cloud.attenuation, cloud.own_material, cloud.shared_material)]
+        cloud.attenuation, cloud.own_material, cloud.shared_material = (
+            part.requires_grad_() for part in parts
+        )
+        weights = cloud.weights(CURVE.to(kind))
+        (weights * slopes.to(kind)).sum().backward()
+        found.append([weights.detach().double(), *(part.grad.double() for part in parts)])
+    for one, other in zip(*found):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
+
+
 @pytest.mark.parametrize("u, share", [(0.0, (1, 0, 0)), (0.5, (0.25, 0.5, 0.25)), (1.0, (0, 0, 1))])
 def test_the_material_number_mixes_the_curves_by_bernstein(u, share):
     cloud = gaussians([u])

@@ -53,3 +53,19 @@ def test_gradients(variance):
     rays = image(1, 4, 5).requires_grad_()
     spread = torch.tensor([variance], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(blurred, (rays, spread))
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (2, 1, 5), (2, 4, 1), (3, 2, 9), (2, 7, 41)])
+def test_lanes_of_float32_blur_as_float64_does(shape):
+    found = []
+    for kind in (torch.float64, torch.float32):
+        rays, spread = (
+            image(*shape).to(kind).requires_grad_(),
+            torch.tensor([0.23], dtype=kind, requires_grad=True),
+        )
+        value = blurred(rays, spread)
+        (value * image(*shape).square().to(kind)).sum().backward()
+        slope = torch.zeros(1) if spread.grad is None else spread.grad
+        found.append([part.double() for part in (value.detach(), rays.grad, slope)])
+    for one, other in zip(*found):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5)

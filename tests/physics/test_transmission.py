@@ -1,5 +1,7 @@
 """The torch projection against its definition, its gradient against differences, and the water inverse."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -68,6 +70,22 @@ def test_gradient_through_a_strided_view_and_a_weighted_loss():
     )
     (-exponents.logsumexp(-1).T[:, ::2] * weights).sum().backward()
     torch.testing.assert_close(areal.grad, reference.grad)
+
+
+@pytest.mark.parametrize("shape", [(3,), (5, 23)])
+@pytest.mark.parametrize("filtered", [False, True])
+def test_rays_and_slopes_in_lanes_of_float32_are_those_of_float64(shape, filtered):
+    curve = mass_attenuation("Al", np.linspace(30.0, 70.0, QUADRATURE.nodes))
+    nodes = replace(QUADRATURE, filter=curve) if filtered else QUADRATURE
+    behind = torch.rand(shape, generator=torch.Generator().manual_seed(1)) if filtered else None
+    found = []
+    for kind in (torch.float32, torch.float64):
+        areal = torch.from_numpy(rays(*shape)).to(kind).requires_grad_()
+        value = polychromatic_projection(areal, nodes, None if behind is None else behind.to(kind))
+        (value * torch.arange(value.numel()).reshape(shape)).sum().backward()
+        found.append((value.detach().double(), areal.grad.double()))
+    for one, other in zip(*found):
+        torch.testing.assert_close(one, other, rtol=3e-6, atol=1e-6)
 
 
 def test_negative_areal_densities_stay_finite():

@@ -45,7 +45,11 @@ def misfit(
 
 
 def misfits_of_step(
-    predicted: torch.Tensor, measured: torch.Tensor, weight: torch.Tensor, aside: torch.Tensor, settings: Settings
+    predicted: torch.Tensor,
+    measured: torch.Tensor,
+    weight: torch.Tensor,
+    aside: torch.Tensor,
+    settings: Settings,
 ) -> tuple[torch.Tensor, torch.Tensor | float, torch.Tensor | float]:
     """`misfit` of the fitted rays, differentiable; that of those held ``aside``, times their weight, and this."""
     if predicted.device.type == "cpu" and predicted.dtype == torch.float32:
@@ -71,7 +75,9 @@ class _Misfits(torch.autograd.Function):
     ) -> tuple[torch.Tensor, float, float]:
         from tomo_polysplat.kernels.step.numba_misfit import misfit_sums
 
-        (loss, total, held_out, total_aside), slopes = misfit_sums((predicted, measured, weight, aside), width)
+        (loss, total, held_out, total_aside), slopes = misfit_sums(
+            (predicted, measured, weight, aside), width
+        )
         ctx.total = max(float(total), 1e-12)
         ctx.save_for_backward(slopes)
         return predicted.new_tensor(loss / ctx.total), float(held_out), float(total_aside)

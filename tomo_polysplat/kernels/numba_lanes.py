@@ -3,9 +3,9 @@
 The compiler takes a loop over numbers side by side into vectors only where it can prove much of it, and what it took so
 it holds in memory from one loop to the next. These say it, and are compiled sooner than such a loop.
 
-A value knows ``+``, ``-``, ``*`` and ``/``, with others and with single float32 numbers. Its two halves may lie in different
-places, as two short rows of an image: so the arrays' blocks are halves, too. No index is checked: the caller keeps
-every block inside its array.
+A value knows ``+``, ``-``, ``*`` and ``/``, with others and with single float32 numbers. Its two halves may lie in
+different places, as two short rows of an image: so the arrays' blocks are halves, too. No index is checked: the caller
+keeps every block inside its array.
 """
 
 from __future__ import annotations
@@ -366,7 +366,9 @@ def logarithm(typing, value):
         for coefficient in _ODD[1:]:
             series = builder.fadd(builder.fmul(series, square, flags=_FLAGS), _all(coefficient), flags=_FLAGS)
         return builder.fadd(
-            builder.fmul(power, _all(math.log(2.0)), flags=_FLAGS), builder.fmul(series, s, flags=_FLAGS), flags=_FLAGS
+            builder.fmul(power, _all(math.log(2.0)), flags=_FLAGS),
+            builder.fmul(series, s, flags=_FLAGS),
+            flags=_FLAGS,
         )
 
     return _lanes(_lanes), generate

@@ -122,7 +122,9 @@ class Gaussians:
         if curve is None:
             return self.attenuation[None]
         if curve.device.type == "cpu" and curve.dtype == torch.float32:
-            return _Weights.apply(self.attenuation, self.own_material, self.shared_material, self.group, curve)
+            return _Weights.apply(
+                self.attenuation, self.own_material, self.shared_material, self.group, curve
+            )
         u = self.material()
         mixture = shares_of_curves(u)
         return mixture * (self.attenuation / (curve @ mixture))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import torch
 
 from tomo_polysplat.kernels.project import reference
@@ -39,20 +40,24 @@ def project(
 
         image, skipped = triton_kernel.project(position, scale, rotation, weight, views, cutoff, vectors)
         return image, skipped
-    image, skipped = _NumbaProject.apply(position, scale, rotation, weight, views, cutoff, vectors)
     factor = math.sqrt(2 * math.pi) * views.ray_lengths(position.device, position.dtype, vectors)
-    return image * factor, skipped
+    # Where it is not differentiated there is no image without it.
+    inside = factor.numpy() if vectors is None else None
+    image, skipped = _NumbaProject.apply(position, scale, rotation, weight, views, cutoff, vectors, inside)
+    return (image * factor if vectors is not None else image), skipped
 
 
 class _NumbaProject(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, position, scale, rotation, weight, views, cutoff, vectors):
+    def forward(ctx, position, scale, rotation, weight, views, cutoff, vectors, factor):
         from tomo_polysplat.kernels.project import numba_kernel
 
         arrays = [t.detach().contiguous().numpy() for t in (position, scale, rotation, weight)]
         position, scale, rotation, weight = arrays
         image, skipped, state = numba_kernel.forward(position, scale, rotation, weight, views, cutoff)
-        ctx.arrays, ctx.views, ctx.cutoff, ctx.state = arrays, views, cutoff, state
+        ctx.arrays, ctx.views, ctx.cutoff, ctx.state, ctx.factor = arrays, views, cutoff, state, factor
+        if factor is not None:
+            image = np.multiply(image, factor, out=np.empty(image.shape, np.float32))
         return torch.from_numpy(image), skipped
 
     @staticmethod
@@ -60,9 +65,10 @@ class _NumbaProject(torch.autograd.Function):
         from tomo_polysplat.kernels.project import numba_kernel
 
         position, scale, rotation, weight = ctx.arrays
+        gradient = grad_image.numpy()
         grads = numba_kernel.backward(
-            position, scale, rotation, weight, ctx.views, ctx.cutoff, ctx.state, grad_image.numpy(),
-            of_views=ctx.needs_input_grad[6],
+            position, scale, rotation, weight, ctx.views, ctx.cutoff, ctx.state,
+            gradient if ctx.factor is None else gradient * ctx.factor, of_views=ctx.needs_input_grad[6],
         )  # fmt: skip
         of_views = torch.from_numpy(grads[4]) if ctx.needs_input_grad[6] else None
-        return (*map(torch.from_numpy, grads[:4]), None, None, of_views)
+        return (*map(torch.from_numpy, grads[:4]), None, None, of_views, None)

@@ -6,7 +6,16 @@ import numpy as np
 import torch
 
 from tomo_polysplat.compiled import njit
-from tomo_polysplat.kernels.numba_lanes import LANES, halves, larger, load, logarithm, padded, power_of_two, store
+from tomo_polysplat.kernels.numba_lanes import (
+    LANES,
+    halves,
+    larger,
+    load,
+    logarithm,
+    padded,
+    power_of_two,
+    store,
+)
 
 __all__ = ["beer_lambert"]
 
@@ -31,10 +40,10 @@ def beer_lambert(
     (rays) tensor, (curves, rays) tensor or one without numbers
     """
     rays = areal.shape[1]
-    paths, attenuation = padded(areal.numpy()), attenuation.numpy()
+    paths, curves = padded(areal.numpy()), attenuation.numpy()
     weights = log_weights.numpy() if log_weights.shape[1] == 1 else padded(log_weights.numpy())
     value, by_areal = np.empty(paths.shape[1], np.float32), np.empty_like(paths if slopes else paths[:0])
-    _project(paths, weights, attenuation, value, by_areal)
+    _project(paths, weights, curves, value, by_areal)
     return torch.from_numpy(value[:rays]), torch.from_numpy(by_areal[:, :rays])
 
 

@@ -50,8 +50,8 @@ def weigh(
     depths = measured if dimmed is None else measured + dimmed
     inputs = [_flat(part) for part in (measured, depths, aside.to(measured.dtype))]
     made = [np.empty_like(inputs[0]) for _ in range(3)]
-    tasks = _tasks(inputs[0])
-    run_tasks(lambda a, b: _weigh(a, b, *inputs, *made, np.float32(noise)), tasks)
+    parts = (*inputs, *made, np.float32(noise))
+    run_tasks(lambda a, b: _weigh(a, b, *parts), _tasks(inputs[0]))
     values, fitted, held_out = (_shaped(part, measured) for part in made)
     return values, fitted, held_out
 
@@ -105,8 +105,8 @@ def misfit_sums(
     inputs = [_flat(part) for part in rays]
     slopes, tasks = np.empty_like(inputs[0]), _tasks(inputs[0])
     sums = np.zeros((len(tasks), 4))
-    numbers = np.float32(max(width, _SMALLEST))
-    run_tasks(lambda a, b: _add_up(a, b, *inputs, slopes, numbers, sums[a // _TASK]), tasks)
+    parts = (*inputs, slopes, np.float32(max(width, _SMALLEST)), sums)
+    run_tasks(lambda a, b: _add_up(a, b, *parts), tasks)
     return sums.sum(axis=0), _shaped(slopes, rays[0])
 
 
@@ -119,7 +119,11 @@ def _add_up(start, stop, predicted, measured, fitted, held_out, slopes, width, s
         loss = weights = loss_aside = weights_aside = zero
         for begin in range(first, min(first + _ADDED, stop), LANES):
             at = min(begin, len(predicted) - LANES)
-            residual, weight, aside = load(predicted, at) - load(measured, at), load(fitted, at), load(held_out, at)
+            residual, weight, aside = (
+                load(predicted, at) - load(measured, at),
+                load(fitted, at),
+                load(held_out, at),
+            )
             both = weight + aside
             # A ray without weight may have any prediction.
             residual = within(zero - both, -_SMALLEST, zero - both, -_SMALLEST, residual)
@@ -139,4 +143,4 @@ def _add_up(start, stop, predicted, measured, fitted, held_out, slopes, width, s
         store(lanes, 2 * LANES, loss_aside)
         store(lanes, 3 * LANES, weights_aside)
         for k in range(4 * LANES):
-            sums[k // LANES] += lanes[k]
+            sums[start // _TASK, k // LANES] += lanes[k]
