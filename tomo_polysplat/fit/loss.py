@@ -162,8 +162,7 @@ def slope_of_variation(
             return torch.autograd.grad(factor * variation_of_slab(slab, planes, corners, dense), slab)[0]
     from tomo_polysplat.kernels.step.numba_variation import variation_gradient
 
-    away = _away(slab, planes, corners, dense)
-    return variation_gradient(slab, away, corners, dense, factor, planes)
+    return variation_gradient(slab, _away(slab, planes, corners, dense), corners, dense, factor, planes)
 
 
 def total_variation(

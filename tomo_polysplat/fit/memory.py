@@ -43,7 +43,7 @@ _PIXEL = 48
 # Bytes a voxel takes at once, by torch's own count on 40^3 to 64^3 (tests/fit/test_counted_memory.py): while a start is
 # looked at and seeded; in a step, with the smoothing, on the CPU and by the kernels of a GPU, which hold the volume and
 # its slope; while a volume is made of three curves and metal. And the samples of thin Gaussians (render.renderer).
-_SEEDED, _SMOOTHED, _MADE, _SAMPLES = 40, {"cpu": 18, "cuda": 13}, 64, 12 << 25
+_SEEDED, _SMOOTHED, _MADE, _SAMPLES = 40, {"cpu": 22, "cuda": 13}, 64, 12 << 25
 # Voxels of a start around which windows are looked at together (model.seed_samples), and bytes of one on top.
 _WINDOW, _WINDOWED = 1 << 25, 22
 # Voxels that are made at once at most: a larger volume is no faster in one piece.

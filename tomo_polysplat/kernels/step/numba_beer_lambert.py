@@ -42,9 +42,9 @@ def beer_lambert(
     rays = areal.shape[1]
     paths, curves = padded(areal.numpy()), attenuation.numpy()
     weights = log_weights.numpy() if log_weights.shape[1] == 1 else padded(log_weights.numpy())
-    value, by_areal = np.empty(paths.shape[1], np.float32), np.empty_like(paths if slopes else paths[:0])
-    _project(paths, weights, curves, value, by_areal)
-    return torch.from_numpy(value[:rays]), torch.from_numpy(by_areal[:, :rays])
+    value, by_areal = torch.empty(paths.shape[1]), torch.empty(paths.shape if slopes else (0, 0))
+    _project(paths, weights, curves, value.numpy(), by_areal.numpy())
+    return value[:rays], by_areal[:, :rays]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

@@ -7,6 +7,7 @@ the adjoint of the blur is the blur.
 from __future__ import annotations
 
 import numpy as np
+import torch
 
 from tomo_polysplat.compiled import njit
 from tomo_polysplat.kernels.numba_lanes import HALF, LANES, halves, load, padded, ramp, store, within
@@ -24,7 +25,7 @@ def blur(images: np.ndarray, variance: float, other: np.ndarray | None = None) -
         # A border that goes on changes nothing.
         images = np.pad(images, ((0, 0), (0, 0), (0, LANES - columns)), mode="edge")
     images, others = np.ascontiguousarray(images), padded(images[:0] if other is None else other)
-    spread, line = np.empty_like(images), np.empty(2 * (images.shape[2] + 2), np.float32)
+    spread, line = torch.empty(images.shape).numpy(), np.empty(2 * (images.shape[2] + 2), np.float32)
     slope = _blur(images, np.float32(variance), others, line, spread)
     return spread[..., :columns], slope
 

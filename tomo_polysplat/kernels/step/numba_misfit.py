@@ -49,7 +49,7 @@ def weigh(
     """
     depths = measured if dimmed is None else measured + dimmed
     inputs = [_flat(part) for part in (measured, depths, aside.to(measured.dtype))]
-    made = [np.empty_like(inputs[0]) for _ in range(3)]
+    made = [torch.empty(len(inputs[0])).numpy() for _ in range(3)]
     parts = (*inputs, *made, np.float32(noise))
     run_tasks(lambda a, b: _weigh(a, b, *parts), _tasks(inputs[0]))
     values, fitted, held_out = (_shaped(part, measured) for part in made)
@@ -103,7 +103,7 @@ def misfit_sums(
     (4,) float64 array, tensor of the rays' shape
     """
     inputs = [_flat(part) for part in rays]
-    slopes, tasks = np.empty_like(inputs[0]), _tasks(inputs[0])
+    slopes, tasks = torch.empty(len(inputs[0])).numpy(), _tasks(inputs[0])
     sums = np.zeros((len(tasks), 4))
     parts = (*inputs, slopes, np.float32(max(width, _SMALLEST)), sums)
     run_tasks(lambda a, b: _add_up(a, b, *parts), tasks)

@@ -1,6 +1,7 @@
-"""The slope of the total variation, compiled for the CPU: what `fit.loss.variation_of_slab` has, to the bit.
+"""The slope of the total variation, compiled for the CPU: what `fit.loss.variation_of_slab` has.
 
-A step needs the slope alone. As torch has it, operation by operation, it took a sixth of a small cloud's step.
+A step needs the slope alone. As torch has it, operation by operation, it took a sixth of a small cloud's step. Voxels
+stand in one row, in which neighbours along an axis are so far ``apart``.
 """
 
 from __future__ import annotations
@@ -10,12 +11,14 @@ import math
 import numpy as np
 import torch
 
-from tomo_polysplat.compiled import called, njit
+from tomo_polysplat.compiled import njit
+from tomo_polysplat.kernels.numba_lanes import LANES, larger, load, smaller, store, within
 from tomo_polysplat.kernels.step.faint import FAINT
 
 __all__ = ["variation_gradient"]
 
-_NOTHING = np.float32(0)
+# As a corner, none; and what makes a sign of a difference.
+_ENDLESS = np.float32(1e30)
 
 
 def variation_gradient(
@@ -31,57 +34,64 @@ def variation_gradient(
     Of a slab it is that of the whole volume, of so many ``planes``, except within ``faint.HALO`` planes of where the
     slab ends. ``away`` says which voxels are away from edges; None where none is faint.
     """
-    whole, width = (planes, *volume.shape[1:]), FAINT * corners[0] if away is not None else 0.0
-    numbers = np.array([*corners, dense, -1 / width if width else 0.0, 0.5 * width], np.float32)
-    volume = volume.contiguous()
-    near = torch.zeros_like(volume, dtype=torch.bool) if away is None else away.contiguous()
-    gradient, slopes = torch.zeros_like(volume), torch.empty_like(volume)
-    parts = volume.numpy(), near.numpy(), slopes.numpy(), gradient.numpy()
+    whole, shape, plane = (planes, *volume.shape[1:]), volume.shape, math.prod(volume.shape[1:])
+    width = FAINT * corners[0] if away is not None else 0.0
+    numbers = np.array(
+        [
+            *(corners if any(corners) else (_ENDLESS, _ENDLESS)),
+            0.0,
+            -1 / width if width else 0.0,
+            0.5 * width,
+        ],
+        np.float32,
+    )
+    # Least number that is dense.
+    numbers[2] = np.nextafter(np.float32(dense), np.float32(np.inf))
+    size = volume.numel()
+    values, slopes, gradient = (_zeros(length + LANES) for length in (size + plane, plane + size, size))
+    values[:size].reshape(shape)[:] = volume.numpy()
+    near = _zeros(len(values) if width else 0)
+    if away is not None and width:
+        near[:size].reshape(shape)[:] = away.numpy()
+    away = None
+    inside = slopes[plane : plane + size].reshape(shape)
     # In the order in which autograd adds them up.
-    for axis in (2, 1, 0):
+    for axis, apart in ((2, 1), (1, shape[2]), (0, plane)):
         if whole[axis] > 1:
             many = math.prod(whole) // whole[axis] * (whole[axis] - 1)
-            times = np.float32(factor) / np.float32(many)
-            _add_along(*parts, axis, any(corners), width > 0, numbers, times)
-    return gradient
+            _slopes(values, near, apart, numbers, np.float32(factor) / np.float32(many), slopes[plane:])
+            np.moveaxis(inside, axis, 0)[-1] = 0.0
+            _add(slopes, plane, apart, gradient)
+    return torch.from_numpy(gradient[:size].reshape(shape))
+
+
+def _zeros(count: int) -> np.ndarray:
+    return torch.zeros(count).numpy()
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _add_along(volume, near, slopes, gradient, axis, cornered, faint, numbers, times):
-    """Add what the differences along an axis pull each voxel by; each pulls its second one up and its first down."""
-    nz, ny, nx = volume.shape
-    dz, dy, dx = 1 if axis == 0 else 0, 1 if axis == 1 else 0, 1 if axis == 2 else 0
-    for z in range(nz - dz):
-        for y in range(ny - dy):
-            a, b = volume[z, y, : nx - dx], volume[z + dz, y + dy, dx:]
-            one, other = near[z, y, : nx - dx], near[z + dz, y + dy, dx:]
-            _slopes(a, b, one, other, cornered, faint, numbers, slopes[z, y])
-    for z in range(nz):
-        for y in range(ny):
-            for x in range(nx):
-                before = z >= dz and y >= dy and x >= dx
-                behind = z < nz - dz and y < ny - dy and x < nx - dx
-                up = slopes[z - dz, y - dy, x - dx] * times if before else _NOTHING
-                down = slopes[z, y, x] * times if behind else _NOTHING
-                gradient[z, y, x] += up - down
-
-
-@called(error_model="numpy")
-def _slopes(a, b, near_a, near_b, cornered, faint, numbers, out):
-    """The slope of what each difference of two rows counts."""
-    nothing, one = np.float32(0), np.float32(1)
+def _slopes(values, near, apart, numbers, times, slopes):
+    """``times`` the slope of what each difference counts."""
+    none, one = np.float32(0), np.float32(1)
     corner, dense_corner, dense, by_width, half = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
-    for x in range(len(a)):
-        step = b[x] - a[x]
-        height = abs(step)
-        slope = (one if step > nothing else nothing) - (one if step < nothing else nothing)
-        if cornered:
-            if faint:
-                # Huber's function of d is d - width / 2 (1 - missing^2), and its slope 1 - missing.
-                both = one if near_a[x] and near_b[x] else nothing
-                missing = max(height * by_width + one, nothing) * both
-                height = height + (missing * missing - both) * half
-                slope = slope * (one - missing)
-            its = dense_corner if max(a[x], b[x]) > dense else corner
-            slope = slope / (height / its + one)
-        out[x] = slope
+    for k in range(0, len(slopes) - LANES, LANES):
+        a, b = load(values, k), load(values, k + apart)
+        step = b - a
+        height = larger(step, none - step)
+        slope = larger(smaller(step * _ENDLESS, one), -one)
+        if len(near):
+            # Huber's function of d is d - width / 2 (1 - missing^2), and its slope 1 - missing.
+            both = load(near, k) * load(near, k + apart)
+            missing = larger(height * by_width + one, none) * both
+            height = height + (missing * missing - both) * half
+            slope = slope * (one - missing)
+        least = none - larger(a, b)
+        its = corner + within(least, -dense, least, -dense, none * step + (dense_corner - corner))
+        store(slopes, k, slope * its / (height + its) * times)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _add(slopes, first, apart, gradient):
+    """Each difference pulls its second voxel up and its first down."""
+    for k in range(0, len(slopes) - first - LANES, LANES):
+        store(gradient, k, load(gradient, k) + (load(slopes, first + k - apart) - load(slopes, first + k)))

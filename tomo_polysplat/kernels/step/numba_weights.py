@@ -6,6 +6,7 @@ The last lanes begin earlier, so that they end with the Gaussians.
 from __future__ import annotations
 
 import numpy as np
+import torch
 
 from tomo_polysplat.compiled import njit
 from tomo_polysplat.kernels.numba_lanes import LANES, load, padded, store
@@ -19,8 +20,8 @@ Parts = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 def weights(parts: Parts) -> tuple[np.ndarray, np.ndarray]:
     """``Gaussians.weights`` (3, n), and the material numbers (n,), both with room for lanes."""
     attenuation, own, shared, group, curve = parts
-    attenuation, numbers = padded(attenuation), padded(own).copy()
-    made = np.empty((3, len(attenuation)), np.float32)
+    attenuation, numbers = padded(attenuation), torch.from_numpy(padded(own)).clone().numpy()
+    made = torch.empty((3, len(attenuation))).numpy()
     _fill(attenuation, numbers, shared, group, curve, made)
     return made, numbers
 
@@ -31,7 +32,7 @@ def pull_weights(
     """Gradients by attenuation, own and shared numbers, from those by the weights (3, n) that `weights` made."""
     attenuation, _, shared, group, curve = parts
     count, attenuation = len(attenuation), padded(attenuation)
-    by_attenuation, by_number = np.empty_like(attenuation), np.empty_like(attenuation)
+    by_attenuation, by_number = (torch.empty(len(attenuation)).numpy() for _ in range(2))
     by_shared = np.zeros(len(shared))
     _pull(attenuation, numbers, group, curve, padded(gradient), by_attenuation, by_number, by_shared)
     return by_attenuation[:count], by_number[:count], by_shared.astype(np.float32)
