@@ -82,7 +82,7 @@ class Rays:
         weight is the inverse deviation, 1 for a ray without noise.
         """
         values, aside = _chosen(self.projections, chosen).to(self.target), self.aside(chosen)
-        if values.device.type == "cpu":
+        if values.device.type == "cpu" and values.dtype == torch.float32:
             from tomo_polysplat.kernels.step.numba_misfit import weigh
 
             return self.views.select(chosen), *weigh(values, aside, self.noise, self.dimmed)

@@ -26,6 +26,7 @@ __all__ = [
     "HALF",
     "LANES",
     "FOLDED",
+    "TASK",
     "add_blocks",
     "ceiling",
     "fetch",
@@ -43,12 +44,14 @@ __all__ = [
     "ramp",
     "store",
     "store_folded",
+    "tasks_of_lanes",
     "within",
 ]
 
 # Without AVX-512 sixteen lanes are two vectors of eight, and the sums of a footprint more than there are registers.
 LANES = 16 if get_host_cpu_features().get("avx512f") else 8
 HALF = LANES // 2
+TASK = 1 << 15  # numbers that are worth a thread
 FOLDED = 4  # numbers that a sum over pixels is stored as
 
 _FLOAT, _INT = ir.FloatType(), ir.IntType(32)
@@ -119,6 +122,11 @@ _operator(operator.add, "fadd")
 _operator(operator.sub, "fsub")
 _operator(operator.mul, "fmul")
 _operator(operator.truediv, "fdiv")
+
+
+def tasks_of_lanes(count: int) -> list[tuple[int, int]]:
+    """Runs of ``TASK`` numbers and a rest, the same for any number of threads."""
+    return [(start, min(start + TASK, count)) for start in range(0, count, TASK)]
 
 
 def padded(array: np.ndarray) -> np.ndarray:

@@ -15,7 +15,9 @@ from tomo_polysplat.kernels.numba_lanes import (
     padded,
     power_of_two,
     store,
+    tasks_of_lanes,
 )
+from tomo_polysplat.parallel import run_tasks
 
 __all__ = ["beer_lambert"]
 
@@ -43,17 +45,18 @@ def beer_lambert(
     paths, curves = padded(areal.numpy()), attenuation.numpy()
     weights = log_weights.numpy() if log_weights.shape[1] == 1 else padded(log_weights.numpy())
     value, by_areal = torch.empty(paths.shape[1]), torch.empty(paths.shape if slopes else (0, 0))
-    _project(paths, weights, curves, value.numpy(), by_areal.numpy())
+    parts = (paths, weights, curves, value.numpy(), by_areal.numpy())
+    run_tasks(lambda a, b: _project(a, b, *parts), tasks_of_lanes(len(value)))
     return value[:rays], by_areal[:, :rays]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _project(areal, log_weights, attenuation, value, slopes):
+def _project(first, last, areal, log_weights, attenuation, value, slopes):
     """The last block overlaps the one before it."""
     none = np.float32(0)
     zero = halves(none, none)
     rays, three, of_rays = len(value), len(areal) > 1, log_weights.shape[1] > 1
-    for start in range(0, rays + LANES - 1, LANES):
+    for start in range(first, last, LANES):
         at = min(start, rays - LANES)
         a = load(areal, at)
         b, c = (load(areal, rays + at), load(areal, 2 * rays + at)) if three else (a, a)

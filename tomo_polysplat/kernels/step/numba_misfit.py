@@ -13,6 +13,7 @@ from tomo_polysplat.compiled import njit
 from tomo_polysplat.kernels.numba_lanes import (
     HALF,
     LANES,
+    TASK,
     halves,
     inverse_root,
     larger,
@@ -22,16 +23,18 @@ from tomo_polysplat.kernels.numba_lanes import (
     ramp,
     smaller,
     store,
+    tasks_of_lanes,
     within,
 )
 from tomo_polysplat.parallel import run_tasks
 
 __all__ = ["misfit_sums", "weigh"]
 
-# Rays of a task, as many for any number of threads, so that sums are the same; and those that float32 adds up.
-_TASK, _ADDED = 1 << 15, 64 * LANES
-# Of a logarithm to base 2; the exponential of more than this is too large for float32, and so counts as endless.
-_BY_LOG_2, _OPAQUE = np.float32(1.4426950408889634), np.float32(87)
+# Rays that float32 adds up.
+_ADDED = 64 * LANES
+# Of a logarithm to base 2; the exponential of more than this is too large for float32, and so counts as endless; the
+# exponent of the smallest power of two.
+_BY_LOG_2, _OPAQUE, _LEAST = np.float32(1.4426950408889634), np.float32(87), np.float32(-126)
 _LARGEST, _SMALLEST = np.float32(3e38), np.float32(1e-30)
 
 
@@ -51,7 +54,7 @@ def weigh(
     inputs = [_flat(part) for part in (measured, depths, aside.to(measured.dtype))]
     made = [torch.empty(len(inputs[0])).numpy() for _ in range(3)]
     parts = (*inputs, *made, np.float32(noise))
-    run_tasks(lambda a, b: _weigh(a, b, *parts), _tasks(inputs[0]))
+    run_tasks(lambda a, b: _weigh(a, b, *parts), tasks_of_lanes(len(inputs[0])))
     values, fitted, held_out = (_shaped(part, measured) for part in made)
     return values, fitted, held_out
 
@@ -64,10 +67,6 @@ def _shaped(flat: np.ndarray, like: torch.Tensor) -> torch.Tensor:
     return torch.from_numpy(flat[: like.numel()]).reshape(like.shape)
 
 
-def _tasks(flat: np.ndarray) -> list[tuple[int, int]]:
-    return [(start, min(start + _TASK, len(flat))) for start in range(0, len(flat), _TASK)]
-
-
 @njit(nogil=True, cache=True, error_model="numpy")
 def _weigh(start, stop, measured, depths, aside, values, fitted, held_out, noise):
     none, one = np.float32(0), np.float32(1)
@@ -77,7 +76,7 @@ def _weigh(start, stop, measured, depths, aside, values, fitted, held_out, noise
         value, depth = load(measured, at), load(depths, at)
         # 1 where a number is finite.
         usable = within(value, _LARGEST, zero - value, _LARGEST, zero + one)
-        light = within(depth, _OPAQUE, depth, _OPAQUE, power_of_two(depth * _BY_LOG_2))
+        light = within(depth, _OPAQUE, depth, _OPAQUE, power_of_two(larger(depth * _BY_LOG_2, _LEAST)))
         weight = inverse_root(one + smaller(noise * light, _LARGEST))
         weight = usable if noise == none else within(depth, _OPAQUE, zero - usable, -one, weight)
         store(values, at, within(value, _LARGEST, zero - value, _LARGEST, value))
@@ -103,7 +102,7 @@ def misfit_sums(
     (4,) float64 array, tensor of the rays' shape
     """
     inputs = [_flat(part) for part in rays]
-    slopes, tasks = torch.empty(len(inputs[0])).numpy(), _tasks(inputs[0])
+    slopes, tasks = torch.empty(len(inputs[0])).numpy(), tasks_of_lanes(len(inputs[0]))
     sums = np.zeros((len(tasks), 4))
     parts = (*inputs, slopes, np.float32(max(width, _SMALLEST)), sums)
     run_tasks(lambda a, b: _add_up(a, b, *parts), tasks)
@@ -143,4 +142,4 @@ def _add_up(start, stop, predicted, measured, fitted, held_out, slopes, width, s
         store(lanes, 2 * LANES, loss_aside)
         store(lanes, 3 * LANES, weights_aside)
         for k in range(4 * LANES):
-            sums[start // _TASK, k // LANES] += lanes[k]
+            sums[start // TASK, k // LANES] += lanes[k]
