@@ -57,7 +57,7 @@ class _NumbaProject(torch.autograd.Function):
         image, skipped, state = numba_kernel.forward(position, scale, rotation, weight, views, cutoff)
         ctx.arrays, ctx.views, ctx.cutoff, ctx.state, ctx.factor = arrays, views, cutoff, state, factor
         if factor is not None:
-            image = np.multiply(image, factor, out=torch.empty(image.shape).numpy())
+            image = np.multiply(image, factor, out=torch.empty(image.shape, dtype=torch.float32).numpy())
         return torch.from_numpy(image), skipped
 
     @staticmethod

@@ -20,7 +20,7 @@ __all__ = ["away_from_edges"]
 def away_from_edges(volume: torch.Tensor, corner: float, dense: float) -> torch.Tensor:
     """``fit.loss.away_from_edges`` of a volume (nz, ny, nx) of float32, so shaped."""
     shape = volume.shape
-    most, least = (_continued(volume.detach().numpy()) for _ in range(2))
+    most, least = (_continued(volume.detach()) for _ in range(2))
     apart = 1
     for width in most.shape[::-1]:
         _extremes(most, least, apart)
@@ -31,13 +31,13 @@ def away_from_edges(volume: torch.Tensor, corner: float, dense: float) -> torch.
     return torch.from_numpy(near)
 
 
-def _continued(volume: np.ndarray) -> np.ndarray:
+def _continued(volume: torch.Tensor) -> np.ndarray:
     """The volume, continued by its faces: another voxel that is as the last one changes no extreme."""
     inside = tuple(slice(BESIDE, BESIDE + length) for length in volume.shape)
     lengths = [length + 2 * BESIDE for length in volume.shape]
     # The last lanes reach beyond the end.
-    wider = torch.empty(math.prod(lengths) + LANES)[:-LANES].view(lengths).numpy()
-    wider[inside] = volume
+    wider = volume.new_empty(math.prod(lengths) + LANES)[:-LANES].view(lengths).numpy()
+    wider[inside] = volume.numpy()
     for axis, length in enumerate(volume.shape):
         along = np.moveaxis(wider, axis, 0)
         along[:BESIDE], along[BESIDE + length :] = along[BESIDE], along[BESIDE + length - 1]

@@ -44,7 +44,7 @@ def beer_lambert(
     rays = areal.shape[1]
     paths, curves = padded(areal.numpy()), attenuation.numpy()
     weights = log_weights.numpy() if log_weights.shape[1] == 1 else padded(log_weights.numpy())
-    value, by_areal = torch.empty(paths.shape[1]), torch.empty(paths.shape if slopes else (0, 0))
+    value, by_areal = areal.new_empty(paths.shape[1]), areal.new_empty(paths.shape if slopes else (0, 0))
     parts = (paths, weights, curves, value.numpy(), by_areal.numpy())
     run_tasks(lambda a, b: _project(a, b, *parts), tasks_of_lanes(len(value)))
     return value[:rays], by_areal[:, :rays]

@@ -25,7 +25,10 @@ def blur(images: np.ndarray, variance: float, other: np.ndarray | None = None) -
         # A border that goes on changes nothing.
         images = np.pad(images, ((0, 0), (0, 0), (0, LANES - columns)), mode="edge")
     images, others = np.ascontiguousarray(images), padded(images[:0] if other is None else other)
-    spread, line = torch.empty(images.shape).numpy(), np.empty(2 * (images.shape[2] + 2), np.float32)
+    spread, line = (
+        torch.empty(images.shape, dtype=torch.float32).numpy(),
+        np.empty(2 * (images.shape[2] + 2), np.float32),
+    )
     slope = _blur(images, np.float32(variance), others, line, spread)
     return spread[..., :columns], slope
 

@@ -52,7 +52,7 @@ def weigh(
     """
     depths = measured if dimmed is None else measured + dimmed
     inputs = [_flat(part) for part in (measured, depths, aside.to(measured.dtype))]
-    made = [torch.empty(len(inputs[0])).numpy() for _ in range(3)]
+    made = [measured.new_empty(len(inputs[0])).numpy() for _ in range(3)]
     parts = (*inputs, *made, np.float32(noise))
     run_tasks(lambda a, b: _weigh(a, b, *parts), tasks_of_lanes(len(inputs[0])))
     values, fitted, held_out = (_shaped(part, measured) for part in made)
@@ -102,7 +102,7 @@ def misfit_sums(
     (4,) float64 array, tensor of the rays' shape
     """
     inputs = [_flat(part) for part in rays]
-    slopes, tasks = torch.empty(len(inputs[0])).numpy(), tasks_of_lanes(len(inputs[0]))
+    slopes, tasks = rays[0].new_empty(len(inputs[0])).numpy(), tasks_of_lanes(len(inputs[0]))
     sums = np.zeros((len(tasks), 4))
     parts = (*inputs, slopes, np.float32(max(width, _SMALLEST)), sums)
     run_tasks(lambda a, b: _add_up(a, b, *parts), tasks)

@@ -48,9 +48,11 @@ def variation_gradient(
     # Least number that is dense.
     numbers[2] = np.nextafter(np.float32(dense), np.float32(np.inf))
     size = volume.numel()
-    values, slopes, gradient = (_zeros(length + LANES) for length in (size + plane, plane + size, size))
+    values, slopes, gradient = (
+        volume.new_zeros(length + LANES).numpy() for length in (size + plane, plane + size, size)
+    )
     values[:size].reshape(shape)[:] = volume.numpy()
-    near = _zeros(len(values) if width else 0)
+    near = volume.new_zeros(len(values) if width else 0).numpy()
     if away is not None and width:
         near[:size].reshape(shape)[:] = away.numpy()
     away = None
@@ -63,10 +65,6 @@ def variation_gradient(
             np.moveaxis(inside, axis, 0)[-1] = 0.0
             _add(slopes, plane, apart, gradient)
     return torch.from_numpy(gradient[:size].reshape(shape))
-
-
-def _zeros(count: int) -> np.ndarray:
-    return torch.zeros(count).numpy()
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

@@ -21,7 +21,7 @@ def weights(parts: Parts) -> tuple[np.ndarray, np.ndarray]:
     """``Gaussians.weights`` (3, n), and the material numbers (n,), both with room for lanes."""
     attenuation, own, shared, group, curve = parts
     attenuation, numbers = padded(attenuation), torch.from_numpy(padded(own)).clone().numpy()
-    made = torch.empty((3, len(attenuation))).numpy()
+    made = torch.empty((3, len(attenuation)), dtype=torch.float32).numpy()
     _fill(attenuation, numbers, shared, group, curve, made)
     return made, numbers
 
@@ -32,7 +32,7 @@ def pull_weights(
     """Gradients by attenuation, own and shared numbers, from those by the weights (3, n) that `weights` made."""
     attenuation, _, shared, group, curve = parts
     count, attenuation = len(attenuation), padded(attenuation)
-    by_attenuation, by_number = (torch.empty(len(attenuation)).numpy() for _ in range(2))
+    by_attenuation, by_number = torch.empty((2, len(attenuation)), dtype=torch.float32).numpy()
     by_shared = np.zeros(len(shared))
     _pull(attenuation, numbers, group, curve, padded(gradient), by_attenuation, by_number, by_shared)
     return by_attenuation[:count], by_number[:count], by_shared.astype(np.float32)
