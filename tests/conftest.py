@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import atexit
 import gc
+import math
 import os
 import signal
 from typing import TYPE_CHECKING
+from unittest import mock
 
 import pytest
 
@@ -64,7 +66,8 @@ def pytest_collection_finish(session):
 
 
 def pytest_unconfigure(config):
-    gc.unfreeze()
+    if not hasattr(config, "workerinput"):  # a worker ends at once, see above
+        gc.unfreeze()
 
 
 def pytest_runtest_setup(item):
@@ -77,6 +80,21 @@ def pytest_runtest_setup(item):
     if os.environ.get("POLYSPLAT_REQUIRE_GPU") == "1":
         pytest.fail("POLYSPLAT_REQUIRE_GPU=1, but torch finds no CUDA device", pytrace=False)
     pytest.skip("needs a CUDA device")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def spectra_are_not_doubted(request):
+    """No run makes a second start, of one energy, to compare its spectrum with, but where a module asks for that.
+
+    A spectrum that is not doubted changes nothing in a run, which tests of other things need not show again.
+    """
+    if getattr(request.module, "SPECTRA_ARE_DOUBTED", False):
+        yield
+        return
+    from tomo_polysplat.plan import one_energy
+
+    with mock.patch.object(one_energy, "_by_seeds", lambda *_: math.inf):
+        yield
 
 
 @pytest.hookimpl(wrapper=True)

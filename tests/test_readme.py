@@ -10,6 +10,8 @@ import pytest
 from tomo_polysplat.cli import main
 from tomo_polysplat.settings import PRESETS
 
+SPECTRA_ARE_DOUBTED = True  # see tests/conftest.py
+
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 BLOCK = re.compile(r"^```(\w*) ?(\w*)\n(.*?)^```", re.S | re.M)

@@ -16,6 +16,8 @@ from tomo_polysplat.simulate.scanner import Scanner
 from tomo_polysplat.simulate.scenes import scan_phantom, scene_phantom
 from tomo_polysplat.start.fdk import fdk
 
+SPECTRA_ARE_DOUBTED = True  # see tests/conftest.py
+
 ALL_BUT_ROUNDING = 1e-5
 FAST = {"quality": "fast", "settings": {"views_per_step": 4}}
 

@@ -42,6 +42,8 @@ from tomo_polysplat.start.orbit import find_orbit
 sys.path.append(str(Path(__file__).parent / "kernels"))
 from step_scenes import fit_problem
 
+SPECTRA_ARE_DOUBTED = True  # see tests/conftest.py
+
 CPU = torch.device("cpu")
 TWO = ["cpu", "cpu"]
 # Signals that torchrun hands on to its processes.

@@ -35,6 +35,8 @@ LARGEST_COMPRESSION = 1100
 _LONGEST_NAME, _LONGEST_SUFFIX = 255, 12
 # An array as it is read, in the order and type that are wanted, and at work.
 _COPIES = 3
+# Bytes that a process has to have anyway: the system is not asked about every small picture of a folder.
+_SURELY = 1 << 20
 
 
 @contextmanager
@@ -205,8 +207,9 @@ def require_plausible_size(name: str, declared_bytes: int, stored_bytes: int) ->
             f"{declared_bytes} bytes declared but {stored_bytes} stored",
             "the file is truncated or damaged: copy or write it again",
         )
-    memory = available_memory()
-    if memory is not None and _COPIES * declared_bytes > memory:
+    needed = _COPIES * declared_bytes
+    memory = available_memory() if needed > _SURELY else None
+    if memory is not None and needed > memory:
         raise fail(
             name,
             f"at most a third of the {memory / 2**30:.1f} GiB of free memory, which its copies need",

@@ -16,6 +16,8 @@ from tomo_polysplat.checks import fail
 from tomo_polysplat.cli import main
 from tomo_polysplat.settings import PRESETS
 
+SPECTRA_ARE_DOUBTED = True  # see tests/conftest.py
+
 # One or two of every kind, the quick ones.
 SHORT = (
     *("starved-20", "nan", "saturated", "all-dead", "two-views", "truncated", "source-near", "source-inside"),

@@ -22,6 +22,8 @@ from tomo_polysplat.report.decided import doubts
 from tomo_polysplat.scan.noise import RayNoise
 from tomo_polysplat.settings import Settings
 
+SPECTRA_ARE_DOUBTED = True  # see tests/conftest.py
+
 CPU = torch.device("cpu")
 # No short fits and no timed steps, which would take their share of a budget.
 UNASKED = {
