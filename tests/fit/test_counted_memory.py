@@ -16,6 +16,8 @@ from tomo_polysplat.fit.step import EagerStep
 from tomo_polysplat.model import seed_samples
 from tomo_polysplat.plan import first_gaussians
 
+SPECTRA_ARE_DOUBTED = True  # the second seeds are those of one energy; see tests/conftest.py
+
 WINDOW = 4 * 32 * 32
 CPU = torch.device("cpu")
 

@@ -17,7 +17,7 @@ def reconstruct(scan):
 @pytest.mark.parametrize("scene", SCENES)
 def test_metal_spoils_the_slices_it_lies_in(scene):
     """Error outside metal, in the slices with metal, against the same voxels of the metal-free control."""
-    scan, control = (simulate_scan(scene, 32, 64, metal=metal) for metal in (True, False))
+    scan, control = (simulate_scan(scene, 24, 48, metal=metal) for metal in (True, False))
     slices = scan.metal_mask.any(axis=(1, 2))
     rest = ~scan.metal_mask[slices]
     with_metal, without = (
