@@ -1,5 +1,8 @@
 """A Nikon's folder: the axis, the measured angles, and what is left open."""
 
+import shutil
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -8,10 +11,17 @@ from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.simulate.folders.write import write_folder
 
 
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory):
+    path = tmp_path_factory.mktemp("nikon") / "sample"
+    write_folder("nikon", path)
+    return path
+
+
 @pytest.fixture
-def folder(tmp_path):
-    write_folder("nikon", tmp_path / "sample")
-    return tmp_path / "sample"
+def folder(sound, tmp_path):
+    """A copy to change."""
+    return Path(shutil.copytree(sound, tmp_path / "sample"))
 
 
 def change(folder, *pairs):

@@ -1,6 +1,8 @@
 """Every kind of scanner's folder gives the volume of the package's own file."""
 
 import sys
+from functools import cache
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -9,9 +11,17 @@ from folders import error_db, marked, require_the_same_volume
 
 import tomo_polysplat as tps
 from tomo_polysplat.cli import main
+from tomo_polysplat.simulate.folders import write
 from tomo_polysplat.simulate.folders.__main__ import main as write_one
 from tomo_polysplat.simulate.folders.scene import MARKER
 from tomo_polysplat.simulate.folders.write import KINDS, scan_for, write_folder
+
+
+@pytest.fixture(scope="module", autouse=True)
+def simulated_once():
+    """Most kinds hold the same scan, which nobody changes."""
+    with mock.patch.object(write, "marked_scan", cache(write.marked_scan)):
+        yield
 
 
 @pytest.fixture(scope="module", params=KINDS)
