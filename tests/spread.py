@@ -10,9 +10,8 @@ SPLIT = ("tests/test_notebooks.py",)
 # Files that take longest, the longest first; the order of the others does not matter. All but the second of the first
 # five run no kernels of numba's: meanwhile the other worker compiles them, once for both.
 LONGEST = (
-    "tests/kernels/test_triton_steps.py",
-    "tests/bench/test_bench_hard.py",
     "tests/kernels/test_triton.py",
+    "tests/bench/test_bench_hard.py",
     "tests/scan/test_hdf5_stored.py",
     "tests/test_package.py",
     "tests/test_several_devices.py",

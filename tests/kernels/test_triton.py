@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from triton_cases import CASES, IMAGES
+from triton_cases import CASES
 from triton_interpreter import interpret
 
 from tomo_polysplat.kernels.spatial_order import spatial_order
@@ -12,10 +12,10 @@ from tomo_polysplat.kernels.views import DetectorViews
 
 @pytest.fixture(scope="module")
 def interpreted() -> dict[str, str]:
-    return interpret(IMAGES)
+    return interpret(CASES)
 
 
-@pytest.mark.parametrize("name", IMAGES)
+@pytest.mark.parametrize("name", CASES)
 def test_in_the_interpreter(name, interpreted):
     assert name not in interpreted, interpreted[name]
 

@@ -190,12 +190,12 @@ def skip_unread_sums() -> None:
         interpreter.interpreter_builder.options = replace(options, sanitize_overflow=False)
 
 
-def share_windows_less() -> None:
-    """Let two programs share out a window instead of 16, most of which find nothing in so small a one."""
+def share_windows(parts: int) -> None:
+    """Let so many programs at most share out a window."""
     from tomo_polysplat.kernels.project import triton_forward as images
     from tomo_polysplat.kernels.voxelise import triton_forward as volumes
 
-    images._MOST_PARTS = volumes._MOST_PARTS = 2
+    images._MOST_PARTS = volumes._MOST_PARTS = parts
 
 
 def main() -> None:
@@ -210,9 +210,9 @@ def main() -> None:
     skip_unread_sums()
     np.seterr(all="ignore")  # the interpreter computes masked lanes too
     problems = {}
-    for k, name in enumerate(sys.argv[1:]):
-        if k == 1:  # the first case shares them out as on a GPU
-            share_windows_less()
+    for name in sys.argv[1:]:
+        # The first steps and the first images as on a GPU; else most of the 16 find nothing in so small a window.
+        share_windows(16 if name in (STEPS[0], IMAGES[0]) else 2)
         try:
             CASES[name]("cpu")
         except Exception:  # of any kind: its traceback goes to the test of that case, which fails with it
