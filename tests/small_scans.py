@@ -13,8 +13,9 @@ from tomo_polysplat.physics.beer_lambert import projection
 from tomo_polysplat.physics.materials import density, mass_attenuation
 from tomo_polysplat.scan.geometry import Geometry, from_astra, to_astra
 
-# Two passes over the views in a few steps: enough to see every part at work.
-QUICK = {"passes": 2.0, "views_per_step": 8}
+# Two passes over the views in a few steps: enough to see every part at work. What pixels and source did to the light is
+# asked in files of its own, as scatter is.
+QUICK = {"passes": 2.0, "views_per_step": 8, "gains": False, "drift": False}
 
 
 @cache
@@ -30,7 +31,14 @@ def cone(size=18, views=40, metal=False):
 
 def reconstruct(scan, projections=None, proj_geom=None, vol_geom=None, **options):
     """A quick polychromatic reconstruction; what is not given is the scan's, which stood where it says."""
-    options = {"spectrum": scan.spectrum, "unit": scan.unit, "settings": QUICK, "align": False} | options
+    usual = {
+        "spectrum": scan.spectrum,
+        "unit": scan.unit,
+        "settings": QUICK,
+        "align": False,
+        "calibrate": False,
+    }
+    options = usual | options
     return tps.reconstruct(
         scan.projections if projections is None else projections,
         proj_geom or scan.proj_geom,
