@@ -17,6 +17,15 @@ from tomo_polysplat.scan.geometry import Geometry, from_astra, to_astra
 # asked in files of its own, as scatter is.
 QUICK = {"passes": 2.0, "views_per_step": 8, "gains": False, "drift": False}
 
+# A run that only something else ends, and that asks nothing by short fits.
+ENDLESS = QUICK | {
+    "passes": 10_000.0,
+    "patience": 10_000,
+    "tv_factor": 1.0,
+    "edges": "blurred",
+    "pixel_rays": 1,
+}
+
 
 @cache
 def fan(metal=True):

@@ -7,14 +7,12 @@ import time
 
 import numpy as np
 import pytest
-from small_scans import QUICK, fan, reconstruct
+from small_scans import ENDLESS, fan, reconstruct
 
 import tomo_polysplat as tps
 from tomo_polysplat.cli.main import main
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.interrupts import postponed_interrupts
-
-MANY = QUICK | {"passes": 10_000.0, "patience": 10_000}
 
 
 def ctrl_c():
@@ -57,7 +55,7 @@ def test_at_any_moment_of_the_fit_it_returns_what_there_is(delay):
     thread = threading.Thread(target=press)
     thread.start()
     result = reconstruct(
-        fan(), settings=MANY, progress=lambda share, words: began.set() if share > 0 else None
+        fan(), settings=ENDLESS, progress=lambda share, words: began.set() if share > 0 else None
     )
     thread.join()
     assert result.plan["stop"].value == "interrupted" and result.history
@@ -112,7 +110,7 @@ def test_tomopy_on_one_core_gets_the_best_slices():
     theta = np.linspace(0, np.pi, 40, endpoint=False, dtype=np.float32)
     results = []
     options = {
-        "settings": MANY,
+        "settings": ENDLESS,
         "callbacks": [lambda state: ctrl_c()],
         "on_result": results.append,
     }

@@ -12,7 +12,7 @@ SPECTRUM = tps.Spectrum.from_tube(90, filters={"Al": 0.1})
 
 
 # What the rays decide on the way.
-HELD = {"tv_factor": 1.0, "soft_gain": 0.0}
+HELD = {"tv_factor": 1.0, "soft_gain": 0.0, "gains": False, "drift": False}
 
 
 def of_disc(core, seed=0, **settings):
@@ -21,6 +21,7 @@ def of_disc(core, seed=0, **settings):
     # Where the scanner stood is asked in other files.
     settings = {"passes": 10.0, "views_per_step": 8} | HELD | settings
     options = {"spectrum": SPECTRUM, "unit": "cm", "align": False, "settings": settings, "seed": seed}
+    options["calibrate"] = False
     return tps.reconstruct(projections, proj_geom, vol_geom, **options)
 
 

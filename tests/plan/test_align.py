@@ -18,7 +18,7 @@ from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.scan.layout import vector_form
 from tomo_polysplat.settings import make_settings
 
-QUICK = {"passes": 5.0, "views_per_step": 8, "pixel_rays": 1}
+QUICK = {"passes": 5.0, "views_per_step": 8, "pixel_rays": 1, "gains": False, "drift": False}
 
 
 @cache
@@ -37,7 +37,9 @@ def off(scan, columns):
 
 
 def reconstruct(scan, geometry, **options):
-    options = {"unit": scan.unit, "spectrum": scan.spectrum, "settings": QUICK, "progress": False} | options
+    usual = {"unit": scan.unit, "spectrum": scan.spectrum, "settings": QUICK, "progress": False}
+    # What the scanner did to the light is asked in other files.
+    options = usual | {"calibrate": False} | options
     return tps.reconstruct(scan.projections, geometry, scan.vol_geom, **options)
 
 

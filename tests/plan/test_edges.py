@@ -70,7 +70,7 @@ def test_sharp_edges_come_out_sharper():
     proj_geom, vol_geom = to_astra(geometry, grid)
     rays = np.ascontiguousarray(projections.swapaxes(0, 1))
 
-    settings = {"passes": 6, "views_per_step": 22, "growth": 1.0}
+    settings = {"passes": 6, "views_per_step": 22, "growth": 1.0, "gains": False, "drift": False}
 
     def result(edges):
         # Where the scanner stood is asked in other files.

@@ -31,6 +31,8 @@ QUICK = {
     "tv_factor": 1.0,
     "pixel_rays": 1,
     "soft_gain": 0.0,
+    "gains": False,
+    "drift": False,
 }
 VIEWS = 41
 # For what is told whatever the volume comes to.
@@ -59,9 +61,9 @@ def answer_with(monkeypatch, gain):
 
 
 def reconstruct(scan, settings=None, **options):
-    # Where the scanner stood is asked in other files.
+    # Where the scanner stood, and what it did to the light, is asked in other files.
     usual = {"unit": scan.unit, "spectrum": scan.spectrum, "progress": False, "align": False}
-    options = usual | options
+    options = usual | {"calibrate": False} | options
     settings = QUICK | (settings or {})
     return tps.reconstruct(scan.projections, scan.proj_geom, scan.vol_geom, settings=settings, **options)
 

@@ -19,7 +19,14 @@ from tomo_polysplat.plan.decisions.pixel_rays import PixelRays
 from tomo_polysplat.plan.lab import Lab
 from tomo_polysplat.plan.order import ask_between
 
-QUICK = {"passes": 10.0, "views_per_step": 4, "edges": "blurred", "tv_factor": 1.0}
+QUICK = {
+    "passes": 10.0,
+    "views_per_step": 4,
+    "edges": "blurred",
+    "tv_factor": 1.0,
+    "gains": False,
+    "drift": False,
+}
 
 
 @cache
@@ -48,9 +55,9 @@ ROUGH = {"views_per_step": 6}
 
 
 def reconstruct(scan, settings=None, **options):
-    # Where the scanner stood is asked in other files.
+    # Where the scanner stood, and what it did to the light, is asked in other files.
     usual = {"unit": scan.unit, "spectrum": scan.spectrum, "progress": False, "align": False}
-    options = usual | options
+    options = usual | {"calibrate": False} | options
     settings = QUICK | (settings or {})
     return tps.reconstruct(scan.projections, scan.proj_geom, scan.vol_geom, settings=settings, **options)
 

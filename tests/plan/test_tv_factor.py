@@ -59,8 +59,9 @@ def slice_of(discs, noise, denser=1.0, views=VIEWS, size=SIZE):
 
 
 def fitted(scan, **settings):
-    settings = {"passes": 10, "views_per_step": 10, "held_out": 0.03} | settings
-    # Where the scanner stood is asked in other files.
+    usual = {"passes": 10, "views_per_step": 10, "held_out": 0.03, "gains": False, "drift": False}
+    settings = usual | settings
+    # Where the scanner stood, and what it did to the light, is asked in other files.
     return reconstruct(*scan[:3], unit="cm", settings=settings, progress=False, align=False)
 
 

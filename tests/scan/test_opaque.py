@@ -10,6 +10,8 @@ from tomo_polysplat.scan.opaque import _surrounded, fill_opaque
 from tomo_polysplat.scan.usable import usable_rays
 
 PHOTONS = 1e4
+# What pixels and source did to the light is asked in other files.
+SETTINGS = {"passes": 10, "views_per_step": 10, "tv_factor": 1.0, "gains": False, "drift": False}
 
 
 def views():
@@ -92,7 +94,7 @@ def test_opaque_metal_keeps_more_of_its_mass(beside):
     projections, geometry, volume, truth = rod(beside)
     lightless = np.isinf(projections)
     assert lightless.mean() > 0.05
-    about = {"progress": False, "align": False, "settings": {"passes": 10, "views_per_step": 10}}
+    about = {"progress": False, "align": False, "settings": SETTINGS}
     told = tps.reconstruct(projections, geometry, volume, **about)
     left = tps.reconstruct(projections, geometry, volume, valid=~lightless, **about)
     # Beside a sharp rim the next ray may be bright.
