@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 import torch
-from small_scans import QUICK
+from small_scans import ASKED, QUICK
 from small_scans import reconstruct as reconstruct_anywhere
 
 from tomo_polysplat.fit.filter_sums import filter_sums
@@ -18,13 +18,13 @@ SAME, NEARLY_ALL, OF_ALL = 3e-5, 0.95, 1e-4
 # Smoothing takes the sign of a slope from it where neighbouring voxels are as good as equal. One process whose volumes
 # are rounded otherwise differs by up to 4e-4 in L2, and one that does not smooth by 8e-2.
 SMOOTHED = 1e-3
-ROUGH = QUICK | {"tv_weight": 0.0}
+ROUGH = QUICK | ASKED | {"tv_weight": 0.0}
 
 
 def reconstruct(*args, **options):
     """On the CPU, as the other processes, where no devices are named: a machine with a GPU would take that."""
     where = {} if "devices" in options else {"device": "cpu"}
-    return reconstruct_anywhere(*args, **(where | options))
+    return reconstruct_anywhere(*args, **(where | {"calibrate": None} | options))
 
 
 def relative(volume, reference):

@@ -16,6 +16,8 @@ from tomo_polysplat.scan.geometry import Geometry, from_astra, to_astra
 # Two passes over the views in a few steps: enough to see every part at work. What pixels and source did to the light is
 # asked in files of its own, as scatter is.
 QUICK = {"passes": 2.0, "views_per_step": 8, "gains": False, "drift": False}
+# That the light is asked about, which is usual.
+ASKED = {"gains": None, "drift": None}
 
 # A run that only something else ends, and that asks nothing by short fits.
 ENDLESS = QUICK | {

@@ -9,12 +9,12 @@ from functools import cache
 import numpy as np
 import pytest
 from killed_runs import Killed
-from small_scans import QUICK, cone, fan, reconstruct
+from small_scans import ASKED, QUICK, cone, fan, reconstruct
 
 from tomo_polysplat.plan.checkpoint import Checkpoint
 
 # Relocation falls between the passes, metals are freed after two of five, and the state changes in all its parts.
-LONG = QUICK | {"passes": 5.0, "relocate_until": 1.0}
+LONG = QUICK | ASKED | {"passes": 5.0, "relocate_until": 1.0}
 
 
 def killed_after(passes, scan, path, **options):

@@ -281,7 +281,9 @@ def test_what_a_process_fails_of_is_told(monkeypatch):
 def test_torchrun_reconstructs_by_the_command_line(tmp_path, monkeypatch, capfd):
     """By what the command `torchrun` calls, in this process, which has torch already."""
     save_scan(fan(metal=False), tmp_path / "scan.npz")
-    about = [arg for name, value in ROUGH.items() for arg in ("--set", f"{name}={value}")]
+    about = [
+        arg for name, value in ROUGH.items() if value is not None for arg in ("--set", f"{name}={value}")
+    ]
     command = ["--nproc-per-node=2", "-m", "tomo_polysplat", "recon", "scan.npz", "-o", "volume.npy"]
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("OMP_NUM_THREADS", "1")

@@ -16,7 +16,7 @@ import numba
 import numpy as np
 import pytest
 import torch
-from small_scans import QUICK, cone, fan, reconstruct
+from small_scans import ASKED, QUICK, cone, fan, reconstruct
 
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.kernels import device
@@ -99,9 +99,11 @@ SCANS = {"few views": lambda: cone(12, 20), "metal": fan, "calibrated": lambda: 
 @pytest.mark.parametrize("name", SCANS)
 def test_the_same_bits_for_any_number_of_threads(name, monkeypatch):
     def bits():
-        longer = {"calibrate": "scatter", "settings": QUICK | {"passes": 4.0, "views_per_step": 10}}
-        calibrated = longer if name == "calibrated" else {}
-        result = reconstruct(SCANS[name](), align="auto", **calibrated)
+        options = {"align": "auto", "calibrate": None, "settings": QUICK | ASKED}
+        if name == "calibrated":
+            longer = {"passes": 4.0, "views_per_step": 10}
+            options |= {"calibrate": "scatter", "settings": QUICK | ASKED | longer}
+        result = reconstruct(SCANS[name](), **options)
         return hashlib.sha256(result.basis.tobytes() + result.gaussians["position"].tobytes()).hexdigest()
 
     before, found = (torch.get_num_threads(), numba.get_num_threads()), {}
