@@ -14,7 +14,9 @@ from tomo_polysplat.quality.refit import fit_again, settings_of
 from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.start.joseph import JosephProjector
 
-SHORT = {"passes": 6.0, "views_per_step": 2, "tv_factor": 1.0, "edges": "blurred", "growth": 1.0}
+# What pixels and source did to the light is asked in other files.
+LIGHT = {"gains": False, "drift": False}
+SHORT = {"passes": 6.0, "views_per_step": 2, "tv_factor": 1.0, "edges": "blurred", "growth": 1.0} | LIGHT
 
 
 @pytest.fixture(scope="module")
