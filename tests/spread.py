@@ -7,6 +7,8 @@ from xdist.scheduler import LoadFileScheduling
 
 # Their tests share nothing, so each may go to another worker.
 SPLIT = ("tests/test_notebooks.py",)
+# Files that go on in the worker of another one, which has compiled most of what they need.
+AFTER = {"tests/simulate/test_chords.py": "tests/bench/test_bench_hard.py"}
 # Files that take longest, the longest first; the order of the others does not matter. All but the second of the first
 # five run no kernels of numba's: meanwhile the other worker compiles them, once for both.
 LONGEST = (
@@ -58,8 +60,9 @@ LONGEST = (
 
 def begin_with_the_longest(items) -> None:
     """Sort collected tests by their file's place in ``LONGEST``; the others keep their order behind them."""
-    place = {name: k for k, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: place.get(item.nodeid.split("::", 1)[0], len(place)))
+    place = {name: float(k) for k, name in enumerate(LONGEST)}
+    place |= {name: place[other] + 0.5 for name, other in AFTER.items()}
+    items.sort(key=lambda item: place.get(item.nodeid.split("::", 1)[0], len(LONGEST)))
 
 
 class LongestFirst(LoadFileScheduling):
@@ -71,4 +74,4 @@ class LongestFirst(LoadFileScheduling):
 
     def _split_scope(self, nodeid):
         scope = super()._split_scope(nodeid)
-        return nodeid if scope in SPLIT else scope
+        return nodeid if scope in SPLIT else AFTER.get(scope, scope)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import os
 import sys
@@ -58,8 +59,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _complain(f"{type(error).__name__}: {error} (run again with --debug to see where)", FAILED)
 
 
+@functools.cache
 def build_parser() -> Parser:
-    """The parser of every subcommand."""
+    """The parser of every subcommand, which a process that calls `main` many times makes once."""
     parser = Parser(
         prog="tomo-polysplat",
         description="CT reconstruction with Gaussians of matter and the physics of a real x-ray spectrum: "
