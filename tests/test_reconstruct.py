@@ -225,7 +225,7 @@ def test_any_scanner_and_any_voxels(name):
     scan = scan_phantom(
         scene_phantom("pins", False), proj_geom, vol_geom, cone().spectrum, Scanner(noise=False)
     )
-    result = reconstruct(scan, settings={"passes": 3.0, "views_per_step": 4})
+    result = reconstruct(scan, settings={"passes": 3.0, "views_per_step": 5})
     _, grid = from_astra(proj_geom, vol_geom)
     z, y, x = np.meshgrid(*grid.axes()[::-1], indexing="ij")
     core = (np.hypot(x, y) < 1.6) & (np.abs(z) < (0.1 if name.startswith("one row") else 0.9))

@@ -50,8 +50,8 @@ def large():
     return pins(3, seed=2)
 
 
-# Of these runs only the course matters: a third of the steps.
-ROUGH = {"views_per_step": 6}
+# Of these runs only the course matters: two fifths of the steps.
+ROUGH = {"views_per_step": 10}
 
 
 def reconstruct(scan, settings=None, **options):

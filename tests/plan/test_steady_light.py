@@ -138,7 +138,7 @@ def test_once_gains_are_found_every_pass_is_asked_about_them(monkeypatch):
 
 
 def test_a_run_of_many_passes_goes_on_as_well(tmp_path):
-    path, many = tmp_path / "run.npz", {"passes": 14.0}
+    path, many = tmp_path / "run.npz", {"passes": 14.0, "views_per_step": 12}
     reconstruct(spoilt(), settings=many, checkpoint=path, callbacks=[lambda state: state.share > 0.52])
     on = reconstruct(spoilt(), settings=many, checkpoint=path, resume=True)
     assert np.array_equal(on.volume, result(**many).volume) and np.array_equal(on.gains, result(**many).gains)
