@@ -108,9 +108,10 @@ def test_opaque_metal_keeps_more_of_its_mass(beside):
     # Dead pixels count nothing either, and must not make matter of air.
     dead = projections.copy()
     dead[:, 2] = np.inf
-    assert (
-        tps.reconstruct(dead, geometry, volume, **about).counts["rays_opaque"] == told.counts["rays_opaque"]
-    )
+    # Counted before the first step.
+    hasty = about | {"settings": SETTINGS | {"passes": 1, "views_per_step": 120}}
+    counts = tps.reconstruct(dead, geometry, volume, **hasty).counts
+    assert counts["rays_opaque"] == told.counts["rays_opaque"]
 
 
 def test_a_shadow_that_moves_is_opaque_however_bright_it_is_beside_it():
