@@ -89,7 +89,10 @@ def test_every_material_is_known():
     "settings", [{}, {"passes": 10.0, "views_per_step": 4}], ids=["960 steps", "120 steps"]
 )
 def test_bone_is_as_dense_as_bone_however_long_it_is_fitted(settings):
-    """A blurred edge looks like matter of a larger number: left to rise, inside it was 8 and 11 % too dense."""
+    """A blurred edge looks like matter of a larger number: left to rise, inside it was 8 and 11 % too dense.
+
+    What the scanner did to the light is asked in other files.
+    """
     beam = materials.MaterialsBench().spectrum
     scan = material_rods.rod_scan("bone", beam, 24, 48)
     result = reconstruct(
@@ -98,7 +101,8 @@ def test_bone_is_as_dense_as_bone_however_long_it_is_fitted(settings):
         scan.vol_geom,
         spectrum=beam,
         unit=scan.unit,
-        settings=settings,
+        settings=settings | {"gains": False, "drift": False},
+        calibrate=False,
         align=False,
         progress=False,
     )
