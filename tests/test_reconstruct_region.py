@@ -15,7 +15,8 @@ from tomo_polysplat.simulate.scanner import Scanner
 from tomo_polysplat.simulate.scenes import scan_phantom
 from tomo_polysplat.simulate.shapes import cylinder, ellipsoid
 
-QUICK = {"passes": 6.0, "views_per_step": 8}
+# What the scanner did to the light is asked in other files.
+QUICK = {"passes": 6.0, "views_per_step": 8, "gains": False, "drift": False}
 HOST = torch.device("cpu")
 
 SPECTRUM = tps.Spectrum.from_tube(90, filters={"Al": 0.1})
