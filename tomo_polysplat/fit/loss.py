@@ -9,6 +9,7 @@ import torch
 
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.fit.shares import Part
+from tomo_polysplat.kernels.device import is_for_compiled
 from tomo_polysplat.kernels.step.faint import BESIDE, EDGE, FAINT
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
@@ -52,7 +53,7 @@ def misfits_of_step(
     settings: Settings,
 ) -> tuple[torch.Tensor, torch.Tensor | float, torch.Tensor | float]:
     """`misfit` of the fitted rays, differentiable; that of those held ``aside``, times their weight, and this."""
-    if predicted.device.type == "cpu" and predicted.dtype == torch.float32:
+    if is_for_compiled(predicted):
         width = settings.huber_corner * settings.model_error if settings.loss == "huber" else 0.0
         return _Misfits.apply(predicted, measured, weight, aside, width)
     fitted = misfit(predicted, measured, weight, settings)
@@ -156,7 +157,7 @@ def slope_of_variation(
     slab: torch.Tensor, planes: int, corners: tuple[float, float], dense: float, factor: float
 ) -> torch.Tensor:
     """``factor`` times the slope of `variation_of_slab`, (nz, ny, nx)."""
-    if slab.device.type != "cpu" or slab.dtype != torch.float32:
+    if not is_for_compiled(slab):
         with torch.enable_grad():
             slab = slab.detach().requires_grad_()
             return torch.autograd.grad(factor * variation_of_slab(slab, planes, corners, dense), slab)[0]
@@ -233,7 +234,7 @@ def away_from_edges(volume: torch.Tensor, corner: float, dense: float) -> torch.
     -------
     (nz, ny, nx) bool tensor
     """
-    if volume.device.type == "cpu" and volume.dtype == torch.float32:
+    if is_for_compiled(volume):
         from tomo_polysplat.kernels.step import numba_away
 
         return numba_away.away_from_edges(volume, corner, dense)

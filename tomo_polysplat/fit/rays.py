@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.evenly_spread import evenly_spread
+from tomo_polysplat.kernels.device import is_for_compiled
 from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.scan.noise import RayNoise, Values
 
@@ -82,7 +83,7 @@ class Rays:
         weight is the inverse deviation, 1 for a ray without noise.
         """
         values, aside = _chosen(self.projections, chosen).to(self.target), self.aside(chosen)
-        if values.device.type == "cpu" and values.dtype == torch.float32:
+        if is_for_compiled(values):
             from tomo_polysplat.kernels.step.numba_misfit import weigh
 
             return self.views.select(chosen), *weigh(values, aside, self.noise, self.dimmed)

@@ -12,7 +12,7 @@ import torch
 
 from tomo_polysplat.checks import fail
 
-__all__ = ["one_torch_thread", "pick_device", "usual_modes"]
+__all__ = ["is_for_compiled", "one_torch_thread", "pick_device", "usual_modes"]
 
 
 def pick_device(name: str | torch.device) -> torch.device:
@@ -40,6 +40,11 @@ def pick_device(name: str | torch.device) -> torch.device:
     if device.type == "cuda" and device.index is None:
         return torch.device("cuda", torch.cuda.current_device())
     return device
+
+
+def is_for_compiled(values: torch.Tensor) -> bool:
+    """Whether the parts of a step that are compiled for the CPU take these; what they do not take is torch's."""
+    return values.device.type == "cpu" and values.dtype == torch.float32
 
 
 class _Borrowed:

@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 
+from tomo_polysplat.kernels.device import is_for_compiled
 from tomo_polysplat.transfer import copied
 
 __all__ = ["OF_ALL", "Gaussians", "shares_of_curves"]
@@ -121,7 +122,7 @@ class Gaussians:
         """
         if curve is None:
             return self.attenuation[None]
-        if curve.device.type == "cpu" and curve.dtype == torch.float32:
+        if is_for_compiled(curve):
             return _Weights.apply(
                 self.attenuation, self.own_material, self.shared_material, self.group, curve
             )

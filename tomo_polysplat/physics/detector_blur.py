@@ -19,6 +19,8 @@ from typing import Any
 
 import torch
 
+from tomo_polysplat.kernels.device import is_for_compiled
+
 __all__ = ["LARGEST_BLUR", "blurred"]
 
 # Three taps make no wider blur without a dip in their middle.
@@ -40,7 +42,7 @@ def blurred(projections: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
     (views, rows, columns) tensor
         Differentiable by both. An axis of one pixel is not blurred.
     """
-    if projections.device.type == "cpu" and projections.dtype == torch.float32:
+    if is_for_compiled(projections):
         return _Blurred.apply(projections, variance)
     beside, same = 0.5 * variance, 1 - variance
     for axis in (1, 2):

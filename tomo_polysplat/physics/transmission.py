@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from tomo_polysplat.checks import fail
+from tomo_polysplat.kernels.device import is_for_compiled
 from tomo_polysplat.physics.quadrature import Quadrature
 
 __all__ = ["nodes_on", "polychromatic_projection"]
@@ -75,7 +76,7 @@ class _Projection(torch.autograd.Function):
     def forward(
         ctx: Any, areal: torch.Tensor, log_weights: torch.Tensor, attenuation: torch.Tensor
     ) -> torch.Tensor:
-        ctx.compiled = areal.device.type == "cpu" and areal.dtype == torch.float32
+        ctx.compiled = is_for_compiled(areal)
         if ctx.compiled:
             from tomo_polysplat.kernels.step.numba_beer_lambert import beer_lambert
 

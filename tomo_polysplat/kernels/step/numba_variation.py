@@ -39,14 +39,13 @@ def variation_gradient(
     numbers = np.array(
         [
             *(corners if any(corners) else (_ENDLESS, _ENDLESS)),
-            0.0,
+            # The least number that is dense.
+            np.nextafter(np.float32(dense), np.float32(np.inf)),
             -1 / width if width else 0.0,
             0.5 * width,
         ],
         np.float32,
     )
-    # Least number that is dense.
-    numbers[2] = np.nextafter(np.float32(dense), np.float32(np.inf))
     size = volume.numel()
     values, slopes, gradient = (
         volume.new_zeros(length + LANES).numpy() for length in (size + plane, plane + size, size)
