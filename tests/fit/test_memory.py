@@ -27,7 +27,7 @@ def with_free(monkeypatch, size):
 def test_projections_stay_where_the_start_has_room_for_its_copies(monkeypatch):
     with_free(monkeypatch, 10e9)
     assert memory.projections_stay(2_000_000_000, GPU)
-    assert not memory.projections_stay(3_000_000_000, GPU)
+    assert not memory.projections_stay(3_100_000_000, GPU)
     assert memory.projections_stay(10**15, CPU)
 
 

@@ -9,7 +9,7 @@ from tomo_polysplat.scan.defects import fill_invalid
 from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.start import initial
 from tomo_polysplat.start.initial import initial_volume, initial_volume_on
-from tomo_polysplat.start.on_gpu import fill_rows
+from tomo_polysplat.start.whole_rows import fill_rows
 
 astra = pytest.importorskip("astra")
 

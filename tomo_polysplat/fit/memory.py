@@ -43,13 +43,14 @@ _PIXEL = 48
 # Bytes a voxel takes at once, by torch's own count on 40^3 to 64^3 (tests/fit/test_counted_memory.py): while a start is
 # looked at and seeded; in a step, with the smoothing, on the CPU and by the kernels of a GPU, which hold the volume and
 # its slope; while a volume is made of three curves and metal. And the samples of thin Gaussians (render.renderer).
-_SEEDED, _SMOOTHED, _MADE, _SAMPLES = 40, {"cpu": 22, "cuda": 13}, 64, 12 << 25
+_SEEDED, _SMOOTHED, _MADE, _SAMPLES = 32, {"cpu": 22, "cuda": 13}, 64, 12 << 25
 # Voxels of a start around which windows are looked at together (model.seed_samples), and bytes of one on top.
 _WINDOW, _WINDOWED = 1 << 25, 22
 # Voxels that are made at once at most: a larger volume is no faster in one piece.
 _LARGEST_SLAB = 1 << 26
-# Copies of the projections that the first reconstruction makes: water equivalents, the filtered ones, ASTRA's.
-_COPIES = 4
+# Copies of the projections that there is room for: themselves, as if all were one material, and as much for the first
+# volumes. What is filtered and backprojected of them at a time takes less than 2 GB (`start.astra_fdk.views_at_once`).
+_COPIES = 3
 # Bytes of the host that a ray takes besides what a scan holds: in the fit's order, whether it is good, and what is made
 # of that in passing; on a CPU also what the start makes of it (20.5 more from 2e7 to 6e7 rays). An energy, whose ray
 # is traced through so many paths and kept three times (runs of 3000 and 12 000 energies); and a voxel of a result.

@@ -343,5 +343,5 @@ class Problem:
             return without_scatter(values, level, OPAQUE) if level else values
         assert self.filter_map is not None and self.spectrum is not None and self.materials is not None
         if level:
-            values = without_scatter(values + dimmed, level, OPAQUE) - dimmed
+            values = without_scatter(values + dimmed, level, OPAQUE).sub_(dimmed)
         return self.filter_map.as_if_bare(values, self.spectrum, self.materials.soft)

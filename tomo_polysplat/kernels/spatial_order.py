@@ -11,6 +11,8 @@ import torch
 __all__ = ["spatial_order"]
 
 _BITS = 10  # cells an axis: 1024
+# Gaussians placed on the curve at once: on the way each takes some 30 numbers for each axis.
+_AT_ONCE = 1 << 20
 
 
 def spatial_order(position: torch.Tensor) -> torch.Tensor:
@@ -28,7 +30,9 @@ def spatial_order(position: torch.Tensor) -> torch.Tensor:
     cells = (point - point.amin(0)) / extent.amax().clamp_min(torch.finfo(point.dtype).tiny)
     # Of the curve through a cube little lies in one plane, and that with leaps: a plane has a curve of its own.
     cells = cells[:, extent > 0] if bool((extent > 0).any()) else cells
-    return torch.argsort(_along_curve((cells * (2**_BITS - 1)).nan_to_num(0.0).long()), stable=True)
+    parts = cells.split(_AT_ONCE)
+    places = [_along_curve((part * (2**_BITS - 1)).nan_to_num(0.0).long()) for part in parts]
+    return torch.argsort(torch.cat(places), stable=True)
 
 
 def _along_curve(cell: torch.Tensor) -> torch.Tensor:

@@ -182,8 +182,9 @@ def _varied(
     mean = box_mean(start.clamp(0.0, settings.metal_level), half)
     reach = [int(n) if size > 1 else 0 for n, size in zip(half, start.shape)]
     voxels = voxel_of(points, grid)
-    highest, lowest = (largest_around(side, reach)[voxels] for side in (mean, -mean))
-    spread = highest + lowest
+    spread = largest_around(mean, reach)[voxels]
+    # In place, as it is nobody else's.
+    spread = spread + largest_around(mean.neg_(), reach)[voxels]
     chosen = torch.zeros_like(supported)
     chosen[spread.masked_fill(~supported, -1.0).topk(min(most, len(points))).indices] = True
     return chosen & supported

@@ -68,7 +68,7 @@ def edge_shapes(
     # Seeds at metal are fine enough, and beside metal the start is too uncertain to follow its edges.
     beside = reaches(start, points, grid, settings.metal_level, float(grid.voxel_size[:dims].min()))
     size = size.masked_fill(beside, 0.0)
-    slope = _slope(start.clamp(0.0, settings.metal_level), points, grid, dims)
+    slope = _slope(start, settings.metal_level, points, grid, dims)
     steepness = slope.norm(dim=1)
     direction = slope / steepness.clamp(min=torch.finfo(slope.dtype).tiny)[:, None]
     # The sign of an axis is free. This one avoids rotations by half a turn, whose own axis is not defined.
@@ -82,10 +82,13 @@ def edge_shapes(
     return torch.nn.functional.normalize(rotation, dim=1), change
 
 
-def _slope(start: torch.Tensor, points: torch.Tensor, grid: VolumeGrid, dims: int) -> torch.Tensor:
+def _slope(
+    start: torch.Tensor, metal_level: float, points: torch.Tensor, grid: VolumeGrid, dims: int
+) -> torch.Tensor:
     """(n, 3) derivatives along x, y and z of the start, smoothed, at the seeds."""
     window = np.minimum(_AVERAGED, start.shape)
-    smooth = box_mean(box_mean(start, window), window)
+    smooth = box_mean(start.clamp(0.0, metal_level), window)
+    smooth = box_mean(smooth, window)
     index = voxel_of(points, grid)
     slope = points.new_zeros((len(points), 3))
     for k in range(dims):

@@ -140,4 +140,5 @@ def without_scatter(values: torch.Tensor, scatter: float, largest: float) -> tor
     largest : float
         Value of the rays that noise leaves with less signal than scatter.
     """
-    return -torch.log((torch.exp(-values) - scatter).clamp(min=float(np.exp(-largest))))
+    # In place: of all rays of a large scan one copy is enough.
+    return (-values).exp_().sub_(scatter).clamp_(min=float(np.exp(-largest))).log_().neg_()

@@ -26,7 +26,9 @@ _CHUNK = 1 << 22
 _PART = 1 << 15
 
 
-def areal_density(projections: Any, spectrum: Spectrum, material: MaterialLike = "water") -> Any:
+def areal_density(
+    projections: Any, spectrum: Spectrum, material: MaterialLike = "water", *, spare: bool = False
+) -> Any:
     """Areal density of a material (g/cm2) that gives the measured projection values.
 
     Parameters
@@ -38,6 +40,8 @@ def areal_density(projections: Any, spectrum: Spectrum, material: MaterialLike =
         Detected spectrum of the scan.
     material : str or mapping
         What the object is taken for: anything ``mass_attenuation`` accepts.
+    spare : bool
+        Whether nobody needs a contiguous tensor of ``projections`` afterwards, so that it may be overwritten.
 
     Returns
     -------
@@ -47,15 +51,17 @@ def areal_density(projections: Any, spectrum: Spectrum, material: MaterialLike =
     """
     if isinstance(projections, torch.Tensor):
         line = projections.reshape(-1)
-        return _inverted(line, spectrum, material).reshape(projections.shape)
+        return _inverted(line, spectrum, material, spare).reshape(projections.shape)
     values = require_array("projections", projections).astype(np.float64)
     flat = torch.from_numpy(values.reshape(-1))
     return _inverted(flat, spectrum, material).numpy().reshape(values.shape)
 
 
-def _inverted(values: torch.Tensor, spectrum: Spectrum, material: MaterialLike) -> torch.Tensor:
-    """The inverse of the material's curve at ``values``, (n,) both."""
-    density = torch.empty_like(values)
+def _inverted(
+    values: torch.Tensor, spectrum: Spectrum, material: MaterialLike, spare: bool = False
+) -> torch.Tensor:
+    """The inverse of the material's curve at ``values``, (n,) both, in their place if they are ``spare``."""
+    density = values if spare else torch.empty_like(values)
     largest = max((float(values[a:b].nan_to_num(0, 0, 0).max()) for a, b in _chunks(values)), default=0.0)
     nodes, slope = _inverse(spectrum, max(largest, 1.0), material)
     table = torch.from_numpy(nodes).to(values.device)

@@ -73,14 +73,14 @@ def _seeded(
     start: np.ndarray | torch.Tensor, plan: Plan, problem: Problem, settings: Settings, device: torch.device
 ) -> Gaussians:
     """The seeds on the device, made on the host where there is no room for what that takes."""
-    relative = start / (problem.depth * plan.reference)
     spacing = plan.spacing * problem.voxel
     # A spacing that was asked for is nobody's lack of Gaussians, which thin ones make up for.
     finest = math.inf if settings.seed_spacing else finest_spacing(problem)[0] * problem.voxel
     finest = 0.0 if plan.sharp else finest
-    stays = start_stays(math.prod(relative.shape), device)
+    stays = start_stays(math.prod(start.shape), device)
     gaussians = seed_gaussians(
-        torch.as_tensor(relative).to(device if stays else "cpu"),
+        # Nobody else holds it: seeding lets go of it early.
+        torch.as_tensor(start / (problem.depth * plan.reference)).to(device if stays else "cpu"),
         problem.grid,
         Spacing(spacing, plan.finer, finest),
         plan.adapted(settings),

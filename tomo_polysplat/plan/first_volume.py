@@ -41,14 +41,15 @@ def first_volume(problem: Problem, device: torch.device, settings: Settings) -> 
 
 def _made(problem: Problem, device: torch.device, settings: Settings) -> tuple[torch.Tensor, str]:
     """The same where it was made."""
-    primary = problem.primary(device)
-    values = _as_if_soft(problem, primary)
+    values = _as_if_soft(problem, device)
     volume, done = initial_volume_on(values, problem.geometry, problem.grid, device)
     reference = soft_reference(_looked_at(volume, device), problem, settings)
     problem.remember_solid(reference.value != reference.first)
     soft = coarse(volume) if problem.solid else None
     for _ in range(_TIMES if problem.solid else 0):
-        values = _as_if_solid(problem, primary, reference.number)
+        # There may be no room for either beside what takes its place.
+        del values, volume
+        values = _as_if_solid(problem, device, reference.number)
         volume, done = initial_volume_on(values, problem.geometry, problem.grid, device)
         reference = soft_reference(_looked_at(volume, device), problem, settings, problem.solid)
     if soft is not None:
@@ -56,7 +57,7 @@ def _made(problem: Problem, device: torch.device, settings: Settings) -> tuple[t
     metal = reference.adapted(settings).metal_level * problem.depth * reference.value
     if not values.is_cuda:
         volume = volume.cpu()
-    spare = values is not primary
+    spare = values is not problem.measured(device)
     volume, bridged = bridged_start(
         values, volume, done["method"], problem.geometry, problem.grid, metal=metal, spare=spare
     )
@@ -69,17 +70,20 @@ def _looked_at(volume: torch.Tensor, device: torch.device) -> torch.Tensor:
     return volume if start_stays(volume.numel(), device) else volume.cpu()
 
 
-def _as_if_soft(problem: Problem, primary: torch.Tensor) -> torch.Tensor:
+def _as_if_soft(problem: Problem, device: torch.device) -> torch.Tensor:
     """Line integrals, were the object all of the first material, of its density; for one energy of attenuation."""
+    primary = problem.primary(device)
     if problem.spectrum is None or problem.materials is None:
         return primary
-    return areal_density(primary, problem.spectrum, problem.materials.soft)
+    spare = primary is not problem.measured(device)
+    return areal_density(primary, problem.spectrum, problem.materials.soft, spare=spare)
 
 
-def _as_if_solid(problem: Problem, primary: torch.Tensor, number: float) -> torch.Tensor:
+def _as_if_solid(problem: Problem, device: torch.device, number: float) -> torch.Tensor:
     """Line integrals, were the object all of one material number, of attenuation in that of the first material."""
     assert problem.spectrum is not None and problem.materials is not None
-    solid = problem.materials.mixed(max(number, 0.0))
+    primary, solid = problem.primary(device), problem.materials.mixed(max(number, 0.0))
     energy = transmitted_energy(primary, problem.spectrum)
     ratio = mass_attenuation(solid, energy) / mass_attenuation(problem.materials.soft, energy)
-    return areal_density(primary, problem.spectrum, solid) * float(ratio)
+    spare = primary is not problem.measured(device)
+    return areal_density(primary, problem.spectrum, solid, spare=spare).mul_(float(ratio))

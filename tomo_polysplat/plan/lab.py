@@ -139,6 +139,8 @@ class Lab:
     def _seeded(self, plan: Plan) -> tuple[Gaussians, dict[str, Any]]:
         key = (plan.spacing, plan.sharp, self.seeding)
         if key not in self._seeds:
+            # Made anew where it is asked for again: seeding takes the room.
+            self.__dict__.pop("relative", None)
             self._seeds[key] = first_gaussians(self.start, plan, self.problem, self.seeding, self.device)
         return self._seeds[key]
 

@@ -10,6 +10,7 @@ import torch
 
 from tomo_polysplat.fit.misses import misses
 from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.physics.typical import largest_finite
 from tomo_polysplat.physics.water_correction import usual_water_correction
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.first_volume import first_volume
@@ -76,7 +77,7 @@ def _doubt_hardening(problem: Problem, device: torch.device) -> Answer | None:
     shown = hardening_shown(problem.projections, problem.geometry, spectrum)
     if shown is None or not shown.none:
         return None
-    largest = float(problem.measured(device).nan_to_num(nan=-math.inf).max())
+    largest = float(largest_finite(problem.measured(device)))
     polynomial = ", ".join(f"{c:.6g}" for c in usual_water_correction(spectrum, largest))
     words = (
         f"all views see the same mass, which shows {shown.share:.2f} (standard error {shown.error:.2g}) of the"

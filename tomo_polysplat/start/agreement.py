@@ -13,6 +13,7 @@ from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.fdk import fdk, fits_fdk
 from tomo_polysplat.start.initial import FEW_VIEWS
 from tomo_polysplat.start.on_gpu import fdk_on_gpu
+from tomo_polysplat.start.whole_rows import Continuation, WholeRows
 
 __all__ = ["halves_agree", "places_of_views"]
 
@@ -101,11 +102,12 @@ def _half(
     some = geometry.select(views)
     if not fits_fdk(some, grid)[0]:
         return None
-    values = projections[torch.from_numpy(views).to(projections.device)]
-    device = values.device if device is None else device
-    volume = fdk_on_gpu(values, some, grid, device) if device.type == "cuda" else None
+    index = torch.from_numpy(views).to(projections.device)
+    device, volume = projections.device if device is None else device, None
+    if device.type == "cuda":
+        volume = fdk_on_gpu(WholeRows(projections, Continuation(some), index), some, grid, device)
     if volume is None and math.prod(grid.shape) * geometry.views <= _MOST_ADDITIONS:
-        array = values.cpu().numpy()
+        array = projections[index].cpu().numpy()
         filled = fill_invalid(array, np.isfinite(array))
         volume = torch.from_numpy(fdk(filled, some, grid, filter_name="hann"))
     return volume

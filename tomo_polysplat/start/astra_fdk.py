@@ -29,10 +29,15 @@ from tomo_polysplat.start.weights import (
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["fdk_cuda_tensor", "suits_fdk_cuda", "weights_on"]
+    from tomo_polysplat.start.level import LevelRows
+
+__all__ = ["fdk_cuda_tensor", "suits_fdk_cuda", "views_at_once", "weights_on"]
 
 # Numbers, with what rows are padded by, that are filtered at once.
 _FILTERED_AT_ONCE = 1 << 24
+# Numbers of the views that are backprojected together. ASTRA adds up so many views at a time, so that whole multiples
+# of these add up to the same as all views at once.
+_AT_ONCE, _GROUP = 1 << 27, 32
 
 
 def suits_fdk_cuda(geometry: Geometry) -> tuple[bool, str]:
@@ -49,45 +54,80 @@ def suits_fdk_cuda(geometry: Geometry) -> tuple[bool, str]:
     return True, "a 3D scan"
 
 
+def views_at_once(pixels: int) -> int:
+    """Views of so many pixels each that are filtered and backprojected together."""
+    return _GROUP * max(1, _AT_ONCE // (_GROUP * pixels))
+
+
 def fdk_cuda_tensor(
-    projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid, orbit: Orbit, filter_name: str
+    projections: torch.Tensor | LevelRows,
+    geometry: Geometry,
+    grid: VolumeGrid,
+    orbit: Orbit,
+    filter_name: str,
 ) -> torch.Tensor:
     """`fdk` of (views, rows, columns) float32 projections on a CUDA device, where the volume stays.
 
     The detector is level (`start.level`). Corners of the volume beyond the ellipse inscribed in its window, and off the
-    detector, miss a part; slices that no view sees are not emptied.
+    detector, miss a part; slices that no view sees are not emptied. Of a large scan some views are filtered and added
+    to the volume at a time: besides the volume that takes 12 B for each of `views_at_once`'s numbers.
 
     Raises
     ------
     RuntimeError
         If ASTRA failed, or had no room.
     """
-    import torch
-
     from tomo_polysplat.start.astra_pair import AstraPair
 
-    views, rows, columns = projections.shape
     before, after = margins(geometry, ellipse_of(grid))
-    wide = replace(geometry, columns=before + columns + after, corner=geometry.corner - before * geometry.u)
+    wide = replace(
+        geometry, columns=before + geometry.columns + after, corner=geometry.corner - before * geometry.u
+    )
     area = np.linalg.norm(np.cross(geometry.u, geometry.v), axis=1) / np.prod(grid.voxel_size)
     arcs = ray_arcs(geometry, orbit, grid) * area[:, None]
-    length = 1 << (2 * (columns + max(before, after)) - 1).bit_length()
-    response = torch.from_numpy(ramp_response(length, filter_name)).to(projections)
-    # In ASTRA's order.
-    sinogram = projections.new_empty((rows, views, wide.columns))
-    at_once, weights = (
-        max(1, _FILTERED_AT_ONCE // (rows * length)),
-        weights_on(projections.device, geometry, orbit, arcs),
-    )
-    for first in range(0, views, at_once):
-        some = slice(first, min(first + at_once, views))
-        weighted = projections[some] * weights(some)
+    length = 1 << (2 * (geometry.columns + max(before, after)) - 1).bit_length()
+    response = _there(ramp_response(length, filter_name), projections.device)
+    weights = weights_on(projections.device, geometry, orbit, arcs)
+    at_once, volume = views_at_once(wide.rows * wide.columns), None
+    with AstraPair(wide, grid, projections.device) as pair:
+        for first in range(0, geometry.views, at_once):
+            some = slice(first, min(first + at_once, geometry.views))
+            sinogram = _filtered(projections[some], some, weights, response, before, after)
+            views = np.arange(some.start, some.stop)
+            if volume is None:
+                volume = pair.adjoint(sinogram, views)
+            else:
+                pair.add_adjoint(volume, sinogram, views)
+            # Before the next is made: there may be no room for both.
+            del sinogram
+    assert volume is not None
+    return volume
+
+
+# Rays, what they are filtered by, and how many columns that makes of them.
+def _filtered(
+    rays: torch.Tensor,
+    views: slice,
+    weights: Callable[[slice], torch.Tensor],
+    response: torch.Tensor,
+    before: int,
+    after: int,
+) -> torch.Tensor:
+    """(views, rows, columns) of some views, filtered, with so many columns more; in memory in ASTRA's order."""
+    import torch
+
+    many, rows, columns = rays.shape
+    length = 2 * (len(response) - 1)
+    sinogram = rays.new_empty((rows, many, before + columns + after))
+    at_once = max(1, _FILTERED_AT_ONCE // (rows * length))
+    for first in range(0, many, at_once):
+        last = min(first + at_once, many)
+        weighted = rays[first:last] * weights(slice(views.start + first, views.start + last))
         filtered = torch.fft.irfft(torch.fft.rfft(weighted, length) * response, length).transpose(0, 1)
         if before:
-            sinogram[:, some, :before] = filtered[..., length - before :]
-        sinogram[:, some, before:] = filtered[..., : columns + after]
-    with AstraPair(wide, grid, projections.device) as pair:
-        return pair.adjoint(sinogram.transpose(0, 1), np.arange(views))
+            sinogram[:, first:last, :before] = filtered[..., length - before :]
+        sinogram[:, first:last, before:] = filtered[..., : columns + after]
+    return sinogram.transpose(0, 1)
 
 
 def weights_on(

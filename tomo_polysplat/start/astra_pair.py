@@ -71,7 +71,7 @@ class AstraPair:
         shape = (self.geometry.rows, len(views), self.geometry.columns)
         volume = volume.contiguous()
         projections = self._unwritten(shape, volume)
-        self._call(direct_FP3D, views, volume, projections)
+        self._call(direct_FP3D, views, volume, projections, volume.nbytes)
         return self._written(projections, volume, projections).transpose(0, 1)
 
     def adjoint(self, projections: torch.Tensor, views: np.ndarray) -> torch.Tensor:
@@ -80,17 +80,45 @@ class AstraPair:
 
         ordered = projections.transpose(0, 1).contiguous()
         volume = self._unwritten(self.grid.shape, projections)
-        self._call(direct_BP3D, views, volume, ordered)
+        self._call(direct_BP3D, views, volume, ordered, ordered.nbytes)
         return self._written(volume, volume, ordered)
 
+    def add_adjoint(self, volume: torch.Tensor, projections: torch.Tensor, views: np.ndarray) -> None:
+        """Add the backprojection of projections (views, rows, columns) to a volume (nz, ny, nx), in place."""
+        ordered = projections.transpose(0, 1).contiguous()
+        # As in `_unwritten`.
+        torch.cuda.current_stream(volume.device).synchronize()
+        proj_geom, vol_geom = to_astra(self.geometry.select(views), self.grid)
+
+        def add(projector: int, volume: torch.Tensor, ordered: torch.Tensor) -> None:
+            import astra
+            from astra.experimental import accumulate_BP
+
+            # ASTRA works on torch's memory. Unlike the direct functions this one always says when it fails.
+            linked = []
+            try:
+                linked.append(astra.data3d.link("-vol", vol_geom, volume))
+                linked.append(astra.data3d.link("-sino", proj_geom, ordered))
+                accumulate_BP(projector, *linked)
+            finally:
+                astra.data3d.delete(linked)
+
+        self._call(add, views, volume, ordered, ordered.nbytes)
+
+    # What ASTRA's function takes, and what of that it copies.
     def _call(
-        self, run: Callable[..., None], views: np.ndarray, volume: torch.Tensor, projections: torch.Tensor
+        self,
+        run: Callable[..., None],
+        views: np.ndarray,
+        volume: torch.Tensor,
+        projections: torch.Tensor,
+        copied: int,
     ) -> None:
         from astra.log import AstraError
 
         projector = self._projector(views)
-        # It takes as much again on its way.
-        make_room(self.index, volume.nbytes + projections.nbytes)
+        # It makes a texture of so many bytes on its way, whose rows are padded.
+        make_room(self.index, 2 * copied)
         try:
             # torch hands out tensors of the current GPU alone.
             with torch.cuda.device_of(volume):

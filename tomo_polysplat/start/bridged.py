@@ -20,9 +20,9 @@ from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.astra_pair import astra_has_gpu
 from tomo_polysplat.start.initial import initial_volume_on
 from tomo_polysplat.start.levels import mass_level
-from tomo_polysplat.start.on_gpu import fill_rows
 from tomo_polysplat.start.projected import projected
 from tomo_polysplat.start.voxel_projector import ProjectorPair, projector_pair
+from tomo_polysplat.start.whole_rows import fill_rows
 
 __all__ = ["THIN", "box_around", "bridged_start", "normalising_volume"]
 
@@ -39,7 +39,7 @@ _JUDGES = 24
 # Steps along all rays beyond which the two more projections would take minutes on two CPU cores.
 _MOST_STEPS = 1e10
 # Rays that are looked at together: the memory is not to hold copies of all.
-_AT_ONCE = {"cuda": 1 << 28, "cpu": 1 << 22}
+_AT_ONCE = {"cuda": 1 << 27, "cpu": 1 << 22}
 
 # Rows and columns of a detector, the first and the one behind the last.
 Window = tuple[tuple[int, int], tuple[int, int]]

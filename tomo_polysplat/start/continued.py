@@ -18,16 +18,15 @@ from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.fdk import fits_fdk
 from tomo_polysplat.start.orbit import Orbit, find_orbit
 from tomo_polysplat.start.weights import ray_offsets
+from tomo_polysplat.start.whole_rows import Continuation, ends_of
 
-__all__ = ["continued", "cut_rows", "few_rows", "half_width"]
+__all__ = ["continuation", "continued", "cut_rows", "few_rows", "half_width"]
 
 _Array = TypeVar("_Array", np.ndarray, torch.Tensor)
 
 # A row sees the object where its largest ray has this part of a typical one, and an end sees matter where it has that.
 # The object is cut where both ends do in this share of the rows that see it.
 _OBJECT, _NOTHING, _MOST = 0.5, 0.1, 0.5
-# Share of the columns whose mean an end is taken for, against noise.
-_END = 0.02
 # Rays through metal would tell of a smaller object than there is: what is more than this many typical rays counts as so
 # much. In six scans of 40^3 of which a third to a half was not seen the half-width is told within 1.2 columns so.
 _DENSE = 1.5
@@ -55,7 +54,7 @@ def cut_rows(projections: torch.Tensor) -> torch.Tensor | None:
     if typical is None:
         return None
     rows = values[values.amax(dim=-1) > _OBJECT * typical].clamp(max=_DENSE * typical)
-    both = _ends(rows).amin(dim=-1) > _NOTHING * typical
+    both = ends_of(rows).amin(dim=-1) > _NOTHING * typical
     return rows if len(rows) and both.float().mean() > _MOST else None
 
 
@@ -90,36 +89,37 @@ def half_width(projections: torch.Tensor, geometry: Geometry) -> float | None:
     return min(max(reach, half + _LEAST * columns), half + _FARTHEST * columns)
 
 
-def continued(
-    projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid
-) -> tuple[torch.Tensor, Geometry, str]:
-    """The projections and geometry with as many columns more at either end as it takes, and words that say so.
+def continuation(projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid) -> Continuation:
+    """How the rows of a scan go on.
 
     A row that ends in matter goes on as one of a homogeneous ellipse of that `half_width` would. Continuing rows as
     those of a uniform object is the idea of Hsieh et al. (Med. Phys. 31, 2385, 2004, doi:10.1118/1.1776673). Where the
-    object is not cut at both ends, or part of a turn is too short for a wider fan, all is returned as it is.
+    object is not cut at both ends, or part of a turn is too short for a wider fan, all is left as it is.
 
     Parameters
     ----------
     projections : (views, rows, columns) tensor
-        -log(I/I0), finite.
+        -log(I/I0), finite; its `few_rows` are enough.
     geometry, grid : Geometry, VolumeGrid
-        For which filtered backprojection fits.
+        Of the whole scan, for which filtered backprojection fits.
     """
     reach = half_width(projections, geometry)
     if reach is None:
-        return projections, geometry, ""
-    columns = projections.shape[2]
-    half = 0.5 * (columns - 1)
-    more = math.ceil(reach - half)
-    wider = replace(geometry, columns=columns + 2 * more, corner=geometry.corner - more * geometry.u)
+        return Continuation(geometry)
+    more = math.ceil(reach - 0.5 * (geometry.columns - 1))
+    wider = replace(geometry, columns=geometry.columns + 2 * more, corner=geometry.corner - more * geometry.u)
     if not fits_fdk(wider, grid)[0]:
-        return projections, geometry, ""
-    beyond = half + torch.arange(1, more + 1, device=projections.device, dtype=projections.dtype)
-    share = ((reach**2 - beyond**2).clamp(min=0) / (reach**2 - half**2)).sqrt()
-    left, right = (end[..., None].clamp(min=0) * share for end in _ends(projections).unbind(-1))
-    wide = torch.cat([left.flip(2), projections, right], dim=2)
-    return wide, wider, f"; rows continued by {more} columns at both ends, where the object reaches beyond"
+        return Continuation(geometry)
+    words = f"; rows continued by {more} columns at both ends, where the object reaches beyond"
+    return Continuation(wider, more, reach, words)
+
+
+def continued(
+    projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid
+) -> tuple[torch.Tensor, Geometry, str]:
+    """All projections as their `continuation` has them, their geometry, and words that say so."""
+    found = continuation(projections, geometry, grid)
+    return found.of(projections), found.geometry, found.words
 
 
 def _centred(geometry: Geometry, orbit: Orbit) -> bool:
@@ -132,9 +132,3 @@ def few_rows(projections: _Array) -> _Array:
     """Enough views and rows of (views, rows, columns) to tell by, evenly spread."""
     views, rows, _ = projections.shape
     return projections[:: max(1, views // _VIEWS), :: max(1, rows // _ROWS)]
-
-
-def _ends(values: torch.Tensor) -> torch.Tensor:
-    """(..., 2) means of the first and of the last few columns."""
-    few = max(1, round(_END * values.shape[-1]))
-    return torch.stack([values[..., :few].mean(dim=-1), values[..., -few:].mean(dim=-1)], dim=-1)

@@ -11,7 +11,7 @@ from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.backproject import accumulate, voxel_maps
 from tomo_polysplat.start.fdk_by_ranks import fdk_by_ranks
 from tomo_polysplat.start.filters import FILTERS, filter_rows
-from tomo_polysplat.start.level import Level
+from tomo_polysplat.start.level import Level, LevelRows
 from tomo_polysplat.start.orbit import Orbit, find_orbit
 from tomo_polysplat.start.shadow import corners_of, margins, slices_seen
 from tomo_polysplat.start.weights import (
@@ -123,9 +123,13 @@ def fdk(
 
 
 def _slab_on_cpu(
-    projections: torch.Tensor, geometry: Geometry, grid: VolumeGrid, orbit: Orbit, filter_name: str
+    projections: torch.Tensor | LevelRows,
+    geometry: Geometry,
+    grid: VolumeGrid,
+    orbit: Orbit,
+    filter_name: str,
 ) -> torch.Tensor:
-    return torch.from_numpy(_fdk_cpu(projections.numpy(), geometry, grid, orbit, filter_name))
+    return torch.from_numpy(_fdk_cpu(projections[:].numpy(), geometry, grid, orbit, filter_name))
 
 
 def _fdk_cpu(

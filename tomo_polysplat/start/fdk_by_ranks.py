@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -14,10 +14,13 @@ from tomo_polysplat.free_memory import give_back
 from tomo_polysplat.rank_work import any_lacks, helpers
 from tomo_polysplat.ranks import Ranks, part_of
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
-from tomo_polysplat.start.level import Level
+from tomo_polysplat.start.level import Level, LevelRows
 from tomo_polysplat.start.orbit import Orbit
 from tomo_polysplat.start.shadow import slices_seen
 from tomo_polysplat.start.slabs import in_one_piece, rows_of, slab_of
+
+if TYPE_CHECKING:
+    from tomo_polysplat.start.whole_rows import WholeRows
 
 __all__ = ["fdk_by_ranks"]
 
@@ -29,8 +32,9 @@ _WORTH = 1 << 33
 _SENT = 1 << 26
 
 
-# Gets (views, rows, columns) projections, their geometry, the grid, the orbit and the name of the filter.
-_Make = Callable[[torch.Tensor, Geometry, VolumeGrid, Orbit, str], torch.Tensor]
+# Gets (views, rows, columns) projections, of which some views are a tensor, their geometry, the grid, the orbit and the
+# name of the filter.
+_Make = Callable[["torch.Tensor | LevelRows", Geometry, VolumeGrid, Orbit, str], torch.Tensor]
 
 
 class _Slab(NamedTuple):
@@ -45,7 +49,7 @@ class _Slab(NamedTuple):
 # What makes a slab, and all of what.
 def fdk_by_ranks(
     make: _Make,
-    projections: torch.Tensor | np.ndarray,
+    projections: torch.Tensor | np.ndarray | WholeRows,
     geometry: Geometry,
     grid: VolumeGrid,
     orbit: Orbit,
@@ -57,7 +61,7 @@ def fdk_by_ranks(
     ----------
     make : callable
         A function of a module that makes a slab of the rows which it needs, on any rank.
-    projections : (views, rows, columns) float32 tensor or array
+    projections : (views, rows, columns) float32 tensor or array, or WholeRows
         -log(I/I0), finite.
     geometry, grid, orbit
         Of a scan that filtered backprojection fits; on GPUs one that suits ASTRA's.
@@ -77,9 +81,9 @@ def fdk_by_ranks(
     ranks, slices = helpers(), grid.shape[0]
     if ranks.count == 1 or slices < ranks.count or math.prod(grid.shape) * geometry.views < _WORTH:
         return None
-    if not isinstance(projections, torch.Tensor):
+    if isinstance(projections, np.ndarray):
         projections = torch.from_numpy(np.require(projections, np.float32, ("C", "W")))
-    values = projections.float()
+    values = projections.float() if isinstance(projections, torch.Tensor) else projections
     level = Level(geometry)
     if values.device.type != ranks.device.type or not in_one_piece(values, level, grid):
         return None
@@ -102,7 +106,7 @@ def _slab(geometry: Geometry, grid: VolumeGrid, part: slice) -> _Slab:
 def _made_together(
     ranks: Ranks,
     make: _Make,
-    values: torch.Tensor,
+    values: torch.Tensor | WholeRows,
     level: Level,
     grid: VolumeGrid,
     slabs: list[_Slab],
@@ -115,12 +119,11 @@ def _made_together(
     if any_lacks(ranks, whole is None):
         return None
     assert whole is not None
-    for rank, slab in enumerate(slabs[1:], 1):
+    pieces = [LevelRows(level, values, slab.rows, values.device) for slab in slabs]
+    for rank, (piece, slab) in enumerate(zip(pieces[1:], slabs[1:]), 1):
         for some in _portions(slab.geometry):
-            ranks.send([level.values(values[some], some, slab.rows, values.device)], rank)
-    own = _made(
-        make, level.values(values, slice(None), slabs[0].rows, values.device), slabs[0], orbit, filter_name
-    )
+            ranks.send([piece[some]], rank)
+    own = _made(make, pieces[0], slabs[0], orbit, filter_name)
     if any_lacks(ranks, own is None):
         return None
     assert own is not None
@@ -150,7 +153,7 @@ def _follow(ranks: Ranks, make: _Make, slabs: list[_Slab], orbit: Orbit, filter_
 
 
 def _made(
-    make: _Make, piece: torch.Tensor, slab: _Slab, orbit: Orbit, filter_name: str
+    make: _Make, piece: torch.Tensor | LevelRows, slab: _Slab, orbit: Orbit, filter_name: str
 ) -> torch.Tensor | None:
     """The volume of a slab; None where there is no room for what that takes."""
     try:

@@ -12,11 +12,12 @@ from tomo_polysplat.checks import fail, require_array, require_shape
 from tomo_polysplat.ranks import RankFailed
 from tomo_polysplat.scan.defects import fill_invalid
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
-from tomo_polysplat.start.continued import continued
+from tomo_polysplat.start.continued import continuation, continued, few_rows
 from tomo_polysplat.start.fdk import fdk, fits_fdk
-from tomo_polysplat.start.on_gpu import fdk_on_gpu, fill_rows
+from tomo_polysplat.start.on_gpu import fdk_on_gpu
 from tomo_polysplat.start.sirt import sirt
 from tomo_polysplat.start.source_planes import beyond_sources
+from tomo_polysplat.start.whole_rows import WholeRows, fill_rows
 
 __all__ = ["initial_volume", "initial_volume_on"]
 
@@ -52,9 +53,9 @@ def initial_volume_on(
         fits, reason = _method(geometry, grid)
         try:
             if fits:
-                wide, wider, longer = continued(fill_rows(projections), geometry, grid)
-                volume = fdk_on_gpu(wide, wider, grid, device=device)
-                reason += longer
+                longer = continuation(fill_rows(few_rows(projections)), geometry, grid)
+                volume = fdk_on_gpu(WholeRows(projections, longer), longer.geometry, grid, device)
+                reason += longer.words
         except RankFailed:
             raise
         except RuntimeError as problem:

@@ -9,14 +9,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from tomo_polysplat.scan.geometry import Geometry
 
-__all__ = ["Level"]
+if TYPE_CHECKING:
+    from tomo_polysplat.start.whole_rows import WholeRows
+
+__all__ = ["Level", "LevelRows"]
 
 # Rows by which the ends of a detector's own rows rise over their middle, below which they are level.
 _LEVEL = 0.05
@@ -59,7 +63,7 @@ class Level:
             )
 
     def values(
-        self, projections: torch.Tensor, views: slice, rows: tuple[int, int], device: torch.device
+        self, projections: torch.Tensor | WholeRows, views: slice, rows: tuple[int, int], device: torch.device
     ) -> torch.Tensor:
         """What the level detector sees in some views and in its rows from the first up to, and without, the second.
 
@@ -68,7 +72,7 @@ class Level:
 
         Parameters
         ----------
-        projections : (views, rows, columns) tensor
+        projections : (views, rows, columns) tensor or WholeRows
             Of these views, by the told detector; anywhere.
         views : slice
         rows : (int, int)
@@ -105,6 +109,35 @@ class Level:
                     for n, tap in enumerate(_TAPS)
                 )
         return seen
+
+
+@dataclass(frozen=True, eq=False)
+class LevelRows:
+    """What stands for a tensor of what the level detector sees in some of its rows: its views become one.
+
+    Parameters
+    ----------
+    level : Level
+    projections : (views, rows, columns) tensor or WholeRows
+        By the told detector; anywhere.
+    rows : (int, int)
+        Of the level detector, the first and the one behind the last.
+    device : torch.device
+        Where they are to be.
+    """
+
+    level: Level
+    projections: torch.Tensor | WholeRows
+    rows: tuple[int, int]
+    device: torch.device
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(views, rows, columns)."""
+        return len(self.projections), self.rows[1] - self.rows[0], self.level.geometry.columns
+
+    def __getitem__(self, views: slice) -> torch.Tensor:
+        return self.level.values(self.projections[views], views, self.rows, self.device)
 
 
 def _cubic(share: np.ndarray) -> np.ndarray:

@@ -11,12 +11,14 @@ import numpy as np
 
 from tomo_polysplat.free_memory import free_bytes, give_back, in_gigabytes
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
-from tomo_polysplat.start.level import Level
+from tomo_polysplat.start.level import Level, LevelRows
 from tomo_polysplat.start.orbit import Orbit
 from tomo_polysplat.start.shadow import corners_of, ellipse_of, margins, slices_seen
 
 if TYPE_CHECKING:
     import torch
+
+    from tomo_polysplat.start.whole_rows import WholeRows
 
 __all__ = ["fdk_cuda", "fdk_of_slabs", "fdk_on_device", "in_one_piece", "rows_of", "slab_of", "slabs"]
 
@@ -24,8 +26,9 @@ logger = logging.getLogger(__name__)
 
 # Rows beyond those that voxels' centres fall on: the next one is interpolated with.
 _MARGIN = 2
-# Bytes on a GPU: of a number of a slab's projections (the piece itself, ASTRA's sinogram, and a copy of some views that
-# its backprojection makes), of a voxel of it (and whether it is finite), and what the filter takes besides.
+# Bytes on a GPU: of a number of the views of a slab that are filtered and backprojected together (as the filter takes
+# them, ASTRA's sinogram, and the texture that it makes of that), of a voxel of it (and whether it is finite), and what
+# the filter takes besides.
 _OF_RAY, _OF_VOXEL, _FILTER = 12, 5, 4 << 27
 # Of what is free: the rest is for what ASTRA's own context takes. And how often less is tried where that was too much.
 _SHARE, _TIMES = 0.8, 3
@@ -98,7 +101,7 @@ def fdk_cuda(
 
 
 def fdk_on_device(
-    projections: torch.Tensor,
+    projections: torch.Tensor | WholeRows,
     geometry: Geometry,
     grid: VolumeGrid,
     orbit: Orbit,
@@ -122,11 +125,10 @@ def fdk_on_device(
     from tomo_polysplat.start.astra_fdk import fdk_cuda_tensor
 
     level = Level(geometry)
-    flat, resident = level.geometry, projections.is_cuda and not level.moved
+    flat = level.geometry
 
     def make(rows: tuple[int, int], cropped: Geometry, slab: VolumeGrid) -> torch.Tensor:
-        piece = level.values(projections, slice(None), rows, device)
-        return fdk_cuda_tensor(piece, cropped, slab, orbit, filter_name)
+        return fdk_cuda_tensor(LevelRows(level, projections, rows, device), cropped, slab, orbit, filter_name)
 
     def tried(depth: int, place: torch.device) -> torch.Tensor:
         if depth >= nz and place == device:
@@ -142,11 +144,11 @@ def fdk_on_device(
     of_whole = 4 * nz * ny * nx
     for attempt in range(_TIMES):
         room = _SHARE * free_bytes(device) / 2**attempt
-        depth = _depth(flat, grid, room, resident)
+        depth = _depth(flat, grid, room)
         # A second volume of this size is what whatever looks at it takes at least.
         place = device if 2 * of_whole < room else torch.device("cpu")
         if depth < nz and place.type == "cuda":
-            depth = _depth(flat, grid, room - of_whole, resident)
+            depth = _depth(flat, grid, room - of_whole)
         try:
             return tried(depth, place)
         except RuntimeError as problem:
@@ -158,17 +160,18 @@ def fdk_on_device(
     raise AssertionError("unreachable")
 
 
-def in_one_piece(projections: torch.Tensor, level: Level, grid: VolumeGrid) -> bool:
+def in_one_piece(projections: torch.Tensor | WholeRows, level: Level, grid: VolumeGrid) -> bool:
     """Whether the device of the projections has room to make a volume of theirs in one piece; always on the host."""
     if not projections.is_cuda:
         return True
     room = _SHARE * free_bytes(projections.device)
-    whole = _depth(level.geometry, grid, room, not level.moved) == grid.shape[0]
-    return whole and 8 * math.prod(grid.shape) < room
+    return _depth(level.geometry, grid, room) == grid.shape[0] and 8 * math.prod(grid.shape) < room
 
 
-def _depth(geometry: Geometry, grid: VolumeGrid, room: float, resident: bool) -> int:
+def _depth(geometry: Geometry, grid: VolumeGrid, room: float) -> int:
     """Slices of a slab for which there is room."""
+    from tomo_polysplat.start.astra_fdk import views_at_once
+
     nz, ny, nx = grid.shape
     beyond = sum(margins(geometry, ellipse_of(grid)))
     # In the middle: nearest to the source's plane, where the cone is as wide as anywhere along the axis.
@@ -176,9 +179,9 @@ def _depth(geometry: Geometry, grid: VolumeGrid, room: float, resident: bool) ->
     while depth > 1:
         first = (nz - depth) // 2
         low, high = rows_of(geometry, slab_of(grid, first, first + depth))
-        rays = (high - low) * geometry.views * (geometry.columns + beyond)
-        of_ray = _OF_RAY - 4 if resident and depth == nz else _OF_RAY
-        if of_ray * rays + _OF_VOXEL * depth * ny * nx + _FILTER <= room:
+        pixels = (high - low) * (geometry.columns + beyond)
+        rays = min(geometry.views, views_at_once(pixels)) * pixels
+        if _OF_RAY * rays + _OF_VOXEL * depth * ny * nx + _FILTER <= room:
             break
         depth = -(-depth // 2)
     return depth
