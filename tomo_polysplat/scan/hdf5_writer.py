@@ -10,11 +10,14 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from tomo_polysplat.checks import fail
 from tomo_polysplat.files import replacing
+from tomo_polysplat.parallel import of_parts
 
 if TYPE_CHECKING:
     import h5py
@@ -23,6 +26,9 @@ __all__ = ["new_hdf5"]
 
 # A disk or a quota that is full, or a limit on the size of files. Others say that room cannot be taken ahead.
 _FULL = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
+# Bytes after which the system is asked to begin with writing to the disk, and of a block that is not written where it
+# is all zeros, as most of a volume of bone or metal is.
+_PIECE, _BLOCK = 1 << 26, 1 << 16
 
 
 @contextmanager
@@ -105,14 +111,24 @@ class _PatientFile:
     def write(self, data: Any) -> int:
         view = memoryview(data).cast("B")
         try:
-            done = 0
-            while self.error is None and done < len(view):
-                done += os.pwrite(self._file, view[done:], self._at + done)
+            # What lies behind all that was ever written is zeros.
+            for first, last in _lit(view) if self._at >= self._end else [(0, len(view))]:
+                self._put(view[first:last], self._at + first)
         except OSError as error:
             self.error = _too_full(error, self._at + len(view)) if error.errno in _FULL else error
         self._at += len(view)
         self._end = max(self._end, self._at)
         return len(view)
+
+    def _put(self, view: memoryview, at: int) -> None:
+        """Write some bytes; the disk goes on with a piece of them while the next is handed over."""
+        for first in range(0, len(view), _PIECE):
+            piece, done = view[first : first + _PIECE], 0
+            while self.error is None and done < len(piece):
+                done += os.pwrite(self._file, piece[done:], at + first + done)
+            if len(piece) >= _BLOCK and hasattr(os, "posix_fadvise"):
+                with suppress(OSError):
+                    os.posix_fadvise(self._file, at + first, len(piece), os.POSIX_FADV_DONTNEED)
 
     def truncate(self, size: int | None = None) -> int:
         self._end = self._at if size is None else size
@@ -126,3 +142,15 @@ class _PatientFile:
         if self.error is not None:
             raise self.error
         os.ftruncate(self._file, self._end)
+
+
+def _lit(view: memoryview) -> list[tuple[int, int]]:
+    """Where bytes are not all zeros, the first and the one behind the last, by whole blocks."""
+    whole = len(view) // _BLOCK
+    blocks = np.frombuffer(view[: whole * _BLOCK], np.uint32).reshape(whole, _BLOCK // 4)
+    # One at either end, so that what is lit begins and ends; what is left over behind the blocks counts as lit.
+    lit = np.zeros(whole + 3, bool)
+    lit[1 : whole + 1] = np.concatenate([lit[:0], *of_parts(lambda some: some.max(axis=1) > 0, blocks)])
+    lit[whole + 1] = len(view) > whole * _BLOCK
+    ends = np.flatnonzero(lit[1:] != lit[:-1]) * _BLOCK
+    return [(first, min(last, len(view))) for first, last in ends.reshape(-1, 2).tolist()]
