@@ -6,6 +6,7 @@ import torch
 from triton_cases import CASES
 from triton_interpreter import interpret
 
+from tomo_polysplat.kernels import spatial_order as module
 from tomo_polysplat.kernels.spatial_order import spatial_order
 from tomo_polysplat.kernels.views import DetectorViews
 
@@ -20,7 +21,7 @@ def test_in_the_interpreter(name, interpreted):
     assert name not in interpreted, interpreted[name]
 
 
-def test_spatial_order_keeps_neighbours_together():
+def test_spatial_order_keeps_neighbours_together(monkeypatch):
     """Groups of 32 along the curve span a small part of the volume; one Gaussian or none is no matter."""
     position = torch.rand((32 * 64, 3), generator=torch.Generator().manual_seed(0)) - 0.5
     order = spatial_order(position)
@@ -32,6 +33,8 @@ def test_spatial_order_keeps_neighbours_together():
     grid = torch.cartesian_prod(*[torch.arange(8.0)] * 3)
     for cells in (grid, *(grid[grid[:, k] == 3] for k in range(3))):
         assert (cells[spatial_order(cells)].diff(dim=0).abs().sum(1) == 1).all()
+    monkeypatch.setattr(module, "_AT_ONCE", 100)
+    assert torch.equal(spatial_order(position), order), "whatever is placed at once"
     assert spatial_order(torch.ones(5, 3)).tolist() == [0, 1, 2, 3, 4]
     assert spatial_order(position[:0]).tolist() == []
     assert spatial_order(position[:1]).tolist() == [0]

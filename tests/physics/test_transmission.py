@@ -155,3 +155,14 @@ def test_hardly_attenuated_rays_transmit_the_whole_spectrum(value):
 def test_what_no_light_passes_hardens_to_the_last_energy():
     """Though every share of it is too small for a float."""
     assert transmitted_energy(np.array([2e3, 3e3]), SPECTRUM) == pytest.approx(90.0, abs=1.0)
+
+
+@pytest.mark.parametrize("spare", [False, True])
+def test_rays_are_overwritten_only_where_nobody_needs_them(spare):
+    values = torch.linspace(-0.1, 4.0, 3 * 30_000, dtype=torch.float32).reshape(3, -1, 10)
+    values[1, 5, 2] = torch.nan
+    given, expected = values.clone(), areal_density(values.double().numpy(), SPECTRUM)
+    found = areal_density(given, SPECTRUM, spare=spare)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+    assert (found.data_ptr() == given.data_ptr()) == spare
+    assert spare or torch.equal(given.nan_to_num(), values.nan_to_num())

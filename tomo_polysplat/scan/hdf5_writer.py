@@ -27,7 +27,7 @@ __all__ = ["new_hdf5"]
 # A disk or a quota that is full, or a limit on the size of files. Others say that room cannot be taken ahead.
 _FULL = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
 # Bytes after which the system is asked to begin with writing to the disk, and of a block that is not written where it
-# is all zeros, as most of a volume of bone or metal is.
+# is all zeros, as a third to two thirds of the curves of dense matter are.
 _PIECE, _BLOCK = 1 << 26, 1 << 16
 
 
