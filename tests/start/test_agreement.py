@@ -65,6 +65,21 @@ def test_bodies_are_judged_apart():
     assert plain < 0.05
 
 
+@pytest.mark.parametrize("shape", [(11, 13, 17), (1, 20, 30), (9, 1, 5)])
+def test_pairs_are_counted_by_slabs(monkeypatch, shape):
+    """By hand: each pair along an axis of which both voxels are in the body counts once."""
+    rng = np.random.default_rng(0)
+    one, other, body = rng.normal(size=shape), rng.normal(size=shape), rng.random(shape) < 0.8
+    signs = pairs = 0
+    for axis in range(3):
+        first, last = (np.delete(body, k, axis) for k in (0, shape[axis] - 1))
+        both = first & last
+        signs += (np.sign(np.diff(one, axis=axis)) * np.sign(np.diff(other, axis=axis)))[both].sum()
+        pairs += both.sum()
+    monkeypatch.setattr(agreement, "_AT_ONCE", 100)
+    assert agreement._signs(*map(torch.from_numpy, (one, other, body))) == (signs, pairs)
+
+
 def test_a_view_seen_twice_is_no_proof():
     twice = np.repeat(np.arange(VIEWS), 2)
     values = torch.from_numpy(noise())[torch.from_numpy(twice)]

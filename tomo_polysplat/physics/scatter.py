@@ -97,15 +97,15 @@ def made_level(values: torch.Tensor, scatter: Scatter, beam: float = 1.0) -> tup
     beam : float
         Brightness of the beam, in those of the open field I0.
     """
-    if beam != 1.0:
-        values = values + math.log(beam)
+    shift = math.log(beam)
     if not scatter.varies:
-        return values, scatter.constant
+        return values + shift if shift else values, scatter.constant
     chunks = values.split(max(1, _CHUNK // values[0].numel()))
-    level = max(0.0, *(_least_level(chunk, scatter) for chunk in chunks))
+    level = max(0.0, *(_least_level(chunk + shift, scatter) for chunk in chunks))
     made = torch.empty_like(values)
     for chunk, place in zip(chunks, made.split(len(chunks[0]))):
-        light = torch.exp(-chunk) + (level - scatter.at(light_around(chunk)))
+        shifted = chunk + shift
+        light = torch.exp(-shifted) + (level - scatter.at(light_around(shifted)))
         # Rounding leaves some rays without any.
         place.copy_(-torch.log(light.clamp(min=torch.finfo(light.dtype).tiny)))
     return made, level
