@@ -147,6 +147,8 @@ class _PatientFile:
 def _lit(view: memoryview) -> list[tuple[int, int]]:
     """Where bytes are not all zeros, the first and the one behind the last, by whole blocks."""
     whole = len(view) // _BLOCK
+    if not whole:
+        return [(0, len(view))] if len(view) else []
     blocks = np.frombuffer(view[: whole * _BLOCK], np.uint32).reshape(whole, _BLOCK // 4)
     # One at either end, so that what is lit begins and ends; what is left over behind the blocks counts as lit.
     lit = np.zeros(whole + 3, bool)

@@ -165,6 +165,6 @@ def _no_room(volume: torch.Tensor, projections: torch.Tensor) -> str:
     of_rays, of_voxels = projections.nbytes, volume.nbytes
     return (
         f"ASTRA failed on {projections.device}: beside {in_gigabytes(of_rays)} of projections and"
-        f" {in_gigabytes(of_voxels)} of voxels it needs as much again as the larger of them, and"
+        f" {in_gigabytes(of_voxels)} of voxels it needs as much again as what it starts from, and"
         f" {in_gigabytes(free_bytes(projections.device))} are free."
     )
