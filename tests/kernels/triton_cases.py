@@ -127,13 +127,22 @@ def know_numbers() -> None:
     if not hasattr(semantic, "TritonSemantic"):  # before Triton 3.4
         return
     promote, made = semantic.TritonSemantic.binary_op_type_checking_impl, {}
-    usual, numbers = {"fp32", "fp64", "int1", "int32", "int64"}, {int, float}
+    usual, whole, numbers = {"fp32", "fp64", "int1", "int32", "int64"}, {"int32", "int64"}, {int, float}
 
     def promoted(self, one, other, *rest, **named):
         kinds = type(one), type(other)
         if kinds == (tl.tensor, tl.tensor):
-            if one.dtype.name in usual and (
-                one.type is other.type or (one.dtype.name == other.dtype.name and one.shape is other.shape)
+            name = one.dtype.name
+            if name in usual and (
+                one.type is other.type or (name == other.dtype.name and one.shape is other.shape)
+            ):
+                return one, other
+            # Pointers and how far to go from them, which are not promoted.
+            if (
+                rest[:1] == (True,)
+                and other.dtype.name in whole
+                and one.dtype.is_ptr()
+                and one.shape is other.shape
             ):
                 return one, other
         elif tl.tensor in kinds and (kinds[0] in numbers or kinds[1] in numbers):
@@ -152,6 +161,37 @@ def know_numbers() -> None:
         return promote(self, one, other, *rest, **named)
 
     semantic.TritonSemantic.binary_op_type_checking_impl = promoted
+
+
+def work_out_at_once() -> None:
+    """Let the interpreter add, subtract and multiply numbers of one type without asking of what kind they are.
+
+    With pointers that move without promotion it takes a fifth less. The arithmetic is numpy's, as ever.
+    """
+    import triton.language as tl
+    from triton.language import semantic
+    from triton.runtime.interpreter import TensorHandle
+
+    if not hasattr(semantic, "TritonSemantic"):  # before Triton 3.4
+        return
+    plain = {"fp32", "fp64", "int32", "int64"}
+
+    def at_once(usual, operation):
+        def work_out(self, one, other, sanitize_overflow):
+            tensor = one if type(one) is tl.tensor else other
+            checked = sanitize_overflow and self.builder.options.sanitize_overflow
+            if type(tensor) is not tl.tensor or tensor.dtype.name not in plain or checked:
+                return usual(self, one, other, sanitize_overflow)
+            one, other = self.binary_op_type_checking_impl(one, other, True, True)
+            if one.dtype.name not in plain or one.dtype.name != other.dtype.name:
+                return usual(self, one, other, sanitize_overflow)
+            return tl.tensor(TensorHandle(operation(one.handle.data, other.handle.data), one.dtype), one.type)
+
+        return work_out
+
+    for name, operation in (("add", np.add), ("sub", np.subtract), ("mul", np.multiply)):
+        usual = getattr(semantic.TritonSemantic, name)
+        setattr(semantic.TritonSemantic, name, at_once(usual, operation))
 
 
 def call_at_once() -> None:
@@ -206,6 +246,7 @@ def main() -> None:
     hurry()
     know_types()
     know_numbers()
+    work_out_at_once()
     call_at_once()
     skip_unread_sums()
     np.seterr(all="ignore")  # the interpreter computes masked lanes too
