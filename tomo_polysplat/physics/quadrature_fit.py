@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from tomo_polysplat.physics.beer_lambert import projection, shares
@@ -43,13 +45,19 @@ def fit_nodes(log_weights: np.ndarray, attenuation: np.ndarray, rays: np.ndarray
     start = _grouped(log_weights, attenuation, count)
     materials = len(attenuation)
 
+    # Derivatives are asked for where the values have just been.
+    @lru_cache(maxsize=1)
+    def at(unknowns: bytes) -> tuple[Nodes, tuple[np.ndarray, np.ndarray]]:
+        nodes = _unpack(np.frombuffer(unknowns), materials)
+        return nodes, shares(rays, *nodes)
+
     def residuals(unknowns: np.ndarray) -> np.ndarray:
-        nodes = _unpack(unknowns, materials)
-        return np.concatenate([projection(rays, *nodes) - target, nodes[1] @ np.exp(nodes[0]) / slope - 1.0])
+        nodes, (value, _) = at(unknowns.tobytes())
+        return np.concatenate([value - target, nodes[1] @ np.exp(nodes[0]) / slope - 1.0])
 
     def jacobian(unknowns: np.ndarray) -> np.ndarray:
-        nodes = _unpack(unknowns, materials)
-        return np.concatenate([_ray_rows(rays, *nodes), _slope_rows(slope, *nodes)])
+        nodes, (_, share) = at(unknowns.tobytes())
+        return np.concatenate([_ray_rows(rays, share, *nodes), _slope_rows(slope, *nodes)])
 
     solution = least_squares(residuals, _pack(*start), jacobian, method="lm", max_nfev=_MAX_EVALUATIONS)
     return _unpack(solution.x, materials)
@@ -79,9 +87,10 @@ def _unpack(unknowns: np.ndarray, materials: int) -> Nodes:
     return log_weights, np.exp(unknowns[count - 1 :].reshape(materials, count))
 
 
-def _ray_rows(rays: np.ndarray, log_weights: np.ndarray, attenuation: np.ndarray) -> np.ndarray:
+def _ray_rows(
+    rays: np.ndarray, share: np.ndarray, log_weights: np.ndarray, attenuation: np.ndarray
+) -> np.ndarray:
     """Derivatives of ``P`` along each ray by the unknowns, ``(rays, (k + 1) count - 1)``."""
-    share = shares(rays, log_weights, attenuation)[1]
     by_weight = np.exp(log_weights)[:, None] - share
     by_curve = share * rays[:, None] * attenuation[:, :, None]
     return np.concatenate([by_weight[1:], by_curve.reshape(-1, rays.shape[1])]).T
