@@ -52,7 +52,8 @@ def detector_views(geometry: Geometry, planar: bool) -> DetectorViews:
     cone = geometry.beam == "cone"
     direction = geometry.corner - geometry.origin if cone else geometry.origin
     matrix = np.stack([geometry.u, geometry.v, direction], axis=2)
-    origin = geometry.origin if cone else geometry.corner
+    # A geometry's arrays are read-only, which kernels would be compiled for once more.
+    origin = np.array(geometry.origin if cone else geometry.corner)
     return DetectorViews(cone, origin, matrix, geometry.rows, geometry.columns, planar)
 
 

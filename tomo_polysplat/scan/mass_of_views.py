@@ -71,7 +71,9 @@ def hardening_shown(values: Any, geometry: Geometry, spectrum: Spectrum) -> Hard
     rows = evenly_spread(geometry.rows, _ROWS)
     some = np.asarray(values[:, rows], dtype=np.float64).copy()
     flat = some.reshape(-1, geometry.columns)
-    fill_rows_in_place(flat, np.isfinite(flat))
+    finite = np.isfinite(flat)
+    if not finite.all():
+        fill_rows_in_place(flat, finite)
     edges = np.abs(np.median(some[:, :, [0, -1]], axis=0))
     if not edges.max() < _EDGE * some.max():
         return None

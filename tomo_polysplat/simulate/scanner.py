@@ -32,7 +32,8 @@ def transmission(areal: np.ndarray, attenuation: np.ndarray, weights: np.ndarray
     (...) float64
     """
     passed = np.empty(areal.shape[:-1])
-    _transmit(areal.reshape(-1, areal.shape[-1]), attenuation, weights, passed.reshape(-1))
+    # A spectrum's weights are read-only, which `_transmit` would be compiled for once more.
+    _transmit(areal.reshape(-1, areal.shape[-1]), attenuation, np.array(weights), passed.reshape(-1))
     return passed
 
 
