@@ -24,6 +24,8 @@ def pytest_configure(config):
         # Workers share the cores; threads of one would wait for those of the other. They are told before they begin:
         # numpy and torch read it when they are imported, and another package's plugin may import numpy first.
         os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // workers)))
+        # Each process that a test starts would compile the package again, for 0.8 s.
+        os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     # A background job of a shell inherits an ignored Ctrl-C, which tests of interruptions would wait for in vain.
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
