@@ -12,6 +12,7 @@ from docs_examples import DOCS
 from planned import ball, plan, problem, why
 
 from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.plan import first_volume as first_volumes
 from tomo_polysplat.plan.answer import Status
 from tomo_polysplat.plan.decision import Known
 from tomo_polysplat.plan.first_volume import first_volume
@@ -211,6 +212,20 @@ def test_metal_is_seen_in_a_start_and_noise_is_not_taken_for_it(views, photons):
         of = Problem.of(values, *from_astra(scan.proj_geom, scan.vol_geom), "cm", scan.spectrum, None)
         start, _ = first_volume(of, torch.device("cpu"), Settings())
         assert plan(of, start).curves == curves, (metal, why(plan(of, start), "curves"))
+
+
+@pytest.mark.parametrize(("times", "solid"), [(1, False), (4, True)])
+def test_the_first_volume_is_the_same_where_the_rays_are_made_anew_to_bridge_metal(times, solid, monkeypatch):
+    """As a GPU does; four times as dense the object is looked at as one solid, and its metal is bridged."""
+    scan = simulate_scan("pins", 20, 60)
+    values, _, _ = usable_rays(scan.projections * np.float32(times), scan.proj_geom, scan.valid)
+    of = Problem.of(values, *from_astra(scan.proj_geom, scan.vol_geom), "cm", scan.spectrum, None)
+    kept, words = first_volume(of, torch.device("cpu"), Settings())
+    assert (of.solid, "metal bridged, which" in words) == (solid, solid)
+    made = first_volumes._of_one_material
+    monkeypatch.setattr(first_volumes, "_of_one_material", lambda *scan: (*made(*scan)[:2], None))
+    anew, _ = first_volume(of, torch.device("cpu"), Settings())
+    assert torch.equal(anew, kept)
 
 
 def test_a_corner_that_is_asked_for_is_taken():

@@ -41,20 +41,21 @@ def first_volume(problem: Problem, device: torch.device, settings: Settings) -> 
 
 def _made(problem: Problem, device: torch.device, settings: Settings) -> tuple[torch.Tensor, str]:
     """The same where it was made."""
-    values = _as_if_soft(problem, device)
-    volume, done = initial_volume_on(values, problem.geometry, problem.grid, device)
+    solid: float | None = None
+    volume, done, values = _of_one_material(solid, problem, device)
     reference = soft_reference(_looked_at(volume, device), problem, settings)
     problem.remember_solid(reference.value != reference.first)
     soft = coarse(volume) if problem.solid else None
     for _ in range(_TIMES if problem.solid else 0):
         # There may be no room for either beside what takes its place.
         del values, volume
-        values = _as_if_solid(problem, device, reference.number)
-        volume, done = initial_volume_on(values, problem.geometry, problem.grid, device)
+        solid = reference.number
+        volume, done, values = _of_one_material(solid, problem, device)
         reference = soft_reference(_looked_at(volume, device), problem, settings, problem.solid)
     if soft is not None:
         problem.remember_solid(problem.solid, hardening_of(soft, coarse(volume)))
     metal = reference.adapted(settings).metal_level * problem.depth * reference.value
+    values = _as_if(solid, problem, device) if values is None else values
     if not values.is_cuda:
         volume = volume.cpu()
     spare = values is not problem.measured(device)
@@ -68,6 +69,23 @@ def _made(problem: Problem, device: torch.device, settings: Settings) -> tuple[t
 def _looked_at(volume: torch.Tensor, device: torch.device) -> torch.Tensor:
     """The volume where there is room for what looks at it: on the host if need be."""
     return volume if start_stays(volume.numel(), device) else volume.cpu()
+
+
+def _of_one_material(
+    solid: float | None, problem: Problem, device: torch.device
+) -> tuple[torch.Tensor, dict[str, str], torch.Tensor | None]:
+    """The volume of rays that are taken for one material's, how it was made, and these rays.
+
+    On a GPU there may be no room for the rays beside what looks at the volume: they are made anew where needed.
+    """
+    values = _as_if(solid, problem, device)
+    volume, done = initial_volume_on(values, problem.geometry, problem.grid, device)
+    return volume, done, None if values.is_cuda else values
+
+
+def _as_if(solid: float | None, problem: Problem, device: torch.device) -> torch.Tensor:
+    """Line integrals, were the object all of the first material, or of a ``solid`` of this material number."""
+    return _as_if_soft(problem, device) if solid is None else _as_if_solid(problem, device, solid)
 
 
 def _as_if_soft(problem: Problem, device: torch.device) -> torch.Tensor:
