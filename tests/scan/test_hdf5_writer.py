@@ -58,3 +58,15 @@ def test_a_file_holds_the_zeros_that_were_not_written(tmp_path, monkeypatch, wri
         for name in ("slabs", "whole"):
             np.testing.assert_array_equal(file[name][:], values)
         assert not file["none"][:].any() and file.attrs["words"] == "to the end"
+
+
+def test_zeros_behind_an_end_that_moved_back_are_written(tmp_path, written):
+    """HDF5 may cut a file and let it grow again: what was there is not what is to be there."""
+    with open(tmp_path / "v", "w+b", buffering=0) as file:
+        patient = hdf5_writer._PatientFile(file.fileno())
+        patient.write(b"\1" * 3 * BLOCK)
+        patient.truncate(BLOCK)
+        patient.seek(BLOCK)
+        patient.write(bytes(2 * BLOCK))
+        patient.finish()
+    assert (tmp_path / "v").read_bytes() == b"\1" * BLOCK + bytes(2 * BLOCK)

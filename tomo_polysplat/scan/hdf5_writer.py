@@ -84,6 +84,8 @@ class _PatientFile:
     def __init__(self, file: int) -> None:
         self.error: Exception | None = None
         self._file, self._at, self._end = file, 0, 0
+        # Behind this nothing was ever written; the end may have moved back from there.
+        self._touched = 0
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
         start = {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: self._end}[whence]
@@ -111,13 +113,12 @@ class _PatientFile:
     def write(self, data: Any) -> int:
         view = memoryview(data).cast("B")
         try:
-            # What lies behind all that was ever written is zeros.
-            for first, last in _lit(view) if self._at >= self._end else [(0, len(view))]:
+            for first, last in _lit(view) if self._at >= self._touched else [(0, len(view))]:
                 self._put(view[first:last], self._at + first)
         except OSError as error:
             self.error = _too_full(error, self._at + len(view)) if error.errno in _FULL else error
         self._at += len(view)
-        self._end = max(self._end, self._at)
+        self._end, self._touched = max(self._end, self._at), max(self._touched, self._at)
         return len(view)
 
     def _put(self, view: memoryview, at: int) -> None:
