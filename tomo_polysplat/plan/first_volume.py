@@ -58,7 +58,7 @@ def _made(problem: Problem, device: torch.device, settings: Settings) -> tuple[t
     values = _as_if(solid, problem, device) if values is None else values
     if not values.is_cuda:
         volume = volume.cpu()
-    spare = values is not problem.measured(device)
+    spare = _may_change(values, problem, device)
     volume, bridged = bridged_start(
         values, volume, done["method"], problem.geometry, problem.grid, metal=metal, spare=spare
     )
@@ -83,6 +83,11 @@ def _of_one_material(
     return volume, done, None if values.is_cuda else values
 
 
+def _may_change(values: torch.Tensor, problem: Problem, device: torch.device) -> bool:
+    """Whether these rays are nobody else's, so that they may be overwritten."""
+    return values is not problem.measured(device)
+
+
 def _as_if(solid: float | None, problem: Problem, device: torch.device) -> torch.Tensor:
     """Line integrals, were the object all of the first material, or of a ``solid`` of this material number."""
     return _as_if_soft(problem, device) if solid is None else _as_if_solid(problem, device, solid)
@@ -93,7 +98,7 @@ def _as_if_soft(problem: Problem, device: torch.device) -> torch.Tensor:
     primary = problem.primary(device)
     if problem.spectrum is None or problem.materials is None:
         return primary
-    spare = primary is not problem.measured(device)
+    spare = _may_change(primary, problem, device)
     return areal_density(primary, problem.spectrum, problem.materials.soft, spare=spare)
 
 
@@ -103,5 +108,5 @@ def _as_if_solid(problem: Problem, device: torch.device, number: float) -> torch
     primary, solid = problem.primary(device), problem.materials.mixed(max(number, 0.0))
     energy = transmitted_energy(primary, problem.spectrum)
     ratio = mass_attenuation(solid, energy) / mass_attenuation(problem.materials.soft, energy)
-    spare = primary is not problem.measured(device)
+    spare = _may_change(primary, problem, device)
     return areal_density(primary, problem.spectrum, solid, spare=spare).mul_(float(ratio))
