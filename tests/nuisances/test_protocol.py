@@ -93,6 +93,17 @@ def test_few_dark_rays_do_not_outweigh_all_others_where_the_beam_explains_these(
     assert not OpenBeam.gate(far | {"held_out_after": 0.75}).kept
 
 
+@pytest.mark.parametrize(("rays", "share", "tell"), [(23, 0.1, False), (23, 0.3, True), (400, 0.1, True)])
+def test_dark_rays_tell_where_scatter_in_them_would_stand_out_of_their_noise(rays, share, tell):
+    told = {"darkest_rays": rays, "darkest_share": share}
+    scatter = ERRORS | DARKEST | told | {"held_out_rival": 0.9, "darkest_rival": 1.4}
+    assert ScatteredLight.gate(scatter).kept is tell
+    # A brighter beam is not refused for what few rays with much light make of it.
+    assert OpenBeam.gate(ERRORS | DARKEST | told | {"darkest_after": 1.5}).kept is not tell
+    beam = scatter | {"darkest_after": 1.0}
+    assert more_likely(scatter | {"held_out_after": 0.8}, beam) == ("scatter" if tell else "beam")
+
+
 def test_rays_darker_than_scatter_exclude_it():
     assert ScatteredLight.gate(ERRORS | {"darker": 7, "rays": 1000}).kept
     assert not ScatteredLight.gate(ERRORS | {"darker": 8, "rays": 1000}).kept

@@ -33,12 +33,13 @@ def fan(scatter, views=40):
 
 
 def of_fit(fitted, error, *, darkest=None, density=1.0, cut=False):
-    """A short fit that left such errors, with one ray."""
-    rays = RaySample(np.zeros((3, 1)), *np.zeros((5, 1)))
+    """A short fit that left such errors, with one ray besides some dark ones, of which scatter would be a part."""
+    rays, dark = RaySample(np.zeros((3, 1)), *np.zeros((5, 1))), np.full(400, 3.0)
     return ShortFit(
         fitted,
         error,
         error if darkest is None else darkest,
+        dark,
         density,
         rays,
         fitted.get("scatter", 0.0),

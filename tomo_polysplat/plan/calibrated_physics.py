@@ -87,9 +87,10 @@ def judge_scatter(
     """The best of the fits with scatter, or with a brighter beam, where the rays tell that it is."""
     kinds = [[fit for fit in stage if name in fit.fitted] for name in ("scatter", "beam")]
     best = [min(fits, key=lambda fit: fit.held_out) for fits in kinds if fits]
+    share = max(before.share_of_darkest(ScatteredLight.of(fit.fitted)) for fit in best)
     rivals, not_taken = list(best), []
     for fit in best:
-        evidence = _evidence(before, fit, suspected, [rival for rival in rivals if rival is not fit])
+        evidence = _evidence(before, fit, suspected, share, [rival for rival in rivals if rival is not fit])
         verdict = _kind(fit).gate(evidence)
         if verdict.kept:
             return fit, f"{describe_scatter(fit.fitted)}, accepted: {_in_words(before, fit)}"
@@ -97,15 +98,15 @@ def judge_scatter(
         not_taken.append(f"{words}: {_in_words(before, fit)}")
         if not ScatteredLight.possible(evidence):
             rivals.remove(fit)
-    likelier = _likelier(before, rivals) if suspected else None
+    likelier = _likelier(before, rivals, share) if suspected else None
     if likelier is not None:
         return likelier, f"{describe_scatter(likelier.fitted)}, the likelier: {_in_words(before, likelier)}"
     return None, "; ".join(not_taken)
 
 
-def _likelier(before: ShortFit, fits: Sequence[ShortFit]) -> ShortFit | None:
+def _likelier(before: ShortFit, fits: Sequence[ShortFit], share: float) -> ShortFit | None:
     """What is taken of scatter and a brighter beam where neither beats the other; None where none beats neither."""
-    alone = [_evidence(before, fit, True, []) for fit in fits]
+    alone = [_evidence(before, fit, True, share, []) for fit in fits]
     kept = [fit for fit, evidence in zip(fits, alone) if _kind(fit).gate(evidence).kept]
     if len(fits) == 2 and any("beam" in fit.fitted for fit in kept):
         likely = more_likely(*alone)
@@ -128,13 +129,17 @@ def _errors(before: ShortFit, fit: ShortFit) -> dict[str, float]:
 
 
 def _evidence(
-    before: ShortFit, fit: ShortFit, suspected: bool, rivals: Sequence[ShortFit]
+    before: ShortFit, fit: ShortFit, suspected: bool, share: float, rivals: Sequence[ShortFit]
 ) -> dict[str, float]:
-    """What a gate asks for; where nobody has told of scatter, the darkest rays and a fit by what looks alike, too."""
+    """What a gate asks for; where nobody has told of scatter, the darkest rays and a fit by what looks alike, too.
+
+    ``share`` is how much of the light of the darkest rays would be scatter.
+    """
     numbers = _errors(before, fit)
     if not suspected:
         return numbers
     numbers |= {"darkest_before": before.darkest, "darkest_after": fit.darkest}
+    numbers |= {"darkest_rays": float(len(before.darkest_rays)), "darkest_share": share}
     if "scatter" in fit.fitted:
         darker = before.rays.darker_than(ScatteredLight.of(fit.fitted))
         numbers |= {"darker": darker, "rays": len(before.rays.measured)}

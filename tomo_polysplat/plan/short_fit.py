@@ -13,10 +13,12 @@ import torch
 from scipy import ndimage
 
 from tomo_polysplat.fit.loss import misfit
+from tomo_polysplat.fit.optimise import FitOutcome
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.rays import Rays, batches_around
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
+from tomo_polysplat.physics.scatter import Scatter
 from tomo_polysplat.plan.depth import weights_by_depth
 from tomo_polysplat.plan.first_gaussians import first_gaussians
 from tomo_polysplat.plan.fit_options import FitOptions
@@ -53,6 +55,8 @@ class ShortFit:
         Misfit of the held-out rays, or of the fitted ones where there are too few.
     darkest : float
         Misfit of the rays with the least light.
+    darkest_rays : array
+        The P of each of these.
     soft_density : float or None
         Density in g/cm3 of what most of the object is made of besides metal, were it the first material; 0 where that
         is too thin, None where it was not asked for.
@@ -67,10 +71,18 @@ class ShortFit:
     fitted: dict[str, float]
     held_out: float
     darkest: float
+    darkest_rays: np.ndarray
     soft_density: float | None
     rays: RaySample
     scatter_level: float
     cut: bool = False
+
+    def share_of_darkest(self, scatter: Scatter) -> float:
+        """How much of the light of the darkest rays this scatter would be, at least 0 and at most 1."""
+        light = torch.exp(-torch.as_tensor(self.darkest_rays, dtype=torch.float64))
+        total = float(light.sum())
+        # What is around a dark ray is taken for as dark.
+        return min(max(float(scatter.at(light).sum()) / total, 0.0), 1.0) if total else 0.0
 
     def record(self) -> dict[str, float]:
         """Its numbers, for the plan."""
@@ -78,6 +90,7 @@ class ShortFit:
         return numbers if self.soft_density is None else numbers | {"soft_density": self.soft_density}
 
 
+# The scan and its start, and by what one question's fits differ from another's.
 def short_fit(
     problem: Problem,
     start: torch.Tensor,
@@ -86,6 +99,7 @@ def short_fit(
     fewest_steps: int = _FEWEST_STEPS,
     *,
     density: bool = False,
+    held_out: float = 0.0,
 ) -> ShortFit:
     """Two passes over the views, or more where they are few.
 
@@ -103,6 +117,9 @@ def short_fit(
         Steps of the optimiser at least.
     density : bool
         Whether the density of the main matter is to be told.
+    held_out : float
+        Share of the rays held out at least, to be looked at after the fit. By default those of the settings are
+        looked at, on the way.
 
     Raises
     ------
@@ -114,22 +131,31 @@ def short_fit(
     plan = plan_from_start(start, problem, replace(settings, curves=3), device)
     passes = max(_PASSES, fewest_steps * views_of_short_steps(plan, problem) / problem.geometry.views)
     # The soft matter stays what it was said to be: calibration asks what else could explain the rays.
-    short = replace(settings, passes=min(passes, plan.passes), soft_gain=0.0)
+    aside = max(settings.held_out, held_out)
+    short = replace(settings, passes=min(passes, plan.passes), soft_gain=0.0, held_out=aside)
     scene, rays = scene_of(problem, plan, short, device), rays_of(problem, plan, short, device)
     seeds, _ = first_gaussians(start, plan, problem, short, device)
     short = replace(short, tv_weight=weights_by_depth(plan.depth, rays)[0] * settings.tv_weight)
     outcome = fitted_shortly(seeds, plan, problem, scene, rays, replace(options, settings=short))
-    main = None
     with torch.no_grad():
-        if density:
-            volume = scene.volume(outcome.gaussians).cpu().numpy() * plan.reference
-            main = main_density(volume, settings.metal_level * plan.reference)
+        main = _main_density_of(outcome, scene, plan.reference, settings) if density else None
         sample = sample_rays(outcome.gaussians, scene, rays, options.seed)
-        darkest = _darkest(outcome.gaussians, scene, rays, short)
-    errors = [entry["held_out"] or entry["loss"] for entry in outcome.history] or [np.inf]
+        after, darkest, darkest_rays = _left(outcome.gaussians, scene, rays, short)
     level = problem.scatter_level(device)
     cut = outcome.stop is not None and outcome.stop.by_time
-    return ShortFit(fitted, float(min(errors)), darkest, main, sample, level, cut=cut)
+    left = after if held_out else _least_on_the_way(outcome)
+    return ShortFit(fitted, left, darkest, darkest_rays, main, sample, level, cut=cut)
+
+
+def _main_density_of(outcome: FitOutcome, scene: FitScene, reference: float, settings: Settings) -> float:
+    volume = scene.volume(outcome.gaussians).cpu().numpy() * reference
+    return main_density(volume, settings.metal_level * reference)
+
+
+def _least_on_the_way(outcome: FitOutcome) -> float:
+    """The least misfit of the held-out rays, or of the fitted ones where there are too few."""
+    errors = [entry["held_out"] or entry["loss"] for entry in outcome.history] or [np.inf]
+    return float(min(errors))
 
 
 def main_density(density: np.ndarray, metal: float = math.inf) -> float:
@@ -156,15 +182,18 @@ def main_density(density: np.ndarray, metal: float = math.inf) -> float:
     return float(inside[first : first + width].mean())
 
 
-def _darkest(gaussians: Gaussians, scene: FitScene, rays: Rays, settings: Settings) -> float:
-    """Mean misfit of the rays with the least light."""
+def _left(
+    gaussians: Gaussians, scene: FitScene, rays: Rays, settings: Settings
+) -> tuple[float, float, np.ndarray]:
+    """Mean misfit of the held-out rays, and of those with the least light, whose P it tells; in views all around."""
     parts: list[list[torch.Tensor]] = []
     for views, measured, weight, aside in batches_around(rays):
         predicted, _ = scene.projections(gaussians, views)
         used = (weight + aside) > 0
-        parts.append([values[used] for values in (predicted, measured, weight + aside)])
-    predicted, measured, weight = (torch.cat(part) for part in zip(*parts))
+        parts.append([values[used] for values in (predicted, measured, weight, aside)])
+    predicted, measured, weight, aside = (torch.cat(part) for part in zip(*parts))
     if not len(measured):
-        return 0.0
+        return 0.0, 0.0, np.zeros(0, np.float32)
     chosen = measured.topk(max(1, round(_DARKEST * len(measured)))).indices
-    return float(misfit(predicted[chosen], measured[chosen], weight[chosen], settings))
+    darkest = misfit(predicted[chosen], measured[chosen], (weight + aside)[chosen], settings)
+    return float(misfit(predicted, measured, aside, settings)), float(darkest), measured[chosen].cpu().numpy()

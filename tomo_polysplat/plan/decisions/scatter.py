@@ -31,8 +31,8 @@ logger = logging.getLogger(__name__)
 _FROM, _RAYS = 0.3, 8000
 # Rays of a view beside the object that tell its light, and views that tell a drift.
 _FEWEST_RAYS, _FEWEST_VIEWS = 10, 5
-# Steps of the short fits that follow.
-_SHORT = 480
+# Steps of the short fits that follow, of a volume and of one slice.
+_SHORT, _SHORT_PLANAR = 480, 1920
 
 
 class Scattering(Decision):
@@ -69,7 +69,8 @@ class Scattering(Decision):
         """The rays in the middle of the run; where they show some, short fits, and the run begins anew with it."""
         run = lab.run
         assert run is not None
-        if not run.clock.room_for(_SHORT + run.clock.steps):
+        short = _SHORT_PLANAR if lab.problem.planar else _SHORT
+        if not run.clock.room_for(short + run.clock.steps):
             raise Untold("the time budget is kept for the fit")
         fitter = run.fitter
         rays = sample_rays(fitter.gaussians, fitter.scene, fitter.rays, 0, _RAYS)
