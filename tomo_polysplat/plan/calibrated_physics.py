@@ -88,7 +88,9 @@ def judge_scatter(
     kinds = [[fit for fit in stage if name in fit.fitted] for name in ("scatter", "beam")]
     best = [min(fits, key=lambda fit: fit.held_out) for fits in kinds if fits]
     share = max(before.share_of_darkest(ScatteredLight.of(fit.fitted)) for fit in best)
-    rivals, not_taken = list(best), []
+    # Beside the object the rays show how bright the beam is: where that is as the open field, so is what looks alike.
+    bright = any("beam" in fit.fitted for fit in best)
+    rivals, not_taken = list(best) if bright else [*best, before], []
     for fit in best:
         evidence = _evidence(before, fit, suspected, share, [rival for rival in rivals if rival is not fit])
         verdict = _kind(fit).gate(evidence)
@@ -98,7 +100,7 @@ def judge_scatter(
         not_taken.append(f"{words}: {_in_words(before, fit)}")
         if not ScatteredLight.possible(evidence):
             rivals.remove(fit)
-    likelier = _likelier(before, rivals, share) if suspected else None
+    likelier = _likelier(before, rivals, share) if suspected and bright else None
     if likelier is not None:
         return likelier, f"{describe_scatter(likelier.fitted)}, the likelier: {_in_words(before, likelier)}"
     return None, "; ".join(not_taken)
