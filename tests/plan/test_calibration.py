@@ -64,6 +64,19 @@ def test_rays_darker_than_scatter_speak_against_it_where_noise_does_not_explain_
         assert chosen is stage[taken]
 
 
+@pytest.mark.parametrize(
+    ("error", "darkest", "taken"),
+    [(0.85, 0.98, False), (0.85, 0.94, True), (0.6, 0.99, True), (0.6, 1.01, False)],
+)
+def test_scatter_that_does_not_show_beside_the_object_has_to_beat_the_fit_without_it(error, darkest, taken):
+    """Errors of the model, as of too few voxels, look like scatter that is behind the object alone."""
+    problem, stage = problem_of(fan(0.0), SPECTRUM), [of_fit({"scatter": 0.03}, error, darkest=darkest)]
+    for suspected in (True, False):
+        wanted = Calibration(("scatter",), None, suspected=suspected)
+        chosen, _ = _judge("scatter", of_fit({}, 1.0), stage, problem, wanted)
+        assert (chosen is stage[0]) == (taken or not suspected)
+
+
 def problem_of(scan, spectrum):
     return Problem.of(scan.projections.swapaxes(0, 1), *geometries(scan), "cm", spectrum, None)
 

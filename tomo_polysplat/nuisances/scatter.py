@@ -43,10 +43,10 @@ class ScatteredLight(Nuisance):
 
     @classmethod
     def gate(cls, evidence: Mapping[str, float]) -> Verdict:
-        """The held-out rays fit 3 % better. Unasked, the darkest do as well, and better than a beam explains."""
+        """The held-out rays fit 3 % better. Unasked, the darkest do so too, and better than the beam alone explains."""
         if not cls.possible(evidence):
             return Verdict(False, f"{evidence['darker']:.0f} of {evidence['rays']:.0f} rays have less light")
-        return light_gate(evidence, rival="a brighter beam")
+        return light_gate(evidence, rival="the beam that rays beside the object show")
 
     @classmethod
     def suspected(cls, evidence: Mapping[str, float]) -> Verdict:

@@ -88,7 +88,7 @@ def judge_scatter(
     kinds = [[fit for fit in stage if name in fit.fitted] for name in ("scatter", "beam")]
     best = [min(fits, key=lambda fit: fit.held_out) for fits in kinds if fits]
     share = max(before.share_of_darkest(ScatteredLight.of(fit.fitted)) for fit in best)
-    # Beside the object the rays show how bright the beam is: where that is as the open field, so is what looks alike.
+    # The rays beside the object show the beam that looks alike. Where it is the open field, that is the fit without.
     bright = any("beam" in fit.fitted for fit in best)
     rivals, not_taken = list(best) if bright else [*best, before], []
     for fit in best:
