@@ -79,6 +79,19 @@ def test_a_column_without_light_on_the_axis_that_has_no_edges_is_dead(columns):
     np.testing.assert_array_equal(stuck_pixels(values, axis=11.0), wanted)
 
 
+def test_a_pixel_without_light_in_air_is_dead_whatever_is_dead_elsewhere():
+    """Nothing changes beside it. An opaque ring shows on the other side at the same height, dead pixels hardly."""
+    random = np.random.default_rng(3)
+    values = np.repeat(scan(), 5, axis=1)
+    values += 0.01 * random.standard_normal(values.shape).astype(np.float32)
+    wanted = np.zeros(values.shape[1:], bool)
+    wanted[[2, 12], [1, 21]] = True
+    values[:, wanted] = 14.0
+    np.testing.assert_array_equal(stuck_pixels(values, axis=11.0), wanted)
+    values[:, [2, 12], [21, 1]] = 14.0  # Now each shows on both sides.
+    assert not stuck_pixels(values, axis=11.0).any()
+
+
 def test_what_lies_between_air_and_where_things_change_is_left():
     """Without noise the rim of a disc is constant, beside air that is 0, until something turns in its shadow."""
     values = scan(0.0)

@@ -26,6 +26,8 @@ _CHANGES, _WORKING = 0.1, 0.6
 _OPAQUE, _DARK_AROUND = 0.98, 0.6
 # Share of a pixel that the edge of an opaque body covers: it rarely ends between two pixels on both of its sides.
 _EDGE = 0.1
+# Rows, for each column between both sides of the axis, by which one lies higher if the detector is rolled by 3 degrees.
+_ROLLED = 0.05
 _AROUND = np.ones((3, 3), bool)
 
 
@@ -102,12 +104,13 @@ def _among_working(values: np.ndarray, held: np.ndarray, same: np.ndarray, axis:
             changes = np.fmax.reduce(beside, axis=0) - np.fmin.reduce(beside, axis=0)
             usual = np.nanmedian(beside, axis=0)
             apart = float(np.nanmax(changes, initial=0.0))
-            if value < _OPAQUE * largest:
-                apart = max(apart, float(np.nanmax(np.abs(value - usual))))
-            elif np.nanmedian(usual) > _DARK_AROUND * value:
+            if value >= _OPAQUE * largest and np.nanmedian(usual) > _DARK_AROUND * value:
                 continue
-            no_body = value < _OPAQUE * largest or _beside(told, box[1], axis) or _sharp(values, *box)
-            most = working if no_body else largest
+            # Where no body can be, to be far from what is beside is enough, though nothing changes there, as in air.
+            no_body = value < _OPAQUE * largest or _beside(told, box[0], box[1], axis)
+            if no_body:
+                apart = max(apart, float(np.nanmax(np.abs(value - usual))))
+            most = working if no_body or _sharp(values, *box) else largest
             stuck[wider] |= area & (apart > _CHANGES * most)
     return stuck
 
@@ -127,8 +130,8 @@ def _sharp(values: np.ndarray, rows: slice, columns: slice) -> bool:
     return len(sides) > 0 and all(sides)
 
 
-def _beside(told: np.ndarray, place: slice, axis: float | None) -> bool:
-    """Whether columns are off the axis, and those as far on the other side of it are none of the pixels told of.
+def _beside(told: np.ndarray, rows: slice, place: slice, axis: float | None) -> bool:
+    """Whether an area is off the axis, and as far on the other side of it, as high, are none of the pixels told of.
 
     An opaque body that looks the same from all around is round about the axis, so it shows on both sides of it.
     """
@@ -138,5 +141,6 @@ def _beside(told: np.ndarray, place: slice, axis: float | None) -> bool:
     if place.start - doubt <= axis <= place.stop - 1 + doubt:
         return False
     first, last = 2 * axis - (place.stop - 1) - 2 * doubt, 2 * axis - place.start + 2 * doubt
-    across = told[:, max(0, math.floor(first)) : max(0, min(columns, math.ceil(last) + 1))].copy()
-    return not across.any()
+    rolled = 1 + math.ceil(_ROLLED * (max(last, place.stop) - min(first, place.start)))
+    level = slice(max(0, rows.start - rolled), rows.stop + rolled)
+    return not told[level, max(0, math.floor(first)) : max(0, min(columns, math.ceil(last) + 1))].any()
