@@ -67,11 +67,16 @@ def initial_volume_on(
         return torch.from_numpy(np.ascontiguousarray(found)).to(projections.device), done
     # In parts: to add up what is true takes 8 bytes a ray.
     invalid = sum(int((~torch.isfinite(part)).sum()) for part in projections.reshape(-1).split(_COUNTED))
-    _log.info("Start from FDK: %s; %d invalid pixels.", reason, invalid)
+    _tell("fdk", reason, invalid, projections.numel())
     beyond, near = _beyond_sources(geometry, grid)
     if beyond is not None:
         volume[torch.from_numpy(beyond.copy()).to(volume.device)] = 0.0
     return volume, {"method": "fdk", "reason": reason + near, "invalid_pixels": invalid}
+
+
+def _tell(method: str, reason: str, invalid: int, rays: int) -> None:
+    left_out = f"; {invalid / rays:.2g} of the rays are left out" if invalid else ""
+    _log.info("A first volume by %s: %s%s.", method.upper(), reason, left_out)
 
 
 def _method(geometry: Geometry, grid: VolumeGrid) -> tuple[bool, str]:
@@ -136,7 +141,7 @@ def initial_volume(
             fits, reason = False, f"filtered backprojection is not finite ({reason})"
             _log.warning("The start is made by SIRT: %s.", reason)
     method = "fdk" if fits else "sirt"
-    _log.info("Start from %s: %s; %d invalid pixels.", method.upper(), reason, invalid)
+    _tell(method, reason, invalid, projections.size)
     if volume is None or not fits:
         volume = _finite(_sirt_start(np.where(usable, projections, np.nan), geometry, grid))
     beyond, near = _beyond_sources(geometry, grid)
