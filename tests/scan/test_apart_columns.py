@@ -41,6 +41,12 @@ def test_an_object_makes_no_column_apart(photons):
     assert asked(scan(photons) + gains) == ([], [])
 
 
+@pytest.mark.parametrize("values", [0.1 * scan() - np.log(2), -scan() - 0.1], ids=["dark flats", "sign"])
+def test_of_rays_brighter_than_the_open_field_no_column_is_told(values):
+    assert np.percentile(values, 99) <= 0
+    assert asked(values) == ([], [])
+
+
 @pytest.mark.parametrize("column", [4, 20, 22, 33])
 def test_noise_is_found_wherever_it_lies(column):
     values = scan()

@@ -44,7 +44,7 @@ def apart_columns(
     values : (rows, views, columns) array
         -log(I/I0); not finite where there is none.
     level : float
-        What counts as large among them.
+        What counts as large among them; where it is not positive, no column is told of.
     axis : float
         Column on which the axis of rotation falls.
     azimuth : (views,) array
@@ -56,7 +56,8 @@ def apart_columns(
     """
     rows, views, columns = values.shape
     bad, doubtful = np.zeros((2, columns), bool)
-    if columns < _FEWEST_COLUMNS or views < _FEWEST_VIEWS:
+    # Where most rays are brighter than the open field, nothing tells how far from the others a column may be.
+    if columns < _FEWEST_COLUMNS or views < _FEWEST_VIEWS or not level > 0:
         return bad, doubtful
     # Values of which a hundredth is more than that are no -log(I/I0).
     limit = max(_LIMIT * min(level, 1.0), 0.01 * level) * (1 if rows > 2 else _FEW_ROWS)
