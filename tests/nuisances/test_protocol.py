@@ -104,6 +104,11 @@ def test_dark_rays_tell_where_scatter_in_them_would_stand_out_of_their_noise(ray
     assert more_likely(scatter | {"held_out_after": 0.8}, beam) == ("scatter" if tell else "beam")
 
 
+def test_a_rival_that_explains_the_darkest_rays_wholly_is_not_beaten():
+    rival = ERRORS | DARKEST | {"held_out_rival": 0.9, "darkest_rival": 0.0}
+    assert not ScatteredLight.gate(rival).kept
+
+
 def test_rays_darker_than_scatter_exclude_it():
     assert ScatteredLight.gate(ERRORS | {"darker": 7, "rays": 1000}).kept
     assert not ScatteredLight.gate(ERRORS | {"darker": 8, "rays": 1000}).kept

@@ -52,10 +52,10 @@ def light_gate(evidence: Mapping[str, float], rival: str, *, darkest_margin: boo
 def _as_good(evidence: Mapping[str, float]) -> bool:
     """Whether it explains the rays as well as the rival, and the darkest better, or all of them far better."""
     held_out, rival = evidence["held_out_after"], evidence["held_out_rival"]
-    darkest, tell = evidence["darkest_after"] / evidence["darkest_rival"], _darkest_tell(evidence)
+    darkest, of_rival, tell = evidence["darkest_after"], evidence["darkest_rival"], _darkest_tell(evidence)
     if _far_better(evidence, "rival"):
-        return darkest <= 1 or not tell
-    return tell and held_out < (1 + _MARGIN) * rival and darkest < 1 - _DARKER
+        return darkest <= of_rival or not tell
+    return tell and held_out < (1 + _MARGIN) * rival and darkest < (1 - _DARKER) * of_rival
 
 
 def _darkest_tell(evidence: Mapping[str, float]) -> bool:
