@@ -31,7 +31,17 @@ def test_only_a_piece_denser_than_osmium_is_impossible(density, voxels, steel, t
     reasons = {}
     with caplog.at_level(logging.WARNING):
         tell_impossible(curves(density, voxels, steel), reasons)
-    assert ("lengths" in reasons) == told == ("unit of length or the size of a pixel" in caplog.text)
+    assert ("lengths" in reasons) == told == ("What the metal is looks wrong: " in caplog.text)
+
+
+@pytest.mark.parametrize("times, lightless", [(1, 0.0), (1, 0.06), (10, 0.0), (10, 0.06)])
+def test_the_unit_is_doubted_only_where_the_rest_is_too_dense_as_well(times, lightless, caplog):
+    """Lead through an edge of its own, in water; and steel and water in a unit ten times too short."""
+    volume = curves(24.0, 60) if times == 1 else times * curves(7.9, 80)
+    with caplog.at_level(logging.WARNING):
+        tell_impossible(volume, {}, lightless)
+    assert ("unit of length" in caplog.messages[0].partition(":")[0]) == (times == 10)
+    assert ("speaks for the unit" in caplog.text) == (times == 1)
 
 
 def test_rays_without_light_are_named_first(caplog):

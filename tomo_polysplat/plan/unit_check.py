@@ -29,6 +29,9 @@ _VIEWS = 24
 # Of the hardening by a solid of its density, what light matter shows whose density is told ten times too high, if it is
 # even: 0.05 to 0.2. Solids show more.
 _LIGHT = 0.2
+# Light matter has ten times its density where lengths are told ten times too short. If most voxels with matter have
+# less than this, in g/cm3, the lengths are right.
+_LIGHT_MATTER, _MATTER = 4.0, 0.1
 _WRONG_LENGTHS = "The unit of length or the size of a pixel looks wrong"
 
 
@@ -84,19 +87,26 @@ def tell_impossible(curves: np.ndarray, facts: dict[str, Answer], lightless: flo
     """
     if sum(float(curve.max(initial=0.0)) for curve in curves) <= _DENSEST_SOLID:
         return
-    voxels, metal, densest = 0, 0, 0.0
+    voxels, metal, light, matter, densest = 0, 0, 0, 0, 0.0
     for z in range(curves.shape[1]):  # The sum of whole curves would take another volume of memory.
         density = curves[:, z].sum(axis=0)
         voxels += int(np.count_nonzero(density > _DENSEST_SOLID))
         metal += int(np.count_nonzero(density > _METAL))
+        light += int(np.count_nonzero((density > _MATTER) & (density < _LIGHT_MATTER)))
+        matter += int(np.count_nonzero(density > _MATTER))
         densest = max(densest, float(density.max(initial=0.0)))
     if voxels >= max(_FEWEST, _OF_METAL * metal):
         words = f"{voxels} voxels have more than {_DENSEST_SOLID:g} g/cm3, up to {densest:.3g}, which no solid has"
         remedy = (
             "name in materials= what is heavier than their densest or has an absorption edge in the spectrum"
         )
-        what = f"{_WRONG_LENGTHS}, or what the metal is"
+        # An absorption edge, as of lead or tin, makes metal alone too dense.
+        right = 2 * light > matter
+        what = "What the metal is looks wrong" if right else f"{_WRONG_LENGTHS}, or what the metal is"
         if lightless > _LIGHTLESS:
             words += f"; {lightless:.1%} of the rays are opaque or have no value, and tell no density"
-            what = "The density of metal is not told by the rays, or the unit of length is wrong"
+            what = "The density of metal is not told by the rays"
+            what += "" if right else ", or the unit of length is wrong"
+        if right:
+            words += "; most other matter is as light as matter is, which speaks for the unit of length"
         doubt_lengths(facts, f"{words}; {remedy}", what)

@@ -55,4 +55,7 @@ def _as_water(measured: Measured) -> float:
     pixel = float(measured.geometry.pixel_size_at(measured.grid.centre)[0]) * cm_per(measured.scan.unit)
     inside = areal > _OBJECT * np.percentile(areal, 99)
     width = pixel * inside.sum(axis=2).mean(axis=1)
-    return float(np.median(pixel * areal.sum(axis=2).mean(axis=1) / (0.25 * math.pi * width**2)))
+    # Beside metal that hardly any light passes, a slice of light matter alone has no shadow.
+    shown = width > 0
+    mass = pixel * areal.sum(axis=2).mean(axis=1)
+    return float(np.median(mass[shown] / (0.25 * math.pi * width[shown] ** 2)))

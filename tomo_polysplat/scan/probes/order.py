@@ -29,6 +29,8 @@ _NEARER = 0.5
 _FURTHER, _FAR, _ELSEWHERE = 2.5, 0.3, 0.5
 # The share is less where neighbours hardly differ: so many times their median, but not less than the second.
 _TIMES, _LEAST = 10.0, 0.05
+# Two views look along one line if they are off it by less than so many steps from one view to the next.
+_ONE_LINE = 0.75
 # Share of the views that have to stand out in other places, for the order to be right.
 _POWER = 0.2
 
@@ -64,7 +66,7 @@ def probe_order(measured: Measured) -> Finding:
         text = f"of any two views {100 * rank:.0f} % are more alike than those from neighbouring places"
         remedy = "the angles do not belong to the views in this order: check the order of the files"
         return Finding(ORDER, DEFECT, text, remedy, numbers, doubt)
-    wrong = _misplaced(views, squared, near, usual)
+    wrong = _misplaced(views, squared, near, _from_the_other_end(measured.azimuth[chosen], near), usual)
     numbers["misplaced"] = len(wrong) / count
     if len(wrong):
         named = ", ".join(map(str, chosen[wrong[:8]])) + (", ..." if len(wrong) > 8 else "")
@@ -122,16 +124,33 @@ def _two_steps_away(near: np.ndarray) -> np.ndarray:
     return np.where(first == np.arange(len(near)), second, first)
 
 
-def _misplaced(views: Alike, squared: np.ndarray, near: np.ndarray, usual: float) -> np.ndarray:
-    """Views unlike both of their neighbours, which are like each other, and like views from elsewhere."""
+def _from_the_other_end(azimuth: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """(views, views) whether views look at each other along one line, within less than a step."""
+
+    def apart(angle: np.ndarray) -> np.ndarray:
+        return np.abs(np.mod(angle + np.pi, 2 * np.pi) - np.pi)
+
+    step = float(np.median(apart(azimuth - azimuth[near[:, 0]])))
+    return apart(azimuth[:, None] - azimuth + np.pi) < _ONE_LINE * step
+
+
+def _misplaced(
+    views: Alike, squared: np.ndarray, near: np.ndarray, other_end: np.ndarray, usual: float
+) -> np.ndarray:
+    """Views unlike both of their neighbours, which are like each other, and like views from elsewhere.
+
+    A plate seen edge-on is unlike its neighbours too, and like the view from its other end, which is as unlike its own.
+    That one is no evidence: a view that belongs there is like those beside it.
+    """
     own = np.arange(len(near))
     nearer = np.minimum(squared[own, near[:, 0]], squared[own, near[:, 1]])
     elsewhere = squared.copy()
-    elsewhere[own[:, None], near] = elsewhere[own, own] = np.inf
+    elsewhere[own[:, None], near] = elsewhere[own, own] = elsewhere[other_end] = np.inf
     typical = float(np.median(nearer))
-    return np.flatnonzero(
-        _shows(views, nearer, squared[near[:, 0], near[:, 1]], elsewhere.min(axis=1), typical, usual)
-    )
+    shows = _shows(views, nearer, squared[near[:, 0], near[:, 1]], elsewhere.min(axis=1), typical, usual)
+    twins = other_end & (np.maximum(squared, 0) < _ELSEWHERE * nearer[:, None])
+    twins &= nearer > _ELSEWHERE * nearer[:, None]
+    return np.flatnonzero(shows & ~twins.any(axis=1))
 
 
 def _would_show(views: Alike, squared: np.ndarray, near: np.ndarray, usual: float) -> float:
