@@ -116,8 +116,9 @@ def test_rays_darker_than_scatter_exclude_it():
 
 
 def test_scatter_is_suspected_where_the_beam_is_steady():
-    assert ScatteredLight.suspected({"most": 0.02, "drift": 0.003}).kept
-    for evidence in ({"most": 0.003, "drift": 0.0}, {"most": 0.02}, {"most": 0.02, "drift": 0.01}):
+    shown = {"most": 0.02, "left": 0.9}
+    assert ScatteredLight.suspected(shown | {"drift": 0.003}).kept
+    for evidence in (shown | {"left": 0.98, "drift": 0.0}, shown, shown | {"drift": 0.01}):
         assert not ScatteredLight.suspected(evidence).kept
 
 

@@ -7,7 +7,7 @@ import torch
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.beer_lambert import projection
 from tomo_polysplat.physics.quadrature import fit_quadrature
-from tomo_polysplat.physics.ray_estimates import FittedRays, estimate_scatter, matching_factor
+from tomo_polysplat.physics.ray_estimates import FittedRays, estimate_scatter, matching_factor, misfit_left
 from tomo_polysplat.physics.scatter import Scatter, add_scatter, light_around, made_level, without_scatter
 from tomo_polysplat.physics.spectral_change import with_voltage
 from tomo_polysplat.physics.spectrum import Spectrum
@@ -65,6 +65,30 @@ def test_scatter_is_found_although_the_matter_has_taken_some_of_it_up(scatter):
     )
     assert found.varies == scatter.varies
     np.testing.assert_allclose(beside(found, light), beside(scatter, light), atol=1.5e-3)
+
+
+@pytest.mark.parametrize(("scatter", "shows"), [(0.0, False), (0.001, True)])
+@pytest.mark.parametrize("photons", [1e4, 1e6])
+def test_faint_scatter_shows_behind_metal_beyond_the_noise_of_counts(scatter, shows, photons):
+    """A thousandth of the open beam is most of the light behind a centimetre of iron, and nothing in front of it."""
+    areal, noise = rays(), np.random.default_rng(6)
+    areal[2, ::10] += 8.0
+    counts = noise.poisson(photons * (np.exp(-value_of(areal, FULL)) + scatter))
+    measured = -np.log(np.maximum(counts, 0.5) / photons)
+    weight = 1 / np.sqrt(1 + np.exp(measured) / (photons * 0.015**2))
+    sample = FittedRays(areal, measured, weight, np.ones_like(measured))
+    found = estimate_scatter(sample, SPECTRUM, MATERIALS)
+    assert (misfit_left(sample, SPECTRUM, MATERIALS, Scatter(), found) < 0.97) == shows
+    assert misfit_left(sample, SPECTRUM, MATERIALS, found, found) == 1.0
+
+
+def test_scatter_shows_in_rays_that_are_straight_sums_too():
+    depth, noise = np.linspace(0.0, 8.0, 501), np.random.default_rng(7)
+    measured = -np.log(np.exp(-depth) + 0.001) + noise.normal(0.0, 0.003, 501)
+    sample = FittedRays(0.97 * depth[None], measured, np.ones(501), np.ones(501))
+    found = estimate_scatter(sample, None, None)
+    assert found.constant == pytest.approx(0.001, rel=0.05)
+    assert misfit_left(sample, None, None, Scatter(), found) < 0.2
 
 
 def test_rays_that_nothing_passes_tell_nothing():

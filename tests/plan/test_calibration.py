@@ -13,8 +13,8 @@ from small_scans import geometries, reconstruct
 import tomo_polysplat as tps
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.physics.scatter import Scatter, light_around
-from tomo_polysplat.plan.calibrated_physics import with_fitted
-from tomo_polysplat.plan.calibration import Calibration, _judge, calibrated
+from tomo_polysplat.plan.calibrated_physics import scatter_beside, with_fitted
+from tomo_polysplat.plan.calibration import Calibration, _judge, _stage, calibrated
 from tomo_polysplat.plan.first_volume import first_volume
 from tomo_polysplat.plan.model import scene_of
 from tomo_polysplat.plan.order import plan_from_start
@@ -170,11 +170,46 @@ def test_a_stage_is_taken_where_its_short_fits_had_their_time(seconds, cut, made
     monkeypatch.setattr("tomo_polysplat.plan.calibration.short_fit", fit)
     monkeypatch.setattr("tomo_polysplat.plan.calibration.first_volume", lambda *scan: (None, ""))
     monkeypatch.setattr("tomo_polysplat.nuisances.scatter.estimate_scatter", lambda *rays: Scatter(0.05))
+    monkeypatch.setattr(
+        "tomo_polysplat.nuisances.scatter.misfit_left", lambda *rays: 0.5 if rays[-1] != rays[-2] else 1.0
+    )
     problem, wanted = problem_of(fan(0.0), SPECTRUM), Calibration(("scatter",), None)
     found = calibrated(problem, wanted, make_settings(), torch.device("cpu"), 0, 0.6)
     taken = made == 2 and not any(cut)
     assert found["accepted"] == {"scatter": taken} and found["fitted"] == ({"scatter": 0.05} if taken else {})
     assert len(trials) == made and ("too short" in found["why"]) != taken
+
+
+@pytest.mark.parametrize("noise, shown", [(0.003, True), (0.03, False)])
+def test_air_shows_scatter_beyond_its_noise(noise, shown):
+    """A median of 301 rays has an error of 0.07 deviations of one."""
+    areal = np.zeros((3, 401))
+    areal[0, 301:] = 2.0
+    measured = np.where(areal[0] > 0, 0.5, -np.log1p(0.003))
+    rays = RaySample(areal, measured, *np.ones((2, 401)), np.zeros(401), np.full(401, noise))
+    found = scatter_beside(dataclasses.replace(of_fit({}, 1.0), rays=rays))
+    assert found == ({"scatter": pytest.approx(0.003)} if shown else {})
+
+
+@pytest.mark.parametrize("beside, goes_on", [(0.4, [0.003, 0.001]), (1.2, [0.001])])
+def test_scatter_is_moved_from_each_short_fit_that_explains_more(beside, goes_on, monkeypatch):
+    """Air shows 0.003 of the open beam, and all rays 0.001."""
+    module, from_where = "tomo_polysplat.plan.calibration", []
+
+    def moved(fit, problem):
+        if not fit.fitted:
+            return {"scatter": 0.001}
+        from_where.append(fit.fitted["scatter"])
+        return {}
+
+    monkeypatch.setattr(f"{module}.scatter_beside", lambda first: {"scatter": 0.003})
+    monkeypatch.setattr(f"{module}.moved_scatter", moved)
+    problem, wanted = problem_of(fan(0.0), SPECTRUM), Calibration(("scatter",), None)
+    errors = {0.003: beside, 0.001: 0.7}
+    stage = _stage(
+        "scatter", of_fit({}, 1.0), wanted, problem, lambda fitted: of_fit(fitted, errors[fitted["scatter"]])
+    )
+    assert [fit.fitted["scatter"] for fit in stage] == [0.003, 0.001] and from_where == goes_on
 
 
 @pytest.mark.parametrize("kvp, density, factors", [(420, 3.0, (1.0, 450 / 420)), (22, 0.03, (20 / 22, 1.0))])

@@ -9,6 +9,7 @@ import torch
 from planned import told_beforehand
 
 import tomo_polysplat as tps
+from tomo_polysplat.physics.materials import mass_attenuation
 from tomo_polysplat.physics.scatter import light_around
 from tomo_polysplat.plan import calibration, solver
 from tomo_polysplat.plan.answer import Status
@@ -72,11 +73,48 @@ def test_a_scan_without_any_is_fitted_as_if_nobody_had_asked():
     assert np.array_equal(asked.volume, without.volume)
 
 
+@pytest.mark.parametrize("scatter", [0.0, 0.002])
+def test_little_scatter_is_found_where_it_is_much_of_the_light_behind_metal(scatter):
+    """Two bolts in a bath, whose shadows together have as much scatter as light; no other ray has a hundredth of it."""
+    views, columns, size = 60, 81, 41
+    angles, across = np.arange(views) * np.pi / views, (np.arange(columns) - columns // 2) * 0.15
+    spectrum = tps.Spectrum.from_tube(120, filters={"Al": 0.3}, detector="counting")
+    depths = {"water": np.zeros((views, columns)), "iron": np.zeros((views, columns))}
+    for x, y, radius, inside in ((0.0, 0.0, 4.0, 1.0), (1.5, 0.6, 0.6, -1.0), (-1.4, -0.5, 0.7, -1.0)):
+        at = across - (x * np.cos(angles) + y * np.sin(angles))[:, None]
+        chord = 2 * np.sqrt(np.maximum(radius**2 - at**2, 0.0))
+        depths["water"] += inside * chord
+        depths["iron"] += chord * 7.87 if inside < 0 else 0.0
+    curves = {name: mass_attenuation(name, spectrum.energies) for name in depths}
+    optical = sum(depths[name][..., None] * curves[name] for name in depths)
+    counts = np.random.default_rng(8).poisson(1e5 * (np.exp(-optical) @ spectrum.weights + scatter))
+    result = tps.reconstruct(
+        -np.log(np.maximum(counts, 0.5) / 1e5),
+        {"type": "parallel", "DetectorWidth": 0.15, "DetectorCount": columns, "ProjectionAngles": angles},
+        {
+            "GridRowCount": size,
+            "GridColCount": size,
+            "option": dict(zip(("WindowMinX", "WindowMaxX", "WindowMinY", "WindowMaxY"), (-4.5, 4.5) * 2)),
+        },
+        spectrum=spectrum,
+        unit="cm",
+        settings=QUICK,
+        progress=False,
+        align=False,
+        callbacks=[asked],
+    )
+    told = result.plan["scatter"]
+    if scatter:
+        assert told.value["scatter"] == pytest.approx(scatter, rel=0.15)
+    else:
+        assert told.value == {} and "calibration" not in result.plan
+
+
 def test_a_beam_that_drifts_does_not_scatter():
     scan = pins()
     brighter = 0.02 * (1 + np.sin(np.arange(scan.projections.shape[1]) / 5.0))[None, :, None]
     drifting = dataclasses.replace(scan, projections=(scan.projections - brighter).astype(np.float32))
-    assert "drift" in reconstruct(drifting, callbacks=[asked]).plan["scatter"].why
+    assert "drift" in reconstruct(drifting, callbacks=[asked], settings=QUICK).plan["scatter"].why
 
 
 def test_nobody_asks_where_it_cannot_be_told():

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 
 from tomo_polysplat.nuisances.nuisance import Verdict
 
-__all__ = ["light_gate", "more_likely"]
+__all__ = ["MARGIN", "light_gate", "more_likely"]
 
 # Held-out errors of two fits of the same scan under nearly the same physics, with one seed, differ by up to 2 %.
-_MARGIN = 0.03
+MARGIN = 0.03
 # Scatter, and a brighter beam, have to explain the darkest rays by so much better than each other. Scatter of 1 and 2 %
 # in scenes with metal did by 8 to 36 %; beams 1 % brighter are taken for scatter where iron is opaque (10 and 12 %).
 _DARKER = 0.05
@@ -37,11 +37,11 @@ def light_gate(evidence: Mapping[str, float], rival: str, *, darkest_margin: boo
     darkest_margin : bool
         Whether the darkest rays may fit as well as before, and need not tell where all rays fit far better.
     """
-    if not evidence["held_out_after"] < (1 - _MARGIN) * evidence["held_out_before"]:
-        return Verdict(False, f"the held-out rays do not fit {_MARGIN:.0%} better")
+    if not evidence["held_out_after"] < (1 - MARGIN) * evidence["held_out_before"]:
+        return Verdict(False, f"the held-out rays do not fit {MARGIN:.0%} better")
     asked = "darkest_before" in evidence and _darkest_tell(evidence)
     if asked and not (darkest_margin and _far_better(evidence, "before")):
-        most = evidence["darkest_before"] * (1 + _MARGIN if darkest_margin else 1.0)
+        most = evidence["darkest_before"] * (1 + MARGIN if darkest_margin else 1.0)
         if not evidence["darkest_after"] < most:
             return Verdict(False, "the darkest rays fit no better")
     if "held_out_rival" in evidence and not _as_good(evidence):
@@ -55,7 +55,7 @@ def _as_good(evidence: Mapping[str, float]) -> bool:
     darkest, of_rival, tell = evidence["darkest_after"], evidence["darkest_rival"], _darkest_tell(evidence)
     if _far_better(evidence, "rival"):
         return darkest <= of_rival or not tell
-    return tell and held_out < (1 + _MARGIN) * rival and darkest < (1 - _DARKER) * of_rival
+    return tell and held_out < (1 + MARGIN) * rival and darkest < (1 - _DARKER) * of_rival
 
 
 def _darkest_tell(evidence: Mapping[str, float]) -> bool:
@@ -84,4 +84,4 @@ def more_likely(scatter: Mapping[str, float], beam: Mapping[str, float]) -> str:
     darker = _darkest_tell(scatter) and scatter["darkest_after"] < beam["darkest_after"]
     varies = scatter.get("of_light", 0.0) != 0
     tells = darker or varies or held_out < _FAR_BETTER
-    return "scatter" if held_out < 1 - _MARGIN and tells else "beam"
+    return "scatter" if held_out < 1 - MARGIN and tells else "beam"

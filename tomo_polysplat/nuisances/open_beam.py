@@ -8,7 +8,10 @@ from typing import Any
 from tomo_polysplat.nuisances.light_gate import light_gate
 from tomo_polysplat.nuisances.nuisance import Found, Nuisance, Parameter, Place, Verdict
 
-__all__ = ["OpenBeam"]
+__all__ = ["LEAST_BRIGHTER", "OpenBeam"]
+
+# A beam that is brighter by less is left as it is.
+LEAST_BRIGHTER = 2e-3
 
 
 class OpenBeam(Nuisance):

@@ -5,22 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import torch
-
-from tomo_polysplat.nuisances.light_gate import light_gate
+from tomo_polysplat.nuisances.light_gate import MARGIN, light_gate
 from tomo_polysplat.nuisances.nuisance import Found, Nuisance, Parameter, Place, Verdict
 from tomo_polysplat.physics.base_materials import Materials
-from tomo_polysplat.physics.ray_estimates import FittedRays, estimate_scatter
+from tomo_polysplat.physics.ray_estimates import FittedRays, estimate_scatter, misfit_left
 from tomo_polysplat.physics.scatter import LARGEST_SCATTER, Scatter
 from tomo_polysplat.physics.spectrum import Spectrum
 
-__all__ = ["LEAST_SCATTER", "ScatteredLight"]
+__all__ = ["ScatteredLight"]
 
-# Scatter below this share of the open beam is left as it is.
-LEAST_SCATTER = 2e-3
-# Less scatter than this share of the open beam, in every ray, is none: 35 scans without any came to 0.003 at most, but
-# for a slice without metal, which short fits then told.
-_SHOWN = 0.004
 # Beside the object, views that differ by more than this share of the most scatter tell of a drifting beam.
 _DRIFT = 0.3
 _ASKED = "calibrate=True fits it all the same"
@@ -39,7 +32,7 @@ class ScatteredLight(Nuisance):
     }
     found_by = Found.RESIDUALS
     gauge = "matter that took up some of the scatter: one factor for each curve's amount is fitted beside it"
-    cost = "two or three short fits"
+    cost = "two to five short fits"
 
     @classmethod
     def gate(cls, evidence: Mapping[str, float]) -> Verdict:
@@ -55,12 +48,15 @@ class ScatteredLight(Nuisance):
         Parameters
         ----------
         evidence : mapping of str to float
-            ``most``, the most scatter in any ray, as a fraction of the open beam; ``drift``, by how much the views'
-            light beside the object differs, missing where too few rays tell it.
+            ``most``, the most scatter in any ray, as a fraction of the open beam; ``left``, how much of the rays'
+            misfit it would leave; ``drift``, by how much the views' light beside the object differs, missing where too
+            few rays tell it.
         """
         most, drift = evidence["most"], evidence.get("drift")
-        if most < _SHOWN:
-            return Verdict(False, f"the rays show {most:.1g} of the open beam at most")
+        # What short fits would have to confirm.
+        if evidence["left"] > 1 - MARGIN:
+            words = f"{most:.1g} of the open beam at most, and {1 - evidence['left']:.1%} of their misfit"
+            return Verdict(False, f"the rays show {words}")
         if drift is None:
             words = "too few rays pass beside the object to tell it from a drifting beam"
             return Verdict(False, f"the rays may show {most:.2g} of the open beam, but {words}; {_ASKED}")
@@ -117,8 +113,6 @@ class ScatteredLight(Nuisance):
         """
         found = estimate_scatter(sample, spectrum, materials, level)
         new = Scatter(was.constant + found.constant - level, was.of_light + found.of_light)
-        light = torch.as_tensor(sample.light)
-        old, now = was.at(light), new.at(light)
-        if float((now - old).abs().max()) <= max(LEAST_SCATTER, 0.02 * float(old.max())):
+        if misfit_left(sample, spectrum, materials, Scatter(level), found) > 1 - MARGIN:
             return {}
         return {"scatter": new.constant} | ({"scatter_of_light": new.of_light} if new.varies else {})

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+import torch
 
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.beer_lambert import projection, shares
@@ -13,7 +14,7 @@ from tomo_polysplat.physics.materials import MaterialLike, mass_attenuation
 from tomo_polysplat.physics.scatter import LARGEST_SCATTER, Scatter
 from tomo_polysplat.physics.spectrum import Spectrum
 
-__all__ = ["FittedRays", "estimate_scatter", "matching_factor"]
+__all__ = ["FittedRays", "estimate_scatter", "matching_factor", "misfit_left"]
 
 _GAUSS_NEWTON_STEPS = 8
 # Scatter varies where that leaves so much less of the squared residuals: of constant one chance takes 0.2 % at most.
@@ -45,7 +46,7 @@ class FittedRays(NamedTuple):
 
 
 def estimate_scatter(
-    sample: FittedRays, spectrum: Spectrum, materials: Materials, start: float = 0.0
+    sample: FittedRays, spectrum: Spectrum | None, materials: Materials | None, start: float = 0.0
 ) -> Scatter:
     """Scatter that explains the residuals of rays, at least one, best; it varies where that is needed.
 
@@ -56,17 +57,12 @@ def estimate_scatter(
     ----------
     sample : FittedRays
         Of a fit that assumed ``start``.
-    spectrum : Spectrum
-    materials : Materials
+    spectrum, materials : Spectrum, Materials, or None
+        None where the areal densities of the one curve are -log(I / I0) themselves.
     start : float
         Constant scatter, as a fraction of the open beam.
     """
-    areal, measured, weight, light = sample
-    lit = spectrum.weights > 0
-    curves = materials.mass_attenuation(spectrum.energies[lit])[: len(areal)]
-    value, share = shares(areal, np.log(spectrum.weights[lit]), curves)
-    primary, slopes = np.exp(-value), np.einsum("kn,nr->kr", curves, share) * areal
-    rays = (primary, slopes, measured, weight)
+    rays, light = _rays(sample, spectrum, materials), sample.light
     mean = float(light.mean())
     kinds = np.stack([np.ones_like(light), light - mean])
     (constant,), plain = _scatter_of(kinds[:1], np.array([start]), *rays)
@@ -78,6 +74,57 @@ def estimate_scatter(
         if left[1] < (1 - _BETTER) * left[0] and abs(of_light) * spread < LARGEST_SCATTER:
             return Scatter(level - of_light * mean, of_light)
     return Scatter(min(max(constant, 0.0), LARGEST_SCATTER))
+
+
+def misfit_left(
+    sample: FittedRays, spectrum: Spectrum | None, materials: Materials | None, was: Scatter, now: Scatter
+) -> float:
+    """How much of the rays' misfit is left under other scatter, each with the best factor of every curve's amount.
+
+    The misfit is Huber's, and where it has its corner changes hardly anything.
+
+    Parameters
+    ----------
+    sample : FittedRays
+        Of a fit that assumed the scatter ``was``.
+    spectrum, materials : Spectrum, Materials, or None
+        See `estimate_scatter`.
+    was, now : Scatter
+    """
+    rays, light = _rays(sample, spectrum, materials), torch.as_tensor(sample.light)
+    before, after = (_deviation(scatter.at(light).numpy(), *rays) for scatter in (was, now))
+    corner = _corner(before)
+    sums = [
+        float(np.where(d < corner, 0.5 * d**2, corner * (d - 0.5 * corner)).sum()) for d in (before, after)
+    ]
+    return sums[1] / sums[0] if sums[0] else 1.0
+
+
+def _rays(
+    sample: FittedRays, spectrum: Spectrum | None, materials: Materials | None
+) -> tuple[np.ndarray, ...]:
+    """What passes of rays, its slopes by a factor of each curve's amount, what was measured, and its weight."""
+    if spectrum is None or materials is None:
+        return np.exp(-sample.areal[0]), sample.areal[:1], sample.measured, sample.weight
+    lit = spectrum.weights > 0
+    curves = materials.mass_attenuation(spectrum.energies[lit])[: len(sample.areal)]
+    value, share = shares(sample.areal, np.log(spectrum.weights[lit]), curves)
+    slopes = np.einsum("kn,nr->kr", curves, share) * sample.areal
+    return np.exp(-value), slopes, sample.measured, sample.weight
+
+
+def _deviation(
+    scatter: np.ndarray, primary: np.ndarray, slopes: np.ndarray, measured: np.ndarray, weight: np.ndarray
+) -> np.ndarray:
+    """What rays lack under some scatter, with the amounts of the curves that are best under it."""
+    columns, target = _linearised(np.empty((0, len(scatter))), scatter, primary, slopes, measured, weight)
+    deviation = np.abs(target)
+    for _ in range(_GAUSS_NEWTON_STEPS):
+        corner = _corner(deviation)
+        robust = np.sqrt(corner / np.maximum(deviation, corner))
+        step = np.linalg.lstsq((columns * robust).T, target * robust, rcond=None)[0]
+        deviation = np.abs(target - step @ columns)
+    return deviation
 
 
 def _scatter_of(

@@ -15,6 +15,7 @@ from tomo_polysplat.nuisances.light_gate import more_likely
 from tomo_polysplat.nuisances.nuisance import Nuisance
 from tomo_polysplat.nuisances.open_beam import OpenBeam
 from tomo_polysplat.nuisances.scatter import ScatteredLight
+from tomo_polysplat.physics.scatter import LARGEST_SCATTER
 from tomo_polysplat.plan.short_fit import ShortFit
 
 __all__ = [
@@ -23,8 +24,12 @@ __all__ = [
     "judge_scatter",
     "moved_factor",
     "moved_scatter",
+    "scatter_beside",
     "with_fitted",
 ]
+
+# Light beside the object is more than the open field by so many deviations at least.
+_DEVIATIONS = 3.0
 
 
 def with_fitted(problem: Problem, fitted: Mapping[str, float]) -> Problem:
@@ -48,6 +53,12 @@ def with_fitted(problem: Problem, fitted: Mapping[str, float]) -> Problem:
 def describe_scatter(fitted: Mapping[str, float]) -> str:
     """In words; `with_fitted` tells what is in ``fitted``."""
     return OpenBeam.describe(fitted) if "beam" in fitted else ScatteredLight.describe(fitted)
+
+
+def scatter_beside(first: ShortFit) -> dict[str, float]:
+    """As much scatter everywhere as rays beside the object show; nothing where noise explains it."""
+    level, error = first.rays.beam() - 1.0, first.rays.beam_error()
+    return {"scatter": min(level, LARGEST_SCATTER)} if level > _DEVIATIONS * error else {}
 
 
 def moved_scatter(last: ShortFit, problem: Problem) -> dict[str, float]:

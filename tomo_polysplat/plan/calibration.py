@@ -20,7 +20,7 @@ from tomo_polysplat.checks import fail, require_choice, require_number
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.kernels.compile_time import working_time
 from tomo_polysplat.nuisances.known import SPECTRAL
-from tomo_polysplat.nuisances.scatter import LEAST_SCATTER
+from tomo_polysplat.nuisances.open_beam import LEAST_BRIGHTER
 from tomo_polysplat.physics.spectral_change import tube_voltage
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.plan.calibrated_physics import (
@@ -28,6 +28,7 @@ from tomo_polysplat.plan.calibrated_physics import (
     judge_scatter,
     moved_factor,
     moved_scatter,
+    scatter_beside,
     with_fitted,
 )
 from tomo_polysplat.plan.first_volume import first_volume
@@ -224,19 +225,33 @@ def _stage(
     trial: Callable[[Mapping[str, float]], ShortFit],
 ) -> list[ShortFit]:
     """Short fits with one quantity moved to where the last of them says that it is."""
+    if name == "scatter":
+        return _stage_of_scatter(begin, wanted, problem, trial)
     made: list[ShortFit] = []
     for _ in range(_ROUNDS):
         last = made[-1] if made else begin
-        if name == "scatter":
-            moved = moved_scatter(last, problem)
-        else:
-            assert wanted.soft_density is not None
-            moved = moved_factor(name, last, wanted.soft_density, problem)
+        assert wanted.soft_density is not None
+        moved = moved_factor(name, last, wanted.soft_density, problem)
         if not moved:
             break
-        made.append(trial({k: v for k, v in last.fitted.items() if not k.startswith(name)} | moved))
+        made.append(trial({k: v for k, v in last.fitted.items() if k != name} | moved))
+    return made
+
+
+def _stage_of_scatter(
+    begin: ShortFit, wanted: Calibration, problem: Problem, trial: Callable[[Mapping[str, float]], ShortFit]
+) -> list[ShortFit]:
+    """Short fits with scatter as air shows it, and as all rays do, and moved to where each of these says that it is."""
+    others = {name: value for name, value in begin.fitted.items() if not name.startswith("scatter")}
+    made: list[ShortFit] = []
+    if moved := moved_scatter(begin, problem):
+        # Matter that has taken up the scatter behind it hides a part of it, or shows more elsewhere; air does not.
+        made = [trial(others | found) for found in (scatter_beside(begin), moved) if found]
+        for fit in [fit for fit in made if fit.held_out < begin.held_out]:
+            if moved := moved_scatter(fit, problem):
+                made.append(trial(others | moved))
     beam = begin.rays.beam()
-    if wanted.suspected and beam - 1.0 > LEAST_SCATTER:
+    if wanted.suspected and beam - 1.0 > LEAST_BRIGHTER:
         made.append(trial({**begin.fitted, "beam": beam}))
     return made
 

@@ -23,6 +23,8 @@ _HAZE = 1e-3
 _LESS, _DEVIATIONS = 0.85, 3.0
 # As few rays beside the object do not tell how bright the beam is.
 _FEWEST_BESIDE = 100
+# Deviation of a median of n normal values, times sqrt(n).
+_OF_A_MEDIAN = 1.2533
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,15 @@ class RaySample:
         """How many times as bright as the open field the rays beside the object are; 1 where there are too few."""
         values = self.measured[self.beside]
         return float(np.exp(-np.median(values))) if len(values) >= _FEWEST_BESIDE else 1.0
+
+    def beam_error(self) -> float:
+        """Deviation of `beam` by the noise of these rays; 0 where there are too few."""
+        noise = self.deviation[self.beside]
+        return (
+            _OF_A_MEDIAN * float(np.sqrt(np.mean(noise**2) / len(noise)))
+            if len(noise) >= _FEWEST_BESIDE
+            else 0.0
+        )
 
     def darker_than(self, scatter: Scatter) -> int:
         """How many rays have less light than their scatter alone, whatever their noise."""

@@ -15,7 +15,8 @@ import torch
 
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.nuisances.scatter import ScatteredLight
-from tomo_polysplat.physics.ray_estimates import estimate_scatter
+from tomo_polysplat.physics.ray_estimates import estimate_scatter, misfit_left
+from tomo_polysplat.physics.scatter import Scatter
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.decision import Decision, Known, When, is_number
 from tomo_polysplat.plan.lab import Lab, Untold
@@ -31,6 +32,8 @@ logger = logging.getLogger(__name__)
 _FROM, _RAYS = 0.3, 8000
 # Rays of a view beside the object that tell its light, and views that tell a drift.
 _FEWEST_RAYS, _FEWEST_VIEWS = 10, 5
+# Views differ where noise explains it by a chance of so many deviations only.
+_DEVIATIONS = 3.0
 # Steps of the short fits that follow, of a volume and of one slice.
 _SHORT, _SHORT_PLANAR = 480, 1920
 
@@ -74,10 +77,10 @@ class Scattering(Decision):
             raise Untold("the time budget is kept for the fit")
         fitter = run.fitter
         rays = sample_rays(fitter.gaussians, fitter.scene, fitter.rays, 0, _RAYS)
-        most, drift = _most(rays, lab.problem, straight=fitter.scene.quadrature is None), _drift(rays)
-        evidence = {"most": most} | ({} if drift is None else {"drift": drift})
+        evidence, drift = _shown(rays, lab.problem, straight=fitter.scene.quadrature is None), _drift(rays)
+        evidence |= {} if drift is None else {"drift": drift}
         suspected = ScatteredLight.suspected(evidence)
-        return _by_short_fits(lab, most, evidence) if suspected.kept else _none(suspected.why, evidence)
+        return _by_short_fits(lab, evidence) if suspected.kept else _none(suspected.why, evidence)
 
 
 def _none(why: str, evidence: dict[str, float]) -> Answer:
@@ -85,7 +88,7 @@ def _none(why: str, evidence: dict[str, float]) -> Answer:
     return Answer({}, why, Status.ASKED, evidence)
 
 
-def _by_short_fits(lab: Lab, most: float, evidence: dict[str, float]) -> Answer:
+def _by_short_fits(lab: Lab, evidence: dict[str, float]) -> Answer:
     """What short fits tell; what ends these does not end the run."""
     assert lab.calibrate is not None and lab.run is not None
     try:
@@ -98,20 +101,18 @@ def _by_short_fits(lab: Lab, most: float, evidence: dict[str, float]) -> Answer:
     if found["accepted"]["scatter"]:
         lab.run.restart = found
         return Answer(found["fitted"], found["why"], Status.ASKED, evidence)
-    return _none(f"the rays may show {most:.2g} of the open beam; {found['why']}", evidence)
+    return _none(f"the rays may show {evidence['most']:.2g} of the open beam; {found['why']}", evidence)
 
 
-def _most(rays: RaySample, problem: Problem, *, straight: bool) -> float:
-    """The most scatter in any ray, as a fraction of the open beam."""
-    spectrum, materials = problem.spectrum, problem.materials
-    assert spectrum is not None and materials is not None
+def _shown(rays: RaySample, problem: Problem, *, straight: bool) -> dict[str, float]:
+    """The most scatter in any ray, as a fraction of the open beam, and how much of the rays' misfit it would leave."""
     if not len(rays.light):
-        return 0.0
-    if straight:
-        # Without hardening there are no areal densities in g/cm2; beside the object it shows all the same.
-        return max(0.0, rays.beam() - 1.0)
-    scatter = estimate_scatter(rays.fitted, spectrum, materials)
-    return float(scatter.at(torch.as_tensor(rays.light)).max())
+        return {"most": 0.0, "left": 1.0}
+    # Without hardening there are no areal densities in g/cm2.
+    model = (None, None) if straight else (problem.spectrum, problem.materials)
+    scatter = estimate_scatter(rays.fitted, *model)
+    most = float(scatter.at(torch.as_tensor(rays.light)).max())
+    return {"most": most, "left": misfit_left(rays.fitted, *model, Scatter(), scatter)}
 
 
 def _drift(rays: RaySample) -> float | None:
@@ -123,4 +124,6 @@ def _drift(rays: RaySample) -> float | None:
         return None
     means = np.bincount(view, values) / np.maximum(many, 1)
     noise = float((values - means[view]).var()) * float((1 / many[enough]).mean())
+    # The variance of so many means has an error of its own.
+    noise *= 1 + _DEVIATIONS * float(np.sqrt(2 / enough.sum()))
     return float(np.sqrt(max(float(means[enough].var()) - noise, 0.0)))
