@@ -166,11 +166,11 @@ def test_each_way_has_steps_enough_to_get_used_to_it_but_no_more_than_a_fifth_of
 
 
 @pytest.mark.parametrize(
-    ("left", "passes"), [((1.5, 1.45), 2), ((1.0, 1.05), 2), ((1.5, 1.3, 1.3), 3), ((0.5, 0.72, 1.0), 3)]
+    ("left", "passes"), [((1.5, 1.45), 2), ((1.0, 1.05), 2), ((1.5, 1.35, 1.35), 3), ((1.4, 1.3, 1.2), 3)]
 )
 def test_no_pass_is_made_that_would_have_to_change_more_than_the_last_one_did(monkeypatch, left, passes):
     (answer, _, _), asked = passes_asked(monkeypatch, left, steps=24)
-    assert asked == 2 * passes * [1] and answer.value == (2 if left[-1] < 1.2 else 1)
+    assert asked == 2 * passes * [1] and answer.value == (2 if left[-1] < 1.25 else 1)
 
 
 def test_one_pass_each_way_is_enough_where_averaged_light_leaves_far_more(monkeypatch):

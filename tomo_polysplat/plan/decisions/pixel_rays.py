@@ -33,7 +33,7 @@ logger = logging.getLogger(__name__)
 # first ones are spent on getting used to it.
 _FROM, _STEPS, _MOST = 0.4, 60, 0.2
 # So much left after one pass is enough: where light is averaged it was 0.90 to 1.31 then, and later passes changed it
-# by 0.27 at most (docs/decisions/pixel_rays.md). Up to 1.2 at the end is taken for averaging.
+# by 0.27 at most (docs/decisions/pixel_rays.md). Up to 1.28 at the end is taken for averaging.
 _SURELY_THIN = 1.7
 # Factor of the time of a step, at most, where light is averaged over two rays a pixel and axis.
 _SLOWER = 4.0
