@@ -55,8 +55,8 @@ class ScatteredLight(Nuisance):
         most, drift = evidence["most"], evidence.get("drift")
         # What short fits would have to confirm.
         if evidence["left"] > 1 - MARGIN:
-            words = f"{most:.1g} of the open beam at most, and {1 - evidence['left']:.1%} of their misfit"
-            return Verdict(False, f"the rays show {words}")
+            less = f"which takes {1 - evidence['left']:.1%} off their misfit"
+            return Verdict(False, f"the rays show {most:.1g} of the open beam at most, {less}")
         if drift is None:
             words = "too few rays pass beside the object to tell it from a drifting beam"
             return Verdict(False, f"the rays may show {most:.2g} of the open beam, but {words}; {_ASKED}")
