@@ -91,12 +91,12 @@ def misfit_left(
         See `estimate_scatter`.
     was, now : Scatter
     """
+    from scipy.special import huber
+
     rays, light = _rays(sample, spectrum, materials), torch.as_tensor(sample.light)
     before, after = (_deviation(scatter.at(light).numpy(), *rays) for scatter in (was, now))
     corner = _corner(before)
-    sums = [
-        float(np.where(d < corner, 0.5 * d**2, corner * (d - 0.5 * corner)).sum()) for d in (before, after)
-    ]
+    sums = [float(huber(corner, deviation).sum()) for deviation in (before, after)]
     return sums[1] / sums[0] if sums[0] else 1.0
 
 
@@ -120,8 +120,7 @@ def _deviation(
     columns, target = _linearised(np.empty((0, len(scatter))), scatter, primary, slopes, measured, weight)
     deviation = np.abs(target)
     for _ in range(_GAUSS_NEWTON_STEPS):
-        corner = _corner(deviation)
-        robust = np.sqrt(corner / np.maximum(deviation, corner))
+        robust = _robust(deviation)
         step = np.linalg.lstsq((columns * robust).T, target * robust, rcond=None)[0]
         deviation = np.abs(target - step @ columns)
     return deviation
@@ -144,8 +143,7 @@ def _scatter_of(
         # The mean scatter; what it differs by is bounded ray by ray.
         amounts[0] = np.clip(amounts[0], 0.0, LARGEST_SCATTER)
         deviation = np.abs(target - step @ columns)
-        corner = _corner(deviation)
-        robust = np.sqrt(corner / np.maximum(deviation, corner))
+        robust = _robust(deviation)
     columns, target = _linearised(kinds[:0], amounts @ kinds, primary, slopes, measured, weight)
     step = np.linalg.lstsq((columns * robust).T, target * robust, rcond=None)[0]
     return [float(amount) for amount in amounts], np.abs(target - step @ columns)
@@ -164,6 +162,12 @@ def _linearised(
     total = primary + np.clip(scatter, 0.0, LARGEST_SCATTER) + np.finfo(np.float64).tiny
     columns = np.concatenate([-kinds * within / total, slopes * (primary / total)]) * weight
     return columns, (measured + np.log(total)) * weight
+
+
+def _robust(deviation: np.ndarray) -> np.ndarray:
+    """Roots of the weights under which squares count as Huber's function does."""
+    corner = _corner(deviation)
+    return np.sqrt(corner / np.maximum(deviation, corner))
 
 
 def _corner(deviation: np.ndarray) -> float:

@@ -155,19 +155,18 @@ def _axis_column(problem: Problem) -> float:
 def _evidence(
     found: np.ndarray, taken: np.ndarray, sums: ResidualSums, where: np.ndarray, corner: float
 ) -> dict[str, float]:
-    """How much better the held-out rays are explained, each with what was found and without any."""
+    """How much better the held-out rays are explained, each with what was found and without any.
+
+    The misfit is Huber's, with the corner that the fit has (`fit.loss.weighted_huber`).
+    """
     rays, rms = len(sums.residual), float(np.sqrt(np.mean(found**2)))
     if rays < _FEWEST_RAYS:
         return {"rms": rms, "better": math.nan, "error": math.nan}
+    from scipy.special import huber
+
     without = sums.residual + taken.ravel()[where]
     left = (without, without - found.ravel()[where])
-    before, after = (_misfit(residual / sums.deviation, corner) for residual in left)
+    before, after = (huber(corner, residual / sums.deviation) for residual in left)
     mean = max(float(before.mean()), 1e-300)
     better, error = float((before - after).mean()), float((before - after).std()) / math.sqrt(rays)
     return {"rms": rms, "better": better / mean, "error": error / mean}
-
-
-def _misfit(deviations: np.ndarray, corner: float) -> np.ndarray:
-    """Huber's, with the corner that the fit has (`fit.loss.weighted_huber`), ray by ray."""
-    size = np.abs(deviations)
-    return np.where(size < corner, 0.5 * size**2, corner * (size - 0.5 * corner))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +25,7 @@ _LESS, _DEVIATIONS = 0.85, 3.0
 # As few rays beside the object do not tell how bright the beam is.
 _FEWEST_BESIDE = 100
 # Deviation of a median of n normal values, times sqrt(n).
-_OF_A_MEDIAN = 1.2533
+_OF_A_MEDIAN = math.sqrt(math.pi / 2)
 
 
 @dataclass(frozen=True)
@@ -71,11 +72,9 @@ class RaySample:
     def beam_error(self) -> float:
         """Deviation of `beam` by the noise of these rays; 0 where there are too few."""
         noise = self.deviation[self.beside]
-        return (
-            _OF_A_MEDIAN * float(np.sqrt(np.mean(noise**2) / len(noise)))
-            if len(noise) >= _FEWEST_BESIDE
-            else 0.0
-        )
+        if len(noise) < _FEWEST_BESIDE:
+            return 0.0
+        return _OF_A_MEDIAN * float(np.sqrt(np.mean(noise**2) / len(noise)))
 
     def darker_than(self, scatter: Scatter) -> int:
         """How many rays have less light than their scatter alone, whatever their noise."""
