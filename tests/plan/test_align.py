@@ -14,6 +14,7 @@ from tomo_polysplat.plan import axis
 from tomo_polysplat.plan.alignment import moves_of
 from tomo_polysplat.plan.coarse import joined_pixels
 from tomo_polysplat.plan.fit_options import FitOptions
+from tomo_polysplat.scan.axis_offset import AxisOffset
 from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.scan.layout import vector_form
 from tomo_polysplat.settings import make_settings
@@ -86,20 +87,27 @@ def problem_off(columns):
 
 
 def test_a_move_that_held_out_rays_do_not_confirm_is_not_made(monkeypatch):
-    misfits = iter([1.0, 1.0])
-    monkeypatch.setattr(axis, "_held_out", lambda *_: next(misfits))
+    monkeypatch.setattr(axis.FitsByAxis, "misfits", lambda *_: np.ones(51))
     answer = axis.find_axis(*problem_off(1.5))
     assert answer.value == {} and "do not confirm" in answer.why and answer.evidence["offset"] > 1
 
 
 @pytest.mark.parametrize(
-    "part, words", [("offset_of", "comparing them failed"), ("_held_out", "not be asked")]
+    "owner, part, words",
+    [
+        (axis, "offset_of", "comparing them failed"),
+        (axis.FitsByAxis, "misfits", "not be asked"),
+        (axis, "axis_by_fits", "do not tell"),
+    ],
 )
-def test_a_probe_that_fails_moves_nothing_and_ends_no_run(monkeypatch, caplog, part, words):
+def test_a_probe_that_fails_moves_nothing_and_ends_no_run(monkeypatch, caplog, owner, part, words):
     def failing(*_):
         raise RuntimeError("broken")
 
-    monkeypatch.setattr(axis, part, failing)
+    if part != "misfits":  # fits are asked where opposite rays do not tell
+        monkeypatch.setattr(axis, "offset_of", lambda _: AxisOffset(0.0, np.inf, "comparing them failed"))
+        monkeypatch.setattr(axis, "axis_by_fits", failing)
+    monkeypatch.setattr(owner, part, failing)
     answer = axis.find_axis(*problem_off(1.5))
     assert answer.value == {} and words in answer.why and not axis.is_known(answer)
     assert "broken" in caplog.text
@@ -127,10 +135,10 @@ def test_a_user_who_interrupts_the_probe_is_heard(monkeypatch):
 
 
 def test_fits_that_confirm_nothing_leave_no_trace_in_the_result(monkeypatch):
-    fits, scan = axis._held_out, fan()
+    fits, scan = axis.FitsByAxis.misfits, fan()
     told = off(scan, 0.5)
     plain = reconstruct(scan, told, align=False, settings=QUICK | {"passes": 1.0})
-    monkeypatch.setattr(axis, "_held_out", lambda *asked: 0.0 * fits(*asked))
+    monkeypatch.setattr(axis.FitsByAxis, "misfits", lambda *asked: 0.0 * fits(*asked))
     asked = reconstruct(scan, told, settings=QUICK | {"passes": 1.0})
     assert "do not confirm" in asked.plan["alignment"].why
     assert np.array_equal(asked.volume, plain.volume)

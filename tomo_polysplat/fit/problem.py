@@ -184,6 +184,11 @@ class Problem:
         return 2 if self.planar else 3
 
     @property
+    def axis(self) -> np.ndarray:
+        """(3,) a point on the axis of rotation, in the solver's coordinates."""
+        return -self.centre / self.length
+
+    @property
     def voxel(self) -> float:
         """Shortest edge of a voxel, in the solver's coordinates."""
         return float(self.grid.voxel_size[: self.dimensions].min())

@@ -25,7 +25,7 @@ from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.nuisances.alignment import Alignment
 from tomo_polysplat.nuisances.alignment_search import levels, schedule, search
 from tomo_polysplat.plan.answer import Answer, Status
-from tomo_polysplat.plan.axis import axis_of, is_known
+from tomo_polysplat.plan.axis import is_known
 from tomo_polysplat.plan.coarse import coarse_problem, coarse_settings, joined_pixels
 from tomo_polysplat.plan.first_gaussians import first_gaussians
 from tomo_polysplat.plan.first_volume import first_volume
@@ -99,7 +99,7 @@ def align(
         Its value is a dict of moves by name, empty where none was confirmed, as `aligned` takes it.
     """
     start = {} if axis is None else axis.value
-    alignment = Alignment(problem.geometry, 1.0, names=names, pivot=axis_of(problem), start=start)
+    alignment = Alignment(problem.geometry, 1.0, names=names, pivot=problem.axis, start=start)
     trials = _Levels(problem, alignment, options, report)
     factors = levels(problem.geometry.columns)
     # Where the axis is known, the coarsest detector has nothing to find that the next does not.

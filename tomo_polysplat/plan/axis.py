@@ -1,4 +1,7 @@
-"""Where the axis of rotation was, asked by default: of opposite rays, then of two short fits if they say it is off."""
+"""Where the axis of rotation was, asked by default: of opposite rays, and of short fits where these do not tell it.
+
+An axis that is off is moved where short fits explain the rays better with it.
+"""
 
 from __future__ import annotations
 
@@ -10,30 +13,28 @@ import numpy as np
 
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.plan.answer import Answer, Status
-from tomo_polysplat.plan.coarse import coarse_problem, coarse_settings
-from tomo_polysplat.plan.first_volume import first_volume
+from tomo_polysplat.plan.axis_by_fits import FitsByAxis, axis_by_fits, fits_that_show
+from tomo_polysplat.plan.fall_of_misfits import fall_of_misfits
 from tomo_polysplat.plan.fit_options import FitOptions
-from tomo_polysplat.plan.short_fit import short_fit
-from tomo_polysplat.ranks import current_ranks
 from tomo_polysplat.scan.axis_offset import AxisOffset, offset_of
 from tomo_polysplat.scan.moves import Scanner, moved_geometry
 from tomo_polysplat.scan.opposite_geometry import opposite_rays_of
 from tomo_polysplat.scan.opposite_rays import OppositeRays
 from tomo_polysplat.scan.probes.direction import REMEDY, runs_backwards
 
-__all__ = ["aligned", "axis_of", "find_axis", "is_known"]
+__all__ = ["aligned", "find_axis", "is_known"]
 
 logger = logging.getLogger(__name__)
 
 # An axis is moved that is off by more than this, in columns, beyond so many standard errors; by so many where a time
 # budget leaves no room for fits. 158 perfect scans of 10 kinds came to 3.3 at most (docs/decisions/alignment.md).
 _TOLERATED, _SURE, _SURE_ALONE = 0.03, 4.0, 8.0
+# Who tells it.
+_RAYS, _FITS = "opposite rays", "short fits"
 # An error below this is as good as none: it costs less than a tenth of a decibel.
 _KNOWN = 0.05
 # An axis known to this has opposite rays that agree: which way the angles go need not be asked, which saves its time.
 _AGREED = 0.02
-# Columns of the two fits at least, and their steps.
-_FEWEST_COLUMNS, _STEPS = 24, 60
 
 
 def find_axis(problem: Problem, options: FitOptions, report: Callable[[float, str], Any]) -> Answer:
@@ -55,21 +56,24 @@ def find_axis(problem: Problem, options: FitOptions, report: Callable[[float, st
     """
     report(0.0, "axis of rotation")
     found, rays = _told_by_rays(problem)
-    evidence = {} if found.doubt else {"offset": found.columns, "error": found.error}
     moves: dict[str, Any] = {}
     if rays is not None and (found.doubt or found.error > _AGREED):
         _warn_of_angles(rays, found)
+    told_by, fits = _RAYS, None
+    if options.time_budget is None and not found.error <= _KNOWN:
+        found, told_by, fits = _told_by_fits(problem, found, options)
+    evidence = {} if found.doubt else {"offset": found.columns, "error": found.error}
     needed = _SURE if options.time_budget is None else _SURE_ALONE
     words = _in_words(found)
     if not found.doubt and abs(found.columns) > _TOLERATED + needed * found.error:
         moves = {"u": found.columns}
         if options.time_budget is None:
-            misfits, why = _asked_of_fits(problem, moves, options)
-            evidence = evidence | misfits if misfits else {}
-            if not misfits or not misfits["moved"] < misfits["without"]:
-                moves, words = {}, f"opposite rays tell {_moved_by(found)}, which {why}"
+            asked, why = _asked_of_fits(problem, found.columns, fits, options)
+            evidence = evidence | asked if asked else {}
+            if not asked or not asked["better"] > 0:
+                moves, words = {}, f"{told_by} tell {_moved_by(found)}, which {why}"
     if moves:
-        words = f"{_moved_by(found)}, told by opposite rays"
+        words = f"{_moved_by(found)}, told by {told_by}"
         logger.warning("The axis of rotation was off. Moved: %s. align=False leaves it.", words)
     else:
         logger.info("Alignment: %s", words)
@@ -82,7 +86,7 @@ def is_known(answer: Answer) -> bool:
     return (
         "error" in evidence
         and evidence["error"] <= _KNOWN
-        and (bool(answer.value) or "moved" not in evidence)
+        and (bool(answer.value) or "better" not in evidence)
     )
 
 
@@ -93,12 +97,7 @@ def aligned(problem: Problem, moves: dict[str, Any]) -> Problem:
     import torch
 
     values = {name: torch.tensor(value, dtype=torch.float64) for name, value in moves.items()}
-    return problem.seen_by(moved_geometry(Scanner(problem.geometry, axis_of(problem)), values))
-
-
-def axis_of(problem: Problem) -> np.ndarray:
-    """A point on the axis of rotation, in the solver's coordinates."""
-    return -problem.centre / problem.length
+    return problem.seen_by(moved_geometry(Scanner(problem.geometry, problem.axis), values))
 
 
 def _in_words(found: AxisOffset) -> str:
@@ -141,29 +140,30 @@ def _warn_of_angles(rays: OppositeRays, told: AxisOffset) -> None:
         )
 
 
-def _asked_of_fits(
-    problem: Problem, moves: dict[str, Any], options: FitOptions
-) -> tuple[dict[str, float], str]:
-    """Misfit of held-out rays without the moves and moved, and what is to be said where the latter is not less.
-
-    A fit that fails confirms nothing. Of one over several processes the others may be left behind: then the run fails.
-    """
+def _told_by_fits(
+    problem: Problem, rays: AxisOffset, options: FitOptions
+) -> tuple[AxisOffset, str, FitsByAxis | None]:
+    """What short fits tell, who told it, and the fits; what opposite rays tell, where they know it better."""
+    near = rays.columns if not rays.doubt and abs(rays.columns) > 2 * rays.error else 0.0
     try:
-        told, moved = (_held_out(one, options) for one in (problem, aligned(problem, moves)))
-    except Exception as error:
-        if current_ranks().count > 1:
-            raise
-        logger.warning("A short fit failed, so the axis stays as told: %r", error)
-        return {}, f"could not be asked of two short fits: {error!r}"
-    return {"without": told, "moved": moved}, "rays held out of two short fits do not confirm"
+        found, fits = axis_by_fits(problem, near, _KNOWN, options)
+    except Exception as broken:
+        logger.warning("A short fit failed, so it does not tell the axis of rotation: %r", broken)
+        return rays, _RAYS, None
+    if found.error < rays.error:
+        return found, _FITS, fits
+    return rays, _RAYS, fits
 
 
-def _held_out(problem: Problem, options: FitOptions) -> float:
-    """Misfit of rays that are held out of a short fit by joined pixels."""
-    factor = 1
-    while problem.geometry.columns // (2 * factor) >= _FEWEST_COLUMNS:
-        factor *= 2
-    coarse, _ = coarse_problem(problem, factor)
-    short = FitOptions(coarse_settings(options.settings), None, options.seed, options.device)
-    start, _ = first_volume(coarse, options.device, short.settings)
-    return short_fit(coarse, start, {}, short, fewest_steps=_STEPS).held_out
+def _asked_of_fits(
+    problem: Problem, columns: float, fits: FitsByAxis | None, options: FitOptions
+) -> tuple[dict[str, float], str]:
+    """Share by which the misfit of held-out rays falls if moved, its error, and what is said where it does not."""
+    try:
+        fits = fits or fits_that_show(problem, columns, options)
+        told, moved = (fits.misfits(place) for place in (0.0, columns))
+    except Exception as broken:
+        logger.warning("A short fit failed, so the axis stays as told: %r", broken)
+        return {}, f"could not be asked of two short fits: {broken!r}"
+    better, error = fall_of_misfits(told, moved, 0.0)
+    return {"better": better, "better_error": error}, "rays held out of two short fits do not confirm"

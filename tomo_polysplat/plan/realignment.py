@@ -25,7 +25,6 @@ from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.nuisances.alignment import Alignment
 from tomo_polysplat.nuisances.move_estimate import shifts_of_views, whole_moves
 from tomo_polysplat.plan.answer import Answer, Status
-from tomo_polysplat.plan.axis import axis_of
 from tomo_polysplat.plan.coarse import coarse_problem, coarse_settings
 from tomo_polysplat.plan.fall_of_misfits import fall_of_misfits
 from tomo_polysplat.plan.first_look import Look
@@ -174,7 +173,7 @@ class _Realignment:
 
     def __init__(self, problem: Problem, axis: Answer, options: FitOptions) -> None:
         self.problem, self.options = problem, options
-        self.scanner = Scanner(problem.geometry, axis_of(problem))
+        self.scanner = Scanner(problem.geometry, problem.axis)
         whole = ["u"] if problem.geometry.planar else list(_WHOLE)
         if axis.evidence.get("error", math.inf) <= _AXIS_KNOWN:
             whole.remove("u")
