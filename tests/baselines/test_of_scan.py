@@ -1,5 +1,7 @@
 """The usual methods on a scan, and the comparison: what they are right about, and the table and figure of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -32,6 +34,13 @@ def test_methods_come_as_results_of_the_scan(pins, made):
         assert one.is_monochromatic and one.provenance["scan"] == pins.name
     assert made["fdk"].energy_kev is None, "of a scan with many energies it has no known one"
     assert made["water_bhc"].energy_kev == pytest.approx(pins.spectrum.effective_energy)
+
+
+def test_one_energy_needs_no_water_correction(pins, made):
+    scan = replace(pins, spectrum=tps.Spectrum.monochromatic(57.0))
+    same = tps.baselines.water_bhc(scan, device="cpu")
+    np.testing.assert_array_equal(same.volume, made["fdk"].volume)
+    assert same.energy_kev == 57.0 and same.provenance["method"] == "FDK"
 
 
 def test_metal_costs_what_it_is_known_to_cost(outcome):
@@ -115,6 +124,8 @@ def test_mistakes_are_named(pins, made):
     with pytest.raises(ValueError, match="scan: expected a scan with its spectrum"):
         bare = tps.Scan(pins.projections, pins.proj_geom, pins.vol_geom)
         tps.baselines.water_bhc(bare)
+    with pytest.raises(ValueError, match="scan: expected a scan with a unit of length"):
+        tps.baselines.water_bhc(replace(pins, unit="pixel"))
     with pytest.raises(ValueError, match="small: expected shape"):
         tps.compare(pins.truth, {"small": pins.truth[:5]})
     with pytest.raises(ValueError, match="volumes: expected a mapping"):

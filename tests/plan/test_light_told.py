@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tomo_polysplat.fit.residual_sums import ResidualSums
+from tomo_polysplat.nuisances.drift import Drift
 from tomo_polysplat.nuisances.gains import Gains
 from tomo_polysplat.nuisances.light_factor import WORTH
 from tomo_polysplat.plan import light_told
@@ -106,3 +107,24 @@ def test_going_farther_ends_where_the_rest_is():
             plain -= (1 - r) * plain
             farther -= (1 + light_told._FURTHER) * (1 - r) * farther
         assert abs(farther) < 0.2 if r < 0.9 else farther < plain**1.6
+
+
+@pytest.mark.parametrize(("seen", "told"), [(0.2, True), (0.9, False)])
+def test_a_drift_that_no_rays_beside_the_object_tell_is_told_with_what_looks_alike(seen, told):
+    """Of a body that the detector cuts off the part that is not seen changes from view to view, too."""
+    views, depths = 53, 3
+    rng = np.random.default_rng(8)
+    drift = 0.03 * np.cos(2 * np.arange(views) * 2 * np.pi / views)
+    count = np.full((2, views, depths), 40.0)
+    count[:, int(seen * views) :, 0] = 0
+    view = rng.integers(views, size=900)
+    by_depth = count * (drift[:, None] + rng.normal(0, 1e-4, count.shape))
+    residual = drift[view] + rng.normal(0, 1e-3, 900)
+    sums = ResidualSums(
+        *np.zeros((2, 8, 3, 5)), count, by_depth, view, view, residual, np.full(900, 1e-3), np.arange(views)
+    )
+    found = light_told.light_told(_Scan(0.0, views), sums, Settings(gains=False))["drift"]
+    np.testing.assert_allclose(found.change, drift, atol=1e-3)
+    words = {"drift": found.answer().value, "beside": found.answer().evidence["beside"]}
+    assert found.kept and ("matter" in found.why) == told and ("matter" in Drift.told(words)) == told
+    assert ("source whose" in Drift.told(words)) != told

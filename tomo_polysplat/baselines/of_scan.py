@@ -82,15 +82,21 @@ def water_bhc(scan: Scan, *, device: str = "auto") -> Result:
     Returns
     -------
     Result
-        Attenuation at the effective energy, right where the object is water.
+        Attenuation at the effective energy, right where the object is water; that of `fdk` under one energy.
 
     Raises
     ------
     ValueError
-        For a scan without spectrum, or one that filtered backprojection does not fit.
+        For a scan without spectrum or unit of length, or one that filtered backprojection does not fit.
     """
     if scan.spectrum is None:
         raise fail("scan", "a scan with its spectrum", "none", "pass spectrum= to load_scan")
+    if scan.spectrum.is_monochromatic:
+        return _result(scan, "FDK", fdk_of_arrays.fdk, device, None)
+    if scan.unit == "pixel":
+        raise fail(
+            "scan", "a scan with a unit of length", "pixels", "how much water hardens depends on lengths"
+        )
     return _result(scan, "FDK after water correction", water_bhc_of_arrays.water_bhc, device, scan.spectrum)
 
 

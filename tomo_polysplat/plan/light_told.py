@@ -48,7 +48,7 @@ class LightTold:
         What is taken out from now on, less what was before: (views looked at,) of drift, (rows, columns) of gains.
     why : str
     evidence : dict of str to float
-        See `nuisances.light_factor.LightFactor.gate`.
+        See `nuisances.light_factor.LightFactor.gate`; of drift, ``beside`` as well, as `Drift.told` takes it.
     """
 
     kept: bool
@@ -121,7 +121,7 @@ def light_told(problem: Problem, sums: ResidualSums, settings: Settings) -> dict
     if wanted[Drift.name] is not False:
         taken = problem.taken.drift[sums.views]
         found = drift_of_views(sums.count, sums.by_depth + sums.count * taken[:, None])
-        told[Drift.name] = drift = _judged(Drift, found, taken, sums, sums.view, settings)
+        told[Drift.name] = drift = _beside_told(_judged(Drift, found, taken, sums, sums.view, settings), sums)
         sums = sums.without_drift(drift.change)
     if wanted[Gains.name] is not False:
         taken = problem.taken.gains
@@ -144,6 +144,13 @@ def _judged(
     verdict = kind.gate(evidence)
     kept = verdict.kept or (getattr(settings, kind.name) is True and evidence["rms"] > 0)
     return LightTold(kept, found - taken if kept else -taken, verdict.why, evidence)
+
+
+def _beside_told(drift: LightTold, sums: ResidualSums) -> LightTold:
+    """The same, with the share of views in which rays pass beside the object, and words where too few do."""
+    beside = {"beside": float((sums.count[..., 0] > 0).any(axis=0).mean())}
+    alike = Drift.looks_alike(beside) if drift.evidence["rms"] > 0 else ""
+    return replace(drift, why="; ".join(filter(None, (drift.why, alike))), evidence=drift.evidence | beside)
 
 
 def _axis_column(problem: Problem) -> float:

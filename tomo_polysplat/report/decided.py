@@ -120,6 +120,7 @@ def _of_nuisances(plan: Mapping[str, Answer]) -> dict[str, Any]:
     if "fitted_blur" in plan and plan["detector_blur"].status is Status.ASKED:
         values["blur"] = plan["fitted_blur"].value
     values |= {name: plan[name].value for name in ("bowtie", "gains", "drift") if name in plan}
+    values |= {"beside": plan["drift"].evidence.get("beside", 1.0)} if "drift" in plan else {}
     return values | ({"pixel_rays": plan["pixel_rays"].value} if "pixel_rays" in plan else {})
 
 
