@@ -14,6 +14,7 @@ from tomo_polysplat.plan import axis
 from tomo_polysplat.plan.alignment import moves_of
 from tomo_polysplat.plan.coarse import joined_pixels
 from tomo_polysplat.plan.fit_options import FitOptions
+from tomo_polysplat.report.decided import doubts
 from tomo_polysplat.scan.axis_offset import AxisOffset
 from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.scan.layout import vector_form
@@ -123,6 +124,7 @@ def test_angles_that_run_backwards_are_said(caplog):
         geometry = from_astra(scan.proj_geom, scan.vol_geom)
         answer = axis.find_axis(Problem.of(projections, *geometry, "cm", None, None), *rest)
         assert answer.value == {} and ("angles times -1" in caplog.text) is said
+        assert any("angles times -1" in doubt for doubt in doubts({"alignment": answer})) is said
 
 
 def test_a_user_who_interrupts_the_probe_is_heard(monkeypatch):

@@ -57,10 +57,11 @@ def find_axis(problem: Problem, options: FitOptions, report: Callable[[float, st
     report(0.0, "axis of rotation")
     found, rays = _told_by_rays(problem)
     moves: dict[str, Any] = {}
+    turned = 0.0
     if rays is not None and (found.doubt or found.error > _AGREED):
-        _warn_of_angles(rays, found)
+        turned = _told_of_angles(rays, found)
     told_by, fits = _RAYS, None
-    if options.time_budget is None and not found.error <= _KNOWN:
+    if not turned and options.time_budget is None and not found.error <= _KNOWN:
         found, told_by, fits = _told_by_fits(problem, found, options)
     evidence = {} if found.doubt else {"offset": found.columns, "error": found.error}
     needed = _SURE if options.time_budget is None else _SURE_ALONE
@@ -77,6 +78,10 @@ def find_axis(problem: Problem, options: FitOptions, report: Callable[[float, st
         logger.warning("The axis of rotation was off. Moved: %s. align=False leaves it.", words)
     else:
         logger.info("Alignment: %s", words)
+    if turned:
+        said = f"opposite rays agree {turned:.1f} times better with the angles turned round: {REMEDY}"
+        logger.warning("%s.", said.capitalize())
+        words, evidence = f"{words}; {said}", evidence | {"turned": turned}
     return Answer(moves, words, Status.ASKED, evidence)
 
 
@@ -127,17 +132,13 @@ def _told_by_rays(problem: Problem) -> tuple[AxisOffset, OppositeRays | None]:
         return AxisOffset(0.0, np.inf, f"comparing them failed: {error!r}"), None
 
 
-def _warn_of_angles(rays: OppositeRays, told: AxisOffset) -> None:
-    """Say that a fan or a cone went the other way round, where opposite rays that do not tell an axis tell that."""
+def _told_of_angles(rays: OppositeRays, told: AxisOffset) -> float:
+    """How many times better opposite rays of a fan or a cone agree the other way round; 0 where they tell nothing."""
     try:
-        better = runs_backwards(rays, told)
+        return runs_backwards(rays, told)
     except Exception as error:
         logger.debug("Which way the angles go is not told: %r", error)
-        return
-    if better:
-        logger.warning(
-            "Opposite rays agree %.1f times better with the angles turned round: %s.", better, REMEDY
-        )
+        return 0.0
 
 
 def _told_by_fits(

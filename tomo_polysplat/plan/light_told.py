@@ -149,7 +149,7 @@ def _judged(
 def _beside_told(drift: LightTold, sums: ResidualSums) -> LightTold:
     """The same, with the share of views in which rays pass beside the object, and words where too few do."""
     beside = {"beside": float((sums.count[..., 0] > 0).any(axis=0).mean())}
-    alike = Drift.looks_alike(beside) if drift.evidence["rms"] > 0 else ""
+    alike = Drift.looks_alike(beside) if drift.kept else ""
     return replace(drift, why="; ".join(filter(None, (drift.why, alike))), evidence=drift.evidence | beside)
 
 
