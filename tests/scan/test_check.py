@@ -15,7 +15,7 @@ from tomo_polysplat.scan.check import check_scan
 from tomo_polysplat.scan.dropouts import dropped_rays
 from tomo_polysplat.scan.io import save_scan
 from tomo_polysplat.scan.probes.measured import Measured
-from tomo_polysplat.scan.probes.rays import bad_rays
+from tomo_polysplat.scan.probes.rays import DEAD, STARVED, bad_rays
 from tomo_polysplat.simulate.phantom import Part, Phantom
 from tomo_polysplat.simulate.scanner import Scanner
 from tomo_polysplat.simulate.scenes import scan_phantom, simulate_scan
@@ -129,6 +129,18 @@ def test_dead_pixels(scan, value):
     bad.swapaxes(1, 2)[dead] = value
     found = defects(replace(scan, projections=bad, valid=np.isfinite(bad)))
     assert set(found) == {"bad rays"} and "dead pixels" in found["bad rays"].text
+
+
+def test_a_pixel_without_light_is_dead_though_metal_is_beside_it_at_times():
+    """Opaque matter that hides a pixel in all views is there in all of them."""
+    scan = simulated("pins", "parallel")
+    dark = scan.projections > 0.7 * scan.projections.max()
+    column = int(dark.mean(axis=(0, 1)).argmax())
+    assert 0.05 < dark[:, :, column].mean() < 0.6
+    bad = scan.projections.copy()
+    bad[:, :, column] = np.inf
+    kinds = bad_rays(Measured(replace(scan, projections=bad, valid=np.isfinite(bad))))
+    assert kinds[DEAD][:, :, column].all() and not kinds[STARVED].any()
 
 
 def test_zeros_in_single_rays(scan):

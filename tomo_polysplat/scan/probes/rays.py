@@ -101,7 +101,9 @@ def _starved(projections: np.ndarray, valid: np.ndarray, level: float) -> np.nda
         around[..., :-shift] = np.maximum(around[..., :-shift], values[..., shift:])
     alone = ~np.isfinite(around)
     lit = np.asarray(valid.any(axis=1))[:, None]
-    return ~valid & ((around > _OPAQUE * level) | alone & lit)
+    # What is opaque in all views is there in all of them: a pixel that sees none among lit ones is dead.
+    dead = ~lit & (~alone & (around <= _OPAQUE * level)).any(axis=1)[:, None]
+    return ~valid & ~dead & ((around > _OPAQUE * level) | alone & lit)
 
 
 def _dark_end(projections: np.ndarray, valid: np.ndarray) -> np.ndarray:
