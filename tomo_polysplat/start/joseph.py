@@ -110,6 +110,7 @@ def _trace(vectors, cone, size, voxels, shape, projections, adjoint, axis, first
                     continue
                 a0, a1 = (first, last) if a == axis else (0, counts[a])
                 b0, b1 = (first, last) if b == axis else (0, counts[b])
+                ahead, right, up = strides[m], strides[a], strides[b]
                 square = (ray[0] * size[0]) ** 2 + (ray[1] * size[1]) ** 2 + (ray[2] * size[2]) ** 2
                 length = np.sqrt(square) / abs(ray[m])
                 value = projections[view, i, j] * length
@@ -118,14 +119,30 @@ def _trace(vectors, cone, size, voxels, shape, projections, adjoint, axis, first
                     pa, pb = start_a + k * slope_a, start_b + k * slope_b
                     ia, ib = int(np.floor(pa)), int(np.floor(pb))
                     fa, fb = pa - ia, pb - ib
-                    at = k * strides[m] + ia * strides[a] + ib * strides[b]
+                    at = k * ahead + ia * right + ib * up
+                    if a0 <= ia and ia + 1 < a1 and b0 <= ib and ib + 1 < b1:
+                        # All four, as nearly always; an index without a sign is not asked if it counts from the end.
+                        ea, eb = 1.0 - fa, 1.0 - fb
+                        v00, v01 = np.uint64(at), np.uint64(at + up)
+                        v10, v11 = np.uint64(at + right), np.uint64(at + right + up)
+                        if adjoint:
+                            voxels[v00] += ea * eb * value
+                            voxels[v01] += ea * fb * value
+                            voxels[v10] += fa * eb * value
+                            voxels[v11] += fa * fb * value
+                        else:
+                            total += ea * eb * voxels[v00]
+                            total += ea * fb * voxels[v01]
+                            total += fa * eb * voxels[v10]
+                            total += fa * fb * voxels[v11]
+                        continue
                     for da in range(2):
                         if a0 <= ia + da < a1:
                             wa = fa if da else 1.0 - fa
                             for db in range(2):
                                 if b0 <= ib + db < b1:
                                     weight = wa * (fb if db else 1.0 - fb)
-                                    voxel = at + da * strides[a] + db * strides[b]
+                                    voxel = at + da * right + db * up
                                     if adjoint:
                                         voxels[voxel] += weight * value
                                     else:
