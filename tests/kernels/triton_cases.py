@@ -93,20 +93,22 @@ def know_types() -> None:
     made, shapes = {}, {}
     begin, broadcast = tl.block_type.__init__, semantic.TritonSemantic.broadcast_impl_value
 
+    def sides(shape):
+        if shape not in shapes:
+            shapes[shape] = tl.constexpr(math.prod(shape)), tl.core.tuple([tl.constexpr(n) for n in shape])
+        return shapes[shape]
+
     def block_type(self, element_ty, shape):
         key = (element_ty.name, *(getattr(side, "value", side) for side in shape))
         if key not in made:
             begin(self, element_ty, shape)
-            made[key] = dict(vars(self))
+            made[key] = vars(self) | {"of_all": sides(tuple(self.shape))}
         vars(self).update(made[key])
 
     def tensor(self, handle, type):
-        shape = tuple(type.shape) if type.is_block() else ()
-        if shape not in shapes:
-            sides = tl.core.tuple([tl.constexpr(side) for side in shape])
-            shapes[shape] = tl.constexpr(math.prod(shape)), sides
         self.handle, self.type, self.dtype = handle, type, type.scalar
-        self.numel, self.shape = shapes[shape]
+        known = vars(type).get("of_all")
+        self.numel, self.shape = known or sides(tuple(type.shape) if type.is_block() else ())
 
     def together(self, one, other):
         alike = one.type.is_block() and other.type.is_block() and [*one.type.shape] == [*other.type.shape]
@@ -176,22 +178,40 @@ def work_out_at_once() -> None:
         return
     plain = {"fp32", "fp64", "int32", "int64"}
 
+    def made(data, like):
+        handle = object.__new__(
+            TensorHandle
+        )  # of one type with what it is made of: there is nothing to check
+        handle.data, handle.dtype, handle.attr = data, like.dtype, {}
+        return tl.tensor(handle, like.type)
+
     def at_once(usual, operation):
         def work_out(self, one, other, sanitize_overflow):
             tensor = one if type(one) is tl.tensor else other
             checked = sanitize_overflow and self.builder.options.sanitize_overflow
-            if type(tensor) is not tl.tensor or tensor.dtype.name not in plain or checked:
+            if type(tensor) is not tl.tensor or (name := tensor.dtype.name) not in plain or checked:
                 return usual(self, one, other, sanitize_overflow)
+            both = type(one) is type(other) is tl.tensor
+            if both and name == other.dtype.name and one.shape is other.shape:
+                return made(operation(one.handle.data, other.handle.data), one)
             one, other = self.binary_op_type_checking_impl(one, other, True, True)
             if one.dtype.name not in plain or one.dtype.name != other.dtype.name:
                 return usual(self, one, other, sanitize_overflow)
-            return tl.tensor(TensorHandle(operation(one.handle.data, other.handle.data), one.dtype), one.type)
+            return made(operation(one.handle.data, other.handle.data), one)
 
         return work_out
 
     for name, operation in (("add", np.add), ("sub", np.subtract), ("mul", np.multiply)):
         usual = getattr(semantic.TritonSemantic, name)
         setattr(semantic.TritonSemantic, name, at_once(usual, operation))
+    convert = semantic.TritonSemantic.cast
+
+    def cast(self, of, kind, *rest):
+        # To what it is already.
+        there = not rest and type(kind) is tl.dtype and kind.name == of.dtype.name
+        return of if there else convert(self, of, kind, *rest)
+
+    semantic.TritonSemantic.cast = cast
 
 
 def call_at_once() -> None:
@@ -203,6 +223,22 @@ def call_at_once() -> None:
     if [*inspect.signature(interpreter._patch_attr).parameters][2:] != ["member", "builder", "scope"]:
         return
     unwrap, plain = tl.core._unwrap_if_constexpr, {tl.tensor, int, float, bool, type(None)}
+    operators = {
+        f"__{turned}{name}__": (name, turned) for name in ("add", "sub", "mul") for turned in ("", "r")
+    }
+
+    def operator(call, name, turned):
+        work_out, given = (
+            getattr(type(interpreter.interpreter_semantic), name),
+            interpreter.interpreter_semantic,
+        )
+
+        def operate(self, other):
+            if type(other) not in plain:
+                return call(self, other)
+            return work_out(given, other, self, True) if turned else work_out(given, self, other, True)
+
+        return operate
 
     def patch(of, name, member, builder, scope):
         # Most wrap the function itself, to check that `_semantic` is given.
@@ -212,7 +248,8 @@ def call_at_once() -> None:
             named["_semantic"] = given
             return function(*args, **named)
 
-        scope.set_attr(of, name, call)
+        quick = of is tl.tensor and name in operators
+        scope.set_attr(of, name, operator(call, *operators[name]) if quick else call)
 
     interpreter._patch_attr = patch
     tl.core._unwrap_if_constexpr = lambda of: of if type(of) in plain else unwrap(of)
