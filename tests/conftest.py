@@ -9,6 +9,7 @@ import atexit
 import gc
 import math
 import os
+import pickle
 import signal
 from typing import TYPE_CHECKING
 from unittest import mock
@@ -96,6 +97,23 @@ def spectra_are_not_doubted(request):
     from tomo_polysplat.plan import one_energy
 
     with mock.patch.object(one_energy, "_by_seeds", lambda *_: math.inf):
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def truths_are_made_once():
+    """A phantom on a grid is made once for all scans of it; `simulate.truth` itself is asked in its own tests."""
+    from tomo_polysplat.simulate import scenes
+
+    make, made = scenes.voxelise_truth, {}
+
+    def once(*of, **options):
+        key = pickle.dumps((of, options))
+        if key not in made:
+            made[key] = make(*of, **options)
+        return tuple(array.copy() for array in made[key])
+
+    with mock.patch.object(scenes, "voxelise_truth", once):
         yield
 
 
