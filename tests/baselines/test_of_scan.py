@@ -14,7 +14,7 @@ from tomo_polysplat.scan.geometry import VolumeGrid
 
 @pytest.fixture(scope="module")
 def pins():
-    return tps.simulate_scan("pins", size=33, views=61, photons=1e6)
+    return tps.simulate_scan("pins", size=25, views=45, photons=1e6)
 
 
 @pytest.fixture(scope="module")

@@ -98,7 +98,7 @@ def test_little_scatter_is_found_where_it_is_much_of_the_light_behind_metal(scat
         },
         spectrum=spectrum,
         unit="cm",
-        settings=QUICK,
+        settings=QUICK | {"views_per_step": 10},
         progress=False,
         align=False,
         callbacks=[asked],
