@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -29,12 +30,22 @@ logger = logging.getLogger(__name__)
 # An axis is moved that is off by more than this, in columns, beyond so many standard errors; by so many where a time
 # budget leaves no room for fits. 158 perfect scans of 10 kinds came to 3.3 at most (docs/decisions/alignment.md).
 _TOLERATED, _SURE, _SURE_ALONE = 0.03, 4.0, 8.0
-# Who tells it.
-_RAYS, _FITS = "opposite rays", "short fits"
 # An error below this is as good as none: it costs less than a tenth of a decibel.
 _KNOWN = 0.05
+# Fits begin where opposite rays have the axis if it is off by so many of their standard errors.
+_NEAR = 2.0
 # An axis known to this has opposite rays that agree: which way the angles go need not be asked, which saves its time.
 _AGREED = 0.02
+
+
+@dataclass(frozen=True)
+class _Told:
+    """Where the axis is, who tells it, the fits that were made, and how much better rays agree the other way round."""
+
+    found: AxisOffset
+    by: str
+    fits: FitsByAxis | None
+    turned: float = 0.0
 
 
 def find_axis(problem: Problem, options: FitOptions, report: Callable[[float, str], Any]) -> Answer:
@@ -55,33 +66,27 @@ def find_axis(problem: Problem, options: FitOptions, report: Callable[[float, st
         not tell, or two fits, as told and moved, do not confirm it by rays held out of them.
     """
     report(0.0, "axis of rotation")
-    found, rays = _told_by_rays(problem)
-    moves: dict[str, Any] = {}
-    turned = 0.0
-    if rays is not None and (found.doubt or found.error > _AGREED):
-        turned = _told_of_angles(rays, found)
-    told_by, fits = _RAYS, None
-    if not turned and options.time_budget is None and not found.error <= _KNOWN:
-        found, told_by, fits = _told_by_fits(problem, found, options)
+    told = _told(problem, options)
+    found, moves = told.found, dict[str, Any]()
     evidence = {} if found.doubt else {"offset": found.columns, "error": found.error}
     needed = _SURE if options.time_budget is None else _SURE_ALONE
     words = _in_words(found)
     if not found.doubt and abs(found.columns) > _TOLERATED + needed * found.error:
         moves = {"u": found.columns}
         if options.time_budget is None:
-            asked, why = _asked_of_fits(problem, found.columns, fits, options)
+            asked, why = _asked_of_fits(problem, found.columns, told.fits, options)
             evidence = evidence | asked if asked else {}
             if not asked or not asked["better"] > 0:
-                moves, words = {}, f"{told_by} tell {_moved_by(found)}, which {why}"
+                moves, words = {}, f"{told.by} tell {_moved_by(found)}, which {why}"
     if moves:
-        words = f"{_moved_by(found)}, told by {told_by}"
+        words = f"{_moved_by(found)}, told by {told.by}"
         logger.warning("The axis of rotation was off. Moved: %s. align=False leaves it.", words)
     else:
         logger.info("Alignment: %s", words)
-    if turned:
-        said = f"opposite rays agree {turned:.1f} times better with the angles turned round: {REMEDY}"
+    if told.turned:
+        said = f"opposite rays agree {told.turned:.1f} times better with the angles turned round: {REMEDY}"
         logger.warning("%s.", said.capitalize())
-        words, evidence = f"{words}; {said}", evidence | {"turned": turned}
+        words, evidence = f"{words}; {said}", evidence | {"turned": told.turned}
     return Answer(moves, words, Status.ASKED, evidence)
 
 
@@ -119,6 +124,25 @@ def _moved_by(found: AxisOffset) -> str:
     return f"u {found.columns:+.3f} px (standard error {found.error:.2g})"
 
 
+def _told(problem: Problem, options: FitOptions) -> _Told:
+    """What opposite rays tell, or short fits where these know the axis better."""
+    found, rays = _told_by_rays(problem)
+    turned = 0.0
+    if rays is not None and (found.doubt or found.error > _AGREED):
+        turned = _told_of_angles(rays, found)
+    by_rays = _Told(found, "opposite rays", None, turned)
+    # The wrong way round no axis explains the rays.
+    if turned or options.time_budget is not None or found.error <= _KNOWN:
+        return by_rays
+    near = found.columns if not found.doubt and abs(found.columns) > _NEAR * found.error else 0.0
+    try:
+        by_fits, fits = axis_by_fits(problem, near, _KNOWN, options)
+    except Exception as broken:
+        logger.warning("A short fit failed, so it does not tell the axis of rotation: %r", broken)
+        return by_rays
+    return _Told(by_fits, "short fits", fits) if by_fits.error < found.error else replace(by_rays, fits=fits)
+
+
 def _told_by_rays(problem: Problem) -> tuple[AxisOffset, OppositeRays | None]:
     """What opposite rays tell, and these of a fan or a cone: nothing where that fails, for the run does not need it."""
     try:
@@ -139,21 +163,6 @@ def _told_of_angles(rays: OppositeRays, told: AxisOffset) -> float:
     except Exception as error:
         logger.debug("Which way the angles go is not told: %r", error)
         return 0.0
-
-
-def _told_by_fits(
-    problem: Problem, rays: AxisOffset, options: FitOptions
-) -> tuple[AxisOffset, str, FitsByAxis | None]:
-    """What short fits tell, who told it, and the fits; what opposite rays tell, where they know it better."""
-    near = rays.columns if not rays.doubt and abs(rays.columns) > 2 * rays.error else 0.0
-    try:
-        found, fits = axis_by_fits(problem, near, _KNOWN, options)
-    except Exception as broken:
-        logger.warning("A short fit failed, so it does not tell the axis of rotation: %r", broken)
-        return rays, _RAYS, None
-    if found.error < rays.error:
-        return found, _FITS, fits
-    return rays, _RAYS, fits
 
 
 def _asked_of_fits(
