@@ -15,6 +15,7 @@ import numpy as np
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.axis_by_fits import FitsByAxis, axis_by_fits, fits_that_show
+from tomo_polysplat.plan.coarse import LEAST_PASSES
 from tomo_polysplat.plan.fall_of_misfits import fall_of_misfits
 from tomo_polysplat.plan.fit_options import FitOptions
 from tomo_polysplat.scan.axis_offset import AxisOffset, offset_of
@@ -131,8 +132,9 @@ def _told(problem: Problem, options: FitOptions) -> _Told:
     if rays is not None and (found.doubt or found.error > _AGREED):
         turned = _told_of_angles(rays, found)
     by_rays = _Told(found, "opposite rays", None, turned)
+    hurried = options.time_budget is not None or (options.settings.passes or np.inf) < LEAST_PASSES
     # The wrong way round no axis explains the rays.
-    if turned or options.time_budget is not None or found.error <= _KNOWN:
+    if turned or hurried or found.error <= _KNOWN:
         return by_rays
     near = found.columns if not found.doubt and abs(found.columns) > _NEAR * found.error else 0.0
     try:

@@ -14,8 +14,11 @@ from tomo_polysplat.parallel import run_tasks, split_range
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.settings import Settings
 
-__all__ = ["coarse_problem", "coarse_settings", "joined_pixels"]
+__all__ = ["LEAST_PASSES", "coarse_problem", "coarse_settings", "joined_pixels"]
 
+# A run of fewer passes is not asked by joined pixels: these are a quarter of all, or less, and a pass over them would
+# take more than a tenth of it.
+LEAST_PASSES = 2.5
 # Voxels of the coarsest volume along its edges, and the share of rays that is held out of a fit.
 _FEWEST_VOXELS, _HELD_OUT = 8, 0.1
 # Rays that are joined at once.

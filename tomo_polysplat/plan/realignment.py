@@ -25,7 +25,7 @@ from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.nuisances.alignment import Alignment
 from tomo_polysplat.nuisances.move_estimate import shifts_of_views, whole_moves
 from tomo_polysplat.plan.answer import Answer, Status
-from tomo_polysplat.plan.coarse import coarse_problem, coarse_settings
+from tomo_polysplat.plan.coarse import LEAST_PASSES, coarse_problem, coarse_settings
 from tomo_polysplat.plan.fall_of_misfits import fall_of_misfits
 from tomo_polysplat.plan.first_look import Look
 from tomo_polysplat.plan.fit_options import FitOptions
@@ -52,9 +52,6 @@ _LEAST, _SURE, _LEAST_OF_VIEWS, _FOUND = 0.01, 2.5, 0.05, 2.0
 _BETTER, _SURELY_BETTER = 0.01, 2.5
 # Fits, their passes, and the change, in pixels, after which the moves are known.
 _ROUNDS, _PASSES, _SETTLED = 5, 1.0, 0.02
-# A run of fewer passes is not asked by joined pixels: these are a quarter of all, or less, and a pass over them would
-# take more than a tenth of it.
-_LEAST_PASSES = 2.5
 # A larger detector is asked by joined pixels, of which at least so many columns are left: moves show to hundredths.
 _COLUMNS = 256
 # A step may be so many times what a fit says. An axis stays if less than this of a step is gained: half acquisitions
@@ -114,7 +111,7 @@ def realigned(
         That of the axis, where there is no more to move, or where held-out rays do not confirm it.
     """
     joined = is_joined(problem)
-    if (options.settings.passes or math.inf) < _LEAST_PASSES if joined else first is None:
+    if (options.settings.passes or math.inf) < LEAST_PASSES if joined else first is None:
         return axis
     report(0.0, "alignment")
     try:
