@@ -97,4 +97,11 @@ def test_less_than_half_a_turn_tells_the_axis_by_fits():
 def test_an_object_that_can_take_the_place_of_the_axis_is_not_asked(monkeypatch):
     monkeypatch.setattr(axis_by_fits.FitsByAxis, "misfits", lambda *_: pytest.fail("a fit was made"))
     answer = found(50.0, 0.7)
-    assert answer.value == {} and "do not tell" in answer.why and not axis.is_known(answer)
+    assert answer.value == {} and "take the place of a move" in answer.why and not axis.is_known(answer)
+
+
+def test_few_views_with_rays_tell_nothing():
+    curve = Curve(lambda place: place**2)
+    curve.views[:-20] = np.nan
+    found = axis_by_fits._least(curve, 0.0, 0.05, 6.0)
+    assert "too few views" in found.doubt and len(curve.asked) == 3

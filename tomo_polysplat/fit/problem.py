@@ -193,10 +193,14 @@ class Problem:
         """Shortest edge of a voxel, in the solver's coordinates."""
         return float(self.grid.voxel_size[: self.dimensions].min())
 
-    def seen_by(self, geometry: Geometry) -> Problem:
-        """The same measurements by a scanner that stood elsewhere; copies of them on devices serve both."""
+    def seen_by(self, geometry: Geometry, *, nearly: bool = False) -> Problem:
+        """The same measurements by a scanner that stood elsewhere; copies of them on devices serve both.
+
+        Where it is ``nearly`` the same, what lies beside the volume is not asked again.
+        """
         other, known = replace(self, geometry=geometry), self._known
-        shared = _Known(known.copies, known.level, noise=known.noise, taken=known.taken)
+        closed = known.closed if nearly else None
+        shared = _Known(known.copies, known.level, closed=closed, noise=known.noise, taken=known.taken)
         object.__setattr__(other, "_known", shared)
         return other
 

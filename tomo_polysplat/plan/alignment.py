@@ -114,7 +114,9 @@ def align(
     last = record["levels"][-1]
     evidence = {name: float(value) for name, value in last.items() if isinstance(value, float)}
     if axis is not None:
-        evidence |= {name: axis.evidence[name] for name in ("offset", "error") if name in axis.evidence}
+        evidence |= {
+            name: axis.evidence[name] for name in ("offset", "error", "turned") if name in axis.evidence
+        }
     words = alignment.describe() if moves else "the rays confirm no move"
     logger.info("Alignment: %s", words)
     return Answer(moves, words, Status.ASKED, evidence)

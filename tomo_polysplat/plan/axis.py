@@ -112,7 +112,7 @@ def aligned(problem: Problem, moves: dict[str, Any]) -> Problem:
 
 
 def _in_words(found: AxisOffset) -> str:
-    """What opposite rays say of an axis that stays."""
+    """What is said of an axis that stays."""
     if found.doubt:
         return f"where the axis of rotation is the rays do not tell: {found.doubt}"
     if found.error > _KNOWN:
@@ -142,7 +142,11 @@ def _told(problem: Problem, options: FitOptions) -> _Told:
     except Exception as broken:
         logger.warning("A short fit failed, so it does not tell the axis of rotation: %r", broken)
         return by_rays
-    return _Told(by_fits, "short fits", fits) if by_fits.error < found.error else replace(by_rays, fits=fits)
+    if by_fits.error < found.error:
+        return _Told(by_fits, "short fits", fits)
+    if found.doubt and by_fits.doubt:
+        found = replace(found, doubt=f"{found.doubt}; {by_fits.doubt}")
+    return replace(by_rays, found=found, fits=fits)
 
 
 def _told_by_rays(problem: Problem) -> tuple[AxisOffset, OppositeRays | None]:
@@ -172,7 +176,7 @@ def _asked_of_fits(
 ) -> tuple[dict[str, float], str]:
     """Share by which the misfit of held-out rays falls if moved, its error, and what is said where it does not."""
     try:
-        fits = fits or fits_that_show(problem, columns, options)
+        fits = fits_that_show(problem, columns, options, fits)
         told, moved = (fits.misfits(place) for place in (0.0, columns))
     except Exception as broken:
         logger.warning("A short fit failed, so the axis stays as told: %r", broken)

@@ -42,8 +42,8 @@ _APART, _WEDGE, _ROUNDS = 0.4, 6.0, 12
 _SURE = 2.5
 # Joined columns by which a detector has to be off for two fits to show it: 0.05 of one of eight columns did not.
 _SHOWN = 0.1
-# Groups of views, each left out once.
-_GROUPS = 12
+# Groups of views, each left out once, and views that tell anything.
+_GROUPS, _FEWEST_VIEWS = 12, 24
 
 
 class FitsByAxis:
@@ -61,6 +61,8 @@ class FitsByAxis:
     def __init__(self, problem: Problem, factor: int, options: FitOptions) -> None:
         self.factor = factor
         self._problem, _ = coarse_problem(problem, factor)
+        # Asked once, as its answer may be a warning.
+        self._problem.closed(options.device)
         self._scanner = Scanner(self._problem.geometry, problem.axis)
         settings = replace(coarse_settings(options.settings), passes=_PASSES)
         self._options = replace(options, settings=settings, time_budget=None)
@@ -78,8 +80,10 @@ class FitsByAxis:
         problem, settings = self._problem, self._options.settings
         if columns:
             off = {"u": torch.tensor(columns / self.factor, dtype=torch.float64)}
-            problem = problem.seen_by(moved_geometry(self._scanner, off))
+            problem = problem.seen_by(moved_geometry(self._scanner, off), nearly=True)
         lab = lab_of(problem, Plan(), self._options)
+        if not len(lab.seeds()):
+            return np.full(problem.geometry.views, np.nan)
         steps = _STEPS_PLANAR if problem.planar else _STEPS
         passes = steps * views_of_short_steps(lab.plan, problem) / problem.geometry.views
         settings = replace(settings, passes=max(_PASSES, passes))
@@ -91,8 +95,12 @@ class FitsByAxis:
         return torch.cat(found).double().cpu().numpy()
 
 
-def fits_that_show(problem: Problem, columns: float, options: FitOptions) -> FitsByAxis:
-    """Fits by the largest pixels that show a move by so many columns, or by the smallest there are."""
+def fits_that_show(
+    problem: Problem, columns: float, options: FitOptions, made: FitsByAxis | None
+) -> FitsByAxis:
+    """Fits by the largest pixels that show a move by so many columns, or by the smallest; those ``made`` if they do."""
+    if made is not None and abs(columns) >= _SHOWN * made.factor:
+        return made
     factors = joined_columns(problem.geometry.columns)
     shown = [factor for factor in factors if abs(columns) >= _SHOWN * factor]
     return FitsByAxis(problem, shown[0] if shown else factors[-1], options)
@@ -132,13 +140,18 @@ def axis_by_fits(
         return AxisOffset(0.0, np.inf, f"fewer than {FEW_VIEWS} views do not tell"), None
     if effects(scanner, ["u"], 1.0)["u"].told < _TOLD:
         return AxisOffset(0.0, np.inf, "the object can take the place of a move"), None
-    found, fits = AxisOffset(near, np.inf), None
-    for factor in joined_columns(problem.geometry.columns):
-        fits = FitsByAxis(problem, factor, options)
-        better = _least(fits, found.columns, known, LARGEST_SHARE * problem.geometry.columns)
-        found = better if better.error < found.error else found
-        if better.doubt or found.error <= known:
+    first, *others = joined_columns(problem.geometry.columns)
+    farthest = LARGEST_SHARE * problem.geometry.columns
+    fits = FitsByAxis(problem, first, options)
+    found = _least(fits, near, known, farthest)
+    for factor in others:
+        if found.doubt or found.error <= known:
             break
+        fits = FitsByAxis(problem, factor, options)
+        better = _least(fits, found.columns, known, farthest)
+        found = better if better.error < found.error else found
+    if abs(found.columns) > farthest:
+        return AxisOffset(0.0, np.inf, f"by fits it is more than {farthest:.3g} columns away"), fits
     return found, fits
 
 
@@ -146,6 +159,8 @@ def _least(fits: FitsByAxis, near: float, known: float, farthest: float) -> Axis
     """Where the misfit is least, near this place or in the direction in which it falls."""
     middle, apart = near, _APART * fits.factor
     while not (three := _Three(fits, middle, apart)).sure:
+        if three.views < _FEWEST_VIEWS:
+            return AxisOffset(0.0, np.inf, "too few views have rays that are held out of fits")
         middle, apart = three.place, 2 * apart
         if max(abs(middle), apart) > farthest:
             return AxisOffset(0.0, np.inf, f"fits explain the rays as well {farthest:.3g} columns away")
@@ -169,10 +184,12 @@ def _least(fits: FitsByAxis, near: float, known: float, farthest: float) -> Axis
 
 
 class _Three:
-    """Misfits at three places, as far apart.
+    """Misfits at three places, equally far apart.
 
     Attributes
     ----------
+    views : int
+        That have rays held out of all three fits.
     place : float
         The one of the least misfit.
     sure : bool
@@ -182,15 +199,19 @@ class _Three:
     def __init__(self, fits: FitsByAxis, middle: float, apart: float) -> None:
         self._middle, self._apart = middle, apart
         places = (middle - apart, middle, middle + apart)
-        self._misfits = np.stack([fits.misfits(place) for place in places])
-        self.place = places[int(np.argmin(np.nanmean(self._misfits, axis=1)))]
+        misfits = np.stack([fits.misfits(place) for place in places])
+        self._misfits = misfits[:, np.isfinite(misfits).all(axis=0)]
+        self.views = self._misfits.shape[1]
+        self.place, self.sure = middle, False
+        if self.views < _FEWEST_VIEWS:
+            return
+        self.place = places[int(np.argmin(self._misfits.mean(axis=1)))]
         rises = [fall_of_misfits(self._misfits[side], self._misfits[1], 0.0) for side in (0, 2)]
         self.sure = all(rise > _SURE * error for rise, error in rises)
 
     def vertex(self) -> AxisOffset:
         """Of the parabola through the misfits, with its standard error."""
-        views = np.flatnonzero(np.isfinite(self._misfits).all(axis=0))
-        groups = [part for part in np.array_split(views, _GROUPS) if len(part)]
+        groups = np.array_split(np.arange(self.views), _GROUPS)
         of_each = np.stack([self._misfits[:, part].sum(axis=1) for part in groups])
         count = np.array([len(part) for part in groups])
         without = (of_each.sum(axis=0) - of_each) / (count.sum() - count)[:, None]
@@ -202,6 +223,6 @@ class _Three:
 
 
 def _of_three(before: float, there: float, behind: float) -> float:
-    """Where the parabola through the values at -1, 0 and 1 has its least, or the lesser end where it has none."""
+    """Where the parabola through the values at -1, 0 and 1 has its least; if it has none, the end that is smaller."""
     bend = before - 2 * there + behind
     return 0.5 * (before - behind) / bend if bend > 0 else np.sign(before - behind)

@@ -140,7 +140,8 @@ def doubts(plan: Mapping[str, Answer]) -> list[str]:
     if "object" in plan:
         found.append(f"that there is an object ({plan['object'].why})")
     if "alignment" in plan and plan["alignment"].evidence.get("turned"):
-        found.append(f"all of it, and which side is left ({plan['alignment'].why})")
+        turned = plan["alignment"].evidence["turned"]
+        found.append(f"all of it (opposite rays agree {turned:.1f} times better with the angles times -1)")
     if "returned" in plan:
         found.append(f"whatever is finer than a filtered backprojection shows ({plan['returned'].why})")
     elif "rays" in plan and plan["rays"].evidence.get("far"):
