@@ -179,9 +179,8 @@ def work_out_at_once() -> None:
     plain = {"fp32", "fp64", "int32", "int64"}
 
     def made(data, like):
-        handle = object.__new__(
-            TensorHandle
-        )  # of one type with what it is made of: there is nothing to check
+        # Of one type with what it is made of: there is nothing to check.
+        handle = object.__new__(TensorHandle)
         handle.data, handle.dtype, handle.attr = data, like.dtype, {}
         return tl.tensor(handle, like.type)
 

@@ -155,7 +155,7 @@ def _beside_told(drift: LightTold, sums: ResidualSums) -> LightTold:
 
 def _axis_column(problem: Problem) -> float:
     """Where the axis of rotation is seen, in the mean of the views."""
-    seen = problem.geometry.project_points(-problem.centre[None] / problem.length)
+    seen = problem.geometry.project_points(problem.axis[None])
     return float(np.mean(seen[..., 0]))
 
 

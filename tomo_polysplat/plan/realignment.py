@@ -43,7 +43,7 @@ logger = logging.getLogger(__name__)
 # Moves of the whole scanner that are looked for, with those of single views.
 _WHOLE = ("u", "roll")
 # One is looked for where the object leaves this share of what it does (`scan.gauges.effects`), and the axis where
-# opposite rays tell it no better than this, in pixels: their error is the smaller one then.
+# it is known no better than this, in pixels, by `plan.axis`: that error is the smaller one then.
 _TOLD, _AXIS_KNOWN = 0.1, 0.02
 # Moves of more than this, in pixels of what is seen, beyond so many standard errors are looked for, and views shifted
 # by more than that; once any is, all that are sure to so many standard errors are made.
