@@ -178,6 +178,8 @@ def prepare(
         else:
             lab.plan.facts = plan.facts | lab.plan.facts
             plan = lab.plan
+        # Once: short fits about the scanner make many more.
+        logger.info("A first volume by %s.", plan.facts["start"].value)
         report(0.0, "seeds")
         if end is not None:
             seed_for_time(lab, end)

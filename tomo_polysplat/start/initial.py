@@ -76,7 +76,7 @@ def initial_volume_on(
 
 def _tell(method: str, reason: str, invalid: int, rays: int) -> None:
     left_out = f"; {invalid / rays:.2g} of the rays are left out" if invalid else ""
-    _log.info("A first volume by %s: %s%s.", method.upper(), reason, left_out)
+    _log.debug("A first volume by %s: %s%s.", method.upper(), reason, left_out)
 
 
 def _method(geometry: Geometry, grid: VolumeGrid) -> tuple[bool, str]:
