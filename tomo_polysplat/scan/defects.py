@@ -10,6 +10,7 @@ import numpy as np
 from tomo_polysplat.checks import fail, require_shape
 from tomo_polysplat.parallel import cpu_threads, run_tasks, split_range
 from tomo_polysplat.scan.counts_kernel import KINDS, count_kinds, line_integrals_of_counts
+from tomo_polysplat.scan.frame_mean import FrameMean
 
 __all__ = ["attenuation", "fill_invalid", "flat_and_dark", "unusable"]
 
@@ -46,7 +47,10 @@ def _mean_frame(name: str, frames: np.ndarray, shape: tuple[int, int]) -> np.nda
     if frames.ndim != 3 or not len(frames):
         raise fail(name, "frames of shape (frames, rows, columns)", f"shape {frames.shape}")
     require_shape(name, frames[0], shape, "(rows, columns) of the data")
-    return frames.mean(axis=0, dtype=np.float64)
+    images = FrameMean()
+    for frame in frames:
+        images.add(frame)
+    return images.mean(name)
 
 
 def attenuation(

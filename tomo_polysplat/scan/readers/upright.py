@@ -6,6 +6,7 @@ import numpy as np
 
 from tomo_polysplat.checks import require_shape
 from tomo_polysplat.evenly_spread import evenly_spread
+from tomo_polysplat.scan.frame_mean import FrameMean
 from tomo_polysplat.scan.readers.acquisition import Acquisition
 from tomo_polysplat.scan.readers.frames import Frames
 from tomo_polysplat.scan.readers.part import Part
@@ -58,10 +59,10 @@ class Upright:
         size = np.broadcast_to(np.uint8(0), frames.shape[1:])
         remedy = f"take {name} of the same scan, neither binned nor cut out"
         require_shape(name, size, self._told.frames.shape[1:], "(rows, columns) of the projections", remedy)
-        total = np.zeros(self.shape[1:])
+        images = FrameMean()
         for index in range(frames.shape[0]):
-            total += self._read(frames, [index])[0]
-        return total / frames.shape[0]
+            images.add(self._read(frames, [index])[0])
+        return images.mean(name)
 
     def bright(self, share: float) -> float:
         """The value that so many percent of the pixels of a few views are below."""
