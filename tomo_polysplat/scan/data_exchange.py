@@ -34,6 +34,7 @@ from tomo_polysplat.scan.data_exchange_pictures import input_kind, pictures_of
 from tomo_polysplat.scan.defects import flat_and_dark
 from tomo_polysplat.scan.dxchange_host import read_block
 from tomo_polysplat.scan.filter_map_file import read_filter_map
+from tomo_polysplat.scan.half_acquisition import with_room
 from tomo_polysplat.scan.hdf5 import (
     find_array,
     find_group,
@@ -112,7 +113,10 @@ def scan_from_hdf5(path: Path, options: ReadOptions, part: Part = _ALL) -> Scan:
             **known,
             filter_map=wanted.filters(read_filter_map(file, (rows, views, columns))),
         )
-    return scan if later.whole else scan_part(scan, later)
+        usual = options.proj_geom is None and options.vol_geom is None
+        own = find_group(file, "polysplat/geometry") is not None
+    scan = scan if later.whole else scan_part(scan, later)
+    return with_room(scan) if usual and not own else scan
 
 
 def _in_two(part: Part, file: h5py.File, options: ReadOptions) -> tuple[Part, Part]:

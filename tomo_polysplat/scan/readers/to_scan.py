@@ -15,6 +15,7 @@ from tomo_polysplat.scan.circular import volume_seen
 from tomo_polysplat.scan.counts import Counts
 from tomo_polysplat.scan.defects import flat_and_dark
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, to_astra
+from tomo_polysplat.scan.half_acquisition import with_room
 from tomo_polysplat.scan.in_blocks import line_integrals
 from tomo_polysplat.scan.layout import spatial_geometry
 from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup
@@ -73,7 +74,7 @@ def scan_from_acquisition(told: Acquisition, options: ReadOptions, part: Part) -
     told, spectrum = _spectrum(told, options)
     seen = part.of(geometry, (pictures.rows, pictures.columns))
     _tell(told, rays, valid)
-    return Scan(
+    scan = Scan(
         projections=projections,
         valid=None if valid.all() else valid,
         spectrum=spectrum,
@@ -82,6 +83,7 @@ def scan_from_acquisition(told: Acquisition, options: ReadOptions, part: Part) -
         notes={"input": kind, "rays": rays, "scanner": _texts(told)},
         **_geometries(seen, told, options),
     )
+    return with_room(scan) if options.vol_geom is None and options.proj_geom is None else scan
 
 
 def _limit(told: Acquisition, kind: str, saturation: float | None) -> float:
