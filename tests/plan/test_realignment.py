@@ -142,3 +142,20 @@ def test_what_is_left_of_a_roll_that_was_made_needs_not_be_sure(first_told, roll
     fits._fitted = lambda values: (None, None, None)
     assert fits.names == ("roll",)
     assert float(fits.moved({})[0].get("roll", 0.0)) == pytest.approx(roll)
+
+
+def test_a_fit_by_a_rolled_scanner_does_not_warn_of_matter_beside_a_few_rows(caplog):
+    """A part of each row of such a detector passes above two slices, or below, where the object goes on."""
+    degrees = np.linspace(0, 180, VIEWS, endpoint=False)
+    told = from_astra(*tps.parallel_geometry(pixel=0.1, detector=(2, 30), degrees=degrees))
+    across = np.abs(np.arange(30) - 14.5)
+    values = np.broadcast_to(0.2 * np.sqrt(np.maximum(11.0**2 - across**2, 0)), (VIEWS, 2, 30)).astype(
+        np.float32
+    )
+    told = Problem.of(np.ascontiguousarray(values), *told, "cm", None, None)
+    rolled = {"roll": torch.tensor(20.0).double()}
+    told.seen_by(moved_geometry(Scanner(told.geometry, told.axis), rolled)).closed(OPTIONS.device)
+    assert "reaches beyond the volume" in caplog.text
+    caplog.clear()
+    realignment._Realignment(told, AXIS, OPTIONS)._fitted(rolled)
+    assert "reaches beyond" not in caplog.text

@@ -256,7 +256,9 @@ class _Realignment:
         # What is told of one start is not kept for another.
         geometry = moved_geometry(self.scanner, values) if values else self.problem.geometry
         options = replace(self.options, settings=self.settings)
-        lab = lab_of(self.problem.seen_by(geometry), Plan(), options)
+        # Asked of the scanner as told: its answer may be a warning, and rolled rays of few rows leave the volume.
+        self.problem.closed(self.options.device)
+        lab = lab_of(self.problem.seen_by(geometry, nearly=True), Plan(), options)
         return lab.trial(self.settings).gaussians, lab.scene, lab.rays
 
 
