@@ -9,6 +9,7 @@ import numpy as np
 
 from tomo_polysplat.scan.check import DEFECT, Finding, asked, check_scan, nothing_to_see
 from tomo_polysplat.scan.layout import vector_form
+from tomo_polysplat.scan.probes.beam import BEAM, probe_beam
 from tomo_polysplat.scan.probes.measured import Measured
 from tomo_polysplat.scan.probes.opposite import CENTRE, DIRECTION, probe_centre_and_direction
 from tomo_polysplat.scan.scan import Scan
@@ -41,8 +42,10 @@ def mend_scan(scan: Scan, findings: list[Finding] | None = None) -> tuple[Scan, 
         What was done, a sentence each.
     """
     if findings is None:
+        measured = Measured(scan)
+        _warn_of_dim_beam(measured)
         # One question first, which is quick: most scans are good.
-        findings = check_scan(scan) if _axis_looks_off(scan) else []
+        findings = check_scan(scan) if _axis_looks_off(measured) else []
     if any(finding.probe != CENTRE and finding.misleading for finding in findings if finding.probe in _GRAVE):
         return scan, []
     for finding in findings:
@@ -66,9 +69,20 @@ def _is_sure(finding: Finding) -> bool:
     return finding.probe == CENTRE and finding.verdict == DEFECT and known
 
 
-def _axis_looks_off(scan: Scan) -> bool:
+def _warn_of_dim_beam(measured: Measured) -> None:
+    """Say where rays beside the object are dimmer than the open beam, which scatter does not make them.
+
+    No fit mends it: the difference becomes matter all around.
+    """
+    for finding in asked(probe_beam, (BEAM,), measured):
+        if finding.values.get("off", 0.0) > 0:
+            logger.warning(
+                "Matter will seem to lie all around the object: %s; %s.", finding.text, finding.remedy
+            )
+
+
+def _axis_looks_off(measured: Measured) -> bool:
     """What `check_scan` asks of the axis, without the questions before."""
-    measured = Measured(scan)
     looks_off = any(map(_is_sure, asked(probe_centre_and_direction, (CENTRE, DIRECTION), measured)))
     # Rows of the whole scan are read for it, which takes longer.
     return looks_off and not nothing_to_see(measured)

@@ -50,7 +50,7 @@ def probe_beam(measured: Measured) -> Finding:
         factor = np.exp(-air.level)
         text = f"beside the object -log(I/I0) is {air.level:+.3f} instead of 0: {factor:.3g} times the flats' light"
         remedy = "take flats at the projections' exposure, or subtract what the rays beside the object hold"
-        return Finding(BEAM, DEFECT, text, remedy, numbers, air.error)
+        return Finding(BEAM, DEFECT, text, remedy, numbers | {"off": air.level}, air.error)
     drift, error = _common_change(air)
     numbers["change"] = drift
     if drift > _FLICKER + _SURE * error:
