@@ -74,3 +74,17 @@ def test_a_panel_beside_the_axis_of_a_cone_beam(tmp_path):
     scan = tps.load_scan(tmp_path / "stack.npz", scanner=told | {"offset": (COLUMNS / 2 - AXIS, 0.0)})
     assert scan.volume_shape == (ROWS, 39, 39)
     assert scan.vol_geom["option"]["WindowMaxX"] == pytest.approx(0.9 * 19.5)
+
+
+def test_counts_that_stay_in_their_file_are_widened_by_some_of_their_views(tmp_path, monkeypatch):
+    from tomo_polysplat.scan import data_exchange
+
+    monkeypatch.setattr(data_exchange, "_STAYS", 1)
+    degrees = np.linspace(0, 360, 400, endpoint=False)
+    path = tmp_path / "scan.h5"
+    with h5py.File(path, "w") as file:
+        file["exchange/data"] = np.round(20000 * np.exp(-_lines(17.0, degrees))).astype(np.uint16)
+        file["exchange/data_white"] = np.full((1, ROWS, COLUMNS), 20000, np.uint16)
+        file["exchange/theta"] = degrees
+    scan = tps.load_scan(path, centre=AXIS)
+    assert isinstance(scan.projections, tps.Counts) and scan.volume_shape == (ROWS, 39, 39)

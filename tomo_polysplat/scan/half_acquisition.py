@@ -60,10 +60,12 @@ def with_room(scan: Scan) -> Scan:
 def _matter_beside(scan: Scan, axis: float, reach: float) -> bool:
     """Whether rays that pass the axis at little more than `reach` columns see matter."""
     rows, views = (evenly_spread(count, most) for count, most in ((scan.rows, _ROWS), (scan.views, _VIEWS)))
-    values = np.asarray(scan.projections[rows][:, views], np.float64)
+    # Of what stays in a file no more is read.
+    chosen = rows[:, None], views
+    values = np.array(scan.projections[chosen], np.float64)
     values[~np.isfinite(values)] = np.nan
     if scan.valid is not None:
-        values[~np.asarray(scan.valid[rows][:, views])] = np.nan
+        values[~np.asarray(scan.valid[chosen])] = np.nan
     away = np.abs(np.arange(scan.columns) + 0.5 - axis)
     beside, within = values[..., (away > reach) & (away <= reach + _NEXT)], values[..., away <= reach]
     lit = within[np.isfinite(within)]

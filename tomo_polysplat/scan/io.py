@@ -85,7 +85,8 @@ def load_scan(
         Counts at which the detector saturates; None takes the largest value of an integer type.
     proj_geom, vol_geom : dict or None
         ASTRA geometries (three-dimensional types) instead of the file's; `vol_geom` may be given alone, and
-        then no truth is read.
+        then no truth is read. Without one the volume is as many voxels across as there are columns, or as
+        wide as a whole turn sees of a detector beside the axis, if matter lies there.
     water_correction : sequence of float or None
         Polynomial that the projections have been put through, instead of the file's; see :class:`Scan`.
     scanner : mapping, optional
