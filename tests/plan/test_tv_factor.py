@@ -10,7 +10,7 @@ import torch
 from tomo_polysplat import reconstruct
 from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.kernels.views import DetectorViews
-from tomo_polysplat.plan.decisions.tv_factor import _misfit_aside
+from tomo_polysplat.plan.decisions.tv_factor import _misfit_aside, _Tries
 from tomo_polysplat.settings import Settings
 
 SIZE, VIEWS = 64, 90
@@ -108,6 +108,18 @@ def test_where_smooth_things_are_thin_held_out_rays_keep_the_usual_weight():
     assert found.plan["tv_factor"].why.startswith("the usual weight: after")
     less = fitted(scan, views_per_step=6, tv_factor=0.2)
     assert relative_error(found.volume, scan[3]) < 0.5 * relative_error(less.volume, scan[3])
+
+
+@pytest.mark.parametrize(
+    ("best", "taken", "asked"), [(0.1, 0.1, 3), (0.17, 0.3, 2), (0.3, 0.3, 2), (0.9, 1.0, 2), (4.0, 3.0, 2)]
+)
+def test_less_is_tried_as_long_as_it_leaves_less(best, taken, asked):
+    """Of a misfit that rises to both sides of the best weight; far less only where it leaves clearly less."""
+    tries = _Tries(lambda factor: 1 + math.log(factor / best) ** 2)
+    assert tries.choose([(0.3, 1.0), (0.1, 0.9), (0.05, 0.9)], more=True) == taken
+    assert len(tries.left) == asked and tries.left[0.3] == pytest.approx(
+        (1 + math.log(0.3 / best) ** 2) / (1 + math.log(best) ** 2)
+    )
 
 
 @pytest.mark.parametrize(

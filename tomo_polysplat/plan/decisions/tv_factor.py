@@ -7,8 +7,8 @@ would melt a scaffold together.
 
 How much smoothing is right depends on noise, views and detail together, and photon noise alone does not tell a brain,
 which gains by more, from a laminate, which loses. So rays that are held out of short fits are asked: of thin objects,
-which may be all smooth, whether the usual weight does as well, and of slices of few rays a voxel, which can fit noise
-and the streaks of missing views as well as the object, whether more is better.
+which may be all smooth, how much less than the usual weight is better, and of slices of few rays a voxel, which can fit
+noise and the streaks of missing views as well as the object, whether more is.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ __all__ = ["TvFactor"]
 
 logger = logging.getLogger(__name__)
 
-# In thin objects less than the usual weight is taken where it leaves less than this of the held-out misfit.
+# In thin objects the root of their factor is taken where it leaves less of the held-out misfit than the usual weight.
+# What is far less is taken where it leaves less than this of what is left by then: too early to be sure of a little.
 _CLEARLY = 0.97
 # In slices this multiple of the usual weight is tried. It is taken where it leaves less of the held-out misfit. Eight
 # slices that gain 0.4 to 3.9 dB by it came to 0.79 to 0.92, one that loses 0.6 to 0.88, a laminate that loses 2.4 to
@@ -95,7 +96,8 @@ class TvFactor(Decision):
         asking = replace(lab.rays, held_out=max(lab.rays.held_out, _HELD_OUT))
         told = _Tries(lambda factor: _left_by(factor, asking, known, lab))
         try:
-            factor = told.choose([by_depth, by_noise] if by_depth < 1 else [], not _why_no_more(lab.problem))
+            less = [(math.sqrt(by_depth), 1.0), (by_depth, _CLEARLY), (by_noise, _CLEARLY)]
+            factor = told.choose(less if by_depth < 1 else [], not _why_no_more(lab.problem))
         except Untold as reason:
             raise Untold(f"{_describe_usual(known, lab)}: {reason}") from None
         weight = "the usual weight" if factor == 1 else f"{factor:.2g} times the usual weight"
@@ -149,15 +151,15 @@ class _Tries:
     left_by: Callable[[float], float]
     left: dict[float, float] = field(default_factory=dict)
 
-    def choose(self, less: list[float], more: bool) -> float:
-        """The factor to take, of 1, those ever ``less``, and with ``more`` three."""
+    def choose(self, less: list[tuple[float, float]], more: bool) -> float:
+        """The factor to take, of 1, those ever ``less`` with shares that they must leave, and with ``more`` three."""
         usual = best = self.left_by(1.0)
         if not usual:
             raise Untold("no ray of those held out is usable")
         chosen = 1.0
-        for factor in less:
+        for factor, share in less:
             left = self._ask(factor, usual)
-            if left >= _CLEARLY * best:
+            if left >= share * best:
                 break
             chosen, best = factor, left
         if more and chosen == 1 and self._ask(_TIMES, usual) < usual:
