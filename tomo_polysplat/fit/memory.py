@@ -200,7 +200,7 @@ def require_room(device: torch.device, size: StepSize, projections: int) -> str:
             remedy = f"say settings pixel_rays and light, which saves a second run beside the first, {remedy}"
         raise fail("device", f"a GPU with {words} free", f"{in_gigabytes(free)} on {device}", remedy)
     words = f"{words} of {in_gigabytes(free)} free; projections {where}"
-    logger.info("Memory: %s.", words)
+    logger.debug("Memory: %s.", words)
     return words
 
 
