@@ -66,7 +66,7 @@ def posed(*arguments, **options):
     """The problem that `reconstruct` would solve, and its counts of rays: all that its solver knows of the rays."""
 
     def reach(*made):
-        raise _Reached(*pose(*made))
+        raise _Reached(*pose(*made)[:2])
 
     pose = reconstruction._problem
     with mock.patch.object(reconstruction, "_problem", reach), pytest.raises(_Reached) as reached:

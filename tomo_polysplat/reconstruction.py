@@ -36,6 +36,7 @@ from tomo_polysplat.plan.calibration import Calibration
 from tomo_polysplat.plan.checkpoint import Checkpoint
 from tomo_polysplat.plan.model import all_curves
 from tomo_polysplat.plan.never_worse import densities_of_start
+from tomo_polysplat.plan.open_beam import take_out_level
 from tomo_polysplat.plan.plan import Plan
 from tomo_polysplat.plan.preparation import PreparedFit, RunOptions
 from tomo_polysplat.plan.solver import Solver
@@ -52,6 +53,7 @@ from tomo_polysplat.scan.mending import mend_scan
 from tomo_polysplat.scan.scan import Scan
 from tomo_polysplat.scan.usable import usable_rays
 from tomo_polysplat.settings import Settings
+from tomo_polysplat.start.initial import FEW_VIEWS
 from tomo_polysplat.transfer import to_host
 from tomo_polysplat.units import warn_of_unit
 
@@ -214,7 +216,7 @@ def reconstruct(
         warn_of_unit("cm")
     unit, spectrum = measured.unit or "cm", require_spectrum("spectrum", measured.spectrum)
     geometry, grid = from_astra(*measured.geometries())
-    problem, counts = _problem(measured, geometry, grid, materials, run_options)
+    problem, counts, beam = _problem(measured, geometry, grid, materials, run_options, calibrate)
     run_options = run_options.allowing(problem.noise(run_options.device))
     wanted = Calibration.of(calibrate, soft_density, problem.spectrum)
     flipped = is_planar_geometry(measured.geometries()[0])
@@ -237,6 +239,7 @@ def reconstruct(
         problem, prepared, outcome = solver.solve(problem, wanted, ask_scatter=calibrate is None)
         _note_ranks(prepared.plan)
         _note_scan(prepared.plan, problem, grid, measured.water_correction, mended)
+        prepared.plan.facts["beam"] = beam
         with postponed_interrupts("the volume") as interruption:
             report(1.0, "volume")
             result = _result(
@@ -285,9 +288,14 @@ def _note_ranks(plan: Plan) -> None:
 
 
 def _problem(
-    measured: Measurement, geometry: Geometry, grid: VolumeGrid, materials: Any, options: RunOptions
-) -> tuple[Problem, dict[str, int]]:
-    """What is to be solved, on this machine, and counts of the rays that are used."""
+    measured: Measurement,
+    geometry: Geometry,
+    grid: VolumeGrid,
+    materials: Any,
+    options: RunOptions,
+    calibrate: Any,
+) -> tuple[Problem, dict[str, int], Answer]:
+    """What is to be solved, on this machine, counts of the rays that are used, and what is told of the open beam."""
     proj_geom, _ = measured.geometries()
     spectrum, unit, on = measured.spectrum, measured.unit or "cm", options.device
     energies = 1 if spectrum is None else len(spectrum.energies)
@@ -297,6 +305,10 @@ def _problem(
         values, counts, given = usable_rays(
             measured.projections, proj_geom, measured.valid, measured.water_correction, spectrum
         )
+        asked = _asks_scatter(calibrate, spectrum, geometry.views)
+        wanted = options.settings.beam
+        # Before anything else is asked of the rays.
+        beam = take_out_level(values, given, geometry, grid, wanted=wanted, scatter_is_asked=asked)
         widest = options.settings.surroundings
         problem = Problem.of(values, geometry, grid, unit, spectrum, materials, widest, on, own=True)
         problem = replace(problem, given=given)
@@ -309,7 +321,16 @@ def _problem(
             raise
         remedy = "settings={'surroundings': 0} leaves that out"
         raise MemoryError(f"{full}. The volume is {problem.surroundings}: {remedy}") from full
-    return problem, counts
+    return problem, counts, beam
+
+
+def _asks_scatter(calibrate: Any, spectrum: Spectrum | None, views: int) -> bool:
+    """Whether the rays are asked about scatter in the course of the run."""
+    if spectrum is None or spectrum.is_monochromatic:
+        return False
+    if calibrate is None:
+        return views >= FEW_VIEWS
+    return "scatter" in calibrate if isinstance(calibrate, Sequence) else bool(calibrate)
 
 
 def _note_scan(

@@ -46,7 +46,7 @@ _CHOICES = {
     "density_check": ("refuse", "warn"),
     "kernel": ("auto", "triton", "numba", "reference"),
 }
-_SWITCHES = ("gains", "drift")
+_SWITCHES = ("gains", "drift", "beam")
 
 
 @dataclass(frozen=True)
@@ -166,6 +166,9 @@ class Settings:
     """Whether each pixel's gain is found and taken out; None: where held-out rays confirm it."""
     drift: bool | None = None
     """Whether each view's light is, likewise."""
+    beam: bool | None = None
+    """Whether what rays beside the object hold is taken out of all rays, as a beam that differs from its open field;
+    None: where that is beyond doubt."""
 
     # The misfit.
     loss: str = "huber"

@@ -20,7 +20,7 @@ from tomo_polysplat.settings import Settings
 __all__ = ["Levels", "fit_again", "geometry_of", "levels_of", "require_scan_of", "settings_of", "voxel_edge"]
 
 # Decisions whose answer is no setting of that kind, or which the number of views or rays may change.
-_FREE = ("tv_corner", "agent", "gains", "drift")
+_FREE = ("tv_corner", "agent", "gains", "drift", "beam")
 
 
 class Levels(NamedTuple):

@@ -61,6 +61,7 @@ _TOLD = {
     "detector_blur": "The detector's blur",
     "fitted_blur": "The blur that was found",
     "pixel_rays": "Rays a pixel and axis",
+    "beam": "The beam, in open fields",
     "gains": "Gains of the pixels, rms of their logarithm",
     "drift": "The source's light from view to view, rms of its logarithm",
     "photons_per_ray": "The noise (photons of an open ray)",
@@ -120,8 +121,15 @@ def _of_nuisances(plan: Mapping[str, Answer]) -> dict[str, Any]:
     if "fitted_blur" in plan and plan["detector_blur"].status is Status.ASKED:
         values["blur"] = plan["fitted_blur"].value
     values |= {name: plan[name].value for name in ("bowtie", "gains", "drift") if name in plan}
+    values |= {"beam": beam} if (beam := _beam(plan)) != 1.0 else {}
     values |= {"beside": plan["drift"].evidence.get("beside", 1.0)} if "drift" in plan else {}
     return values | ({"pixel_rays": plan["pixel_rays"].value} if "pixel_rays" in plan else {})
+
+
+def _beam(plan: Mapping[str, Answer]) -> float:
+    """The brightness of the beam: what was taken out before the run, and what was fitted in it."""
+    fitted = plan["calibration"].value["fitted"] if "calibration" in plan else {}
+    return float(fitted.get("beam", 1.0)) * (float(plan["beam"].value) if "beam" in plan else 1.0)
 
 
 def how_it_ended(plan: Mapping[str, Answer]) -> str:
@@ -170,5 +178,5 @@ def ray_physics(plan: Mapping[str, Answer]) -> RayPhysics:
         pixel_rays=max(1, plan["pixel_rays"].value) if "pixel_rays" in plan else 1,
         scatter=float(found.get("scatter", 0.0)),
         of_light=float(found.get("scatter_of_light", 0.0)),
-        beam=float(found.get("beam", 1.0)),
+        beam=_beam(plan),
     )

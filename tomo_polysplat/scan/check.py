@@ -68,6 +68,7 @@ def check_scan(scan: Scan) -> list[Finding]:
     # The other probes look at what is left.
     measured = replace(measured, dead_pixels=np.asarray(kinds[DEAD].any(axis=1)))
     nothing = nothing_to_see(measured)
+    level: Measured | None = None
     for names, probe in FIRST + LATER:
         misleading = [
             finding.probe for finding in findings if finding.probe in _MISLEADING and finding.misleading
@@ -78,8 +79,19 @@ def check_scan(scan: Scan) -> list[Finding]:
             text = f"looked for once this is mended: {', '.join(misleading)}"
             findings += [Finding(name, UNKNOWN, text, "the scan mended") for name in names]
         else:
-            findings += asked(probe, names, measured)
+            if level is None and (names, probe) in LATER:
+                level = _level(measured)
+            findings += asked(probe, names, measured if level is None or probe is probe_beam else level)
     return findings
+
+
+def _level(measured: Measured) -> Measured:
+    """The same less what rays beside the object tell of the open beam, as a run looks at it."""
+    try:
+        air = measured.air
+    except ValueError:
+        return measured
+    return replace(measured, beam=air.level) if air is not None and air.sure else measured
 
 
 def asked(probe: Probe, names: tuple[str, ...], measured: Measured) -> list[Finding]:

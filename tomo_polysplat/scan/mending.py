@@ -9,7 +9,6 @@ import numpy as np
 
 from tomo_polysplat.scan.check import DEFECT, Finding, asked, check_scan, nothing_to_see
 from tomo_polysplat.scan.layout import vector_form
-from tomo_polysplat.scan.probes.beam import BEAM, probe_beam
 from tomo_polysplat.scan.probes.measured import Measured
 from tomo_polysplat.scan.probes.opposite import CENTRE, DIRECTION, probe_centre_and_direction
 from tomo_polysplat.scan.scan import Scan
@@ -43,7 +42,6 @@ def mend_scan(scan: Scan, findings: list[Finding] | None = None) -> tuple[Scan, 
     """
     if findings is None:
         measured = Measured(scan)
-        _warn_of_dim_beam(measured)
         # One question first, which is quick: most scans are good.
         findings = check_scan(scan) if _axis_looks_off(measured) else []
     if any(finding.probe != CENTRE and finding.misleading for finding in findings if finding.probe in _GRAVE):
@@ -67,18 +65,6 @@ def _is_sure(finding: Finding) -> bool:
     """Whether it is an axis that is off, and known well."""
     known = finding.uncertainty is not None and finding.uncertainty <= _SURE_OF_AXIS
     return finding.probe == CENTRE and finding.verdict == DEFECT and known
-
-
-def _warn_of_dim_beam(measured: Measured) -> None:
-    """Say where rays beside the object are dimmer than the open beam, which scatter does not make them.
-
-    No fit mends it: the difference becomes matter all around.
-    """
-    for finding in asked(probe_beam, (BEAM,), measured):
-        if finding.values.get("off", 0.0) > 0:
-            logger.warning(
-                "Matter will seem to lie all around the object: %s; %s.", finding.text, finding.remedy
-            )
 
 
 def _axis_looks_off(measured: Measured) -> bool:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from tomo_polysplat.scan.view_geometry import Geometry
+from tomo_polysplat.scan.volume_grid import VolumeGrid
 
-__all__ = ["axis_column", "azimuth_of_views", "rotation_axis"]
+__all__ = ["axis_column", "azimuth_of_views", "reach_of", "rotation_axis"]
 
 
 def rotation_axis(geometry: Geometry) -> np.ndarray:
@@ -30,3 +31,11 @@ def azimuth_of_views(geometry: Geometry) -> np.ndarray:
     """Angle of the source, or of the beam, about z in radians, (views,)."""
     beside = geometry.origin if geometry.beam == "parallel" else geometry.origin - rotation_axis(geometry)
     return np.arctan2(beside[:, 1], beside[:, 0])
+
+
+def reach_of(geometry: Geometry, grid: VolumeGrid) -> float:
+    """Columns from the axis to a side of the volume, where that is seen the widest."""
+    sides = 0.5 * grid.extent * np.vstack([np.eye(3)[:2], -np.eye(3)[:2]])
+    columns = geometry.project_points(grid.centre + sides)[..., 0]
+    apart = np.abs(columns - axis_column(geometry))
+    return float(apart[np.isfinite(apart)].max(initial=0.0))

@@ -11,14 +11,15 @@ from tomo_polysplat.scan.probes.air import Air
 from tomo_polysplat.scan.probes.finding import DEFECT, OK, UNKNOWN, Finding
 from tomo_polysplat.scan.probes.measured import Measured
 
-__all__ = ["BEAM", "probe_beam"]
+__all__ = ["BEAM", "SATURATED_SHARE", "TOO_DIM", "beside_the_object", "is_off", "probe_beam"]
 
 BEAM = "open beam"
 # What -log(I/I0) may be off by beside the object; what a source may change by.
 _TOLERATED, _FLICKER = 0.02, 0.02
 _SURE = 4.0
 # Share of frames' light that they may differ by, and of the rays beside the object that hold the same value.
-_FRAMES, _SAME = 0.05, 0.3
+_FRAMES, SATURATED_SHARE = 0.05, 0.3
+TOO_DIM = "take flats at the projections' exposure, or subtract what the rays beside the object hold"
 # Share of the rays that may be saturated.
 _SATURATED = 0.01
 # Rays that tell whether there is noise: 1.4 of noise is new in the next view, and in the next row.
@@ -44,12 +45,11 @@ def probe_beam(measured: Measured) -> Finding:
         text = "no rays beside the object tell whether the flats belong to the projections"
         return Finding(BEAM, UNKNOWN, text, "a view of air beside the object")
     numbers = {"level": air.level, "same": air.share}
-    if air.share >= _SAME:
+    if air.share >= SATURATED_SHARE:
         return _saturated(measured, numbers)
-    if abs(air.level) > _TOLERATED + _SURE * air.error:
-        factor = np.exp(-air.level)
-        text = f"beside the object -log(I/I0) is {air.level:+.3f} instead of 0: {factor:.3g} times the flats' light"
-        remedy = "take flats at the projections' exposure, or subtract what the rays beside the object hold"
+    if is_off(air):
+        text = beside_the_object(air)
+        remedy = f"{TOO_DIM}, as a run does here" if air.sure else TOO_DIM
         return Finding(BEAM, DEFECT, text, remedy, numbers | {"off": air.level}, air.error)
     drift, error = _common_change(air)
     numbers["change"] = drift
@@ -64,8 +64,22 @@ def probe_beam(measured: Measured) -> Finding:
     share = 100 * -np.expm1(-abs(air.level))
     side = "less" if air.level > 0 else "more"
     right = f"up to {100 * _TOLERATED:g} % is right"
-    text = f"beside the object there is {share:.2g} % {side} light than in the flats ({right})"
+    mended = "; a run takes it out" if air.sure else ""
+    text = f"beside the object there is {share:.2g} % {side} light than in the flats ({right}{mended})"
     return Finding(BEAM, OK, text, "", numbers, air.error)
+
+
+def is_off(air: Air) -> bool:
+    """Whether the level of air is farther from 0 than is tolerated."""
+    return abs(air.level) > _TOLERATED + _SURE * air.error
+
+
+def beside_the_object(air: Air) -> str:
+    """What rays hold there, in words."""
+    factor = np.exp(-air.level)
+    return (
+        f"beside the object -log(I/I0) is {air.level:+.3f} instead of 0: {factor:.3g} times the flats' light"
+    )
 
 
 def _frames(notes: dict[str, Any]) -> tuple[str, str] | None:

@@ -14,7 +14,7 @@ from tomo_polysplat.scan.defects import fill_invalid
 from tomo_polysplat.scan.dropouts import dropped_rays
 from tomo_polysplat.scan.geometry import Geometry, from_astra
 from tomo_polysplat.scan.probes.air import Air, look_for_air
-from tomo_polysplat.scan.rotation_axis import axis_column, azimuth_of_views, rotation_axis
+from tomo_polysplat.scan.rotation_axis import axis_column, azimuth_of_views, reach_of, rotation_axis
 from tomo_polysplat.scan.scan import Scan
 from tomo_polysplat.scan.volume_grid import VolumeGrid
 
@@ -31,6 +31,8 @@ class Measured:
     scan: Scan
     dead_pixels: np.ndarray | None = None
     """Pixels not to look at, (rows, columns)."""
+    beam: float = 0.0
+    """What all rays hold beside what they pass."""
 
     @cached_property
     def _told(self) -> tuple[Geometry, VolumeGrid]:
@@ -73,7 +75,8 @@ class Measured:
     @cached_property
     def filled(self) -> np.ndarray:
         """The chosen rows of the projections, with bad rays interpolated, (rows, views, columns)."""
-        return fill_invalid(self._values, self.good)
+        filled = fill_invalid(self._values, self.good)
+        return filled - np.float32(self.beam) if self.beam else filled
 
     @cached_property
     def _values(self) -> np.ndarray:
@@ -94,7 +97,7 @@ class Measured:
     @cached_property
     def air(self) -> Air | None:
         """Rays beside the object, or None where there are none."""
-        return look_for_air(self.filled, self.span)
+        return look_for_air(self.filled, self.span, self.axis_column, reach_of(self.geometry, self.grid))
 
     @cached_property
     def apart(self) -> tuple[np.ndarray, np.ndarray]:
