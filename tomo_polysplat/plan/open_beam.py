@@ -30,8 +30,9 @@ logger = logging.getLogger(__name__)
 _RAYS = 1 << 24
 # Rays that are looked at for how much the values differ.
 _SOME = 1 << 20
-# A ray is darker than scatter by so many deviations of its noise.
-_DEVIATIONS = 3.0
+# A ray is darker than scatter by so many deviations of its noise; behind matter there may be this share of what is
+# beside it.
+_DEVIATIONS, _BEHIND = 3.0, 0.5
 
 
 # What a caller tells of the rays and wants of them.
@@ -124,7 +125,7 @@ def _why_not(
 
 def _may_be_scatter(scatter: float, air: Air, values: np.ndarray) -> bool:
     """Whether no more rays are darker than so much scatter than by a fault of theirs."""
-    least = scatter - _DEVIATIONS * air.noise * math.sqrt(scatter)
+    least = _BEHIND * scatter - _DEVIATIONS * air.noise * math.sqrt(_BEHIND * scatter)
     if least <= 0:
         return True
     darker = sum(int(np.count_nonzero(view > -math.log(least))) for view in values)

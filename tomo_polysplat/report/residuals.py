@@ -186,7 +186,8 @@ class _Model:
         if parts > 1:
             values = averaged_light(values, views.rows, views.columns)
         if self.physics.scatter or self.physics.of_light:
-            scatter = self.physics.scatter + self.physics.of_light * light_around(measured)
+            around = light_around(measured + float(np.log(self.physics.beam)))
+            scatter = self.physics.scatter + self.physics.of_light * around
             values = -torch.log(torch.exp(-values) + scatter.clamp(min=0))
         if self.physics.beam != 1.0:
             values = values - float(np.log(self.physics.beam))

@@ -179,7 +179,10 @@ class _Light:
             return False
         across = np.abs(self._columns - axis)
         half = max(float(across.max()) + 0.5, reach)
-        wide = min(max(_HELD, abs(self.level) / (_AS_DENSE * span)), _WIDEST) * half
+        wide = (
+            _WIDEST if abs(self.level) > _WIDEST * _AS_DENSE * span else abs(self.level) / (_AS_DENSE * span)
+        )
+        wide = max(_HELD, wide) * half
         chord = np.sqrt(wide**2 - across**2)
         # 1 where the level is such a cylinder's, 0 where it is even.
         shape = np.broadcast_to(self.level * (chord / chord.mean() - 1), self._pixels.shape)
