@@ -22,7 +22,7 @@ class OpenBeam(Nuisance):
     parameters = {"beam": Parameter("open fields", 1.0, 0.5, 2.0)}
     found_by = Found.RESIDUALS
     gauge = "scatter, which adds to dark rays as well: each is asked whether it explains the rays better"
-    cost = "one short fit, where rays beside the object are brighter than the open field"
+    cost = "none where rays beside the object tell; one short fit where it may be scatter"
 
     @classmethod
     def gate(cls, evidence: Mapping[str, float]) -> Verdict:
