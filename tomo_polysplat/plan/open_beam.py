@@ -26,8 +26,8 @@ __all__ = ["take_out_level"]
 
 logger = logging.getLogger(__name__)
 
-# Rays that are looked at, of rows evenly spread.
-_RAYS = 1 << 24
+# Rays that are looked at, of rows evenly spread, so many at least.
+_RAYS, _ROWS = 1 << 22, 4
 # Rays that are looked at for how much the values differ.
 _SOME = 1 << 20
 # A ray is darker than scatter by so many deviations of its noise; behind matter there may be this share of what is
@@ -87,7 +87,7 @@ def _evidence(air: Air) -> dict[str, float]:
 def _air(values: np.ndarray, geometry: Geometry, grid: VolumeGrid) -> Air | None:
     """The rays beside the object; None where there are none."""
     views, rows, columns = values.shape
-    chosen = evenly_spread(rows, max(1, _RAYS // (views * columns)))
+    chosen = evenly_spread(rows, max(_ROWS, _RAYS // (views * columns)))
     some = values[:, chosen].swapaxes(0, 1)
     good = np.isfinite(some)
     # Views that were not measured, and then rows, have nothing to go by.
