@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy import ndimage
 
-from tomo_polysplat.physics.detector_blur import LARGEST_BLUR, blurred
+from tomo_polysplat.physics.detector_blur import LARGEST_BLUR, blurred, blurred_light
 from tomo_polysplat.settings import Settings
 
 
@@ -69,3 +69,32 @@ def test_lanes_of_float32_blur_as_float64_does(shape):
         found.append([part.double() for part in (value.detach(), rays.grad, slope)])
     for one, other in zip(*found):
         torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5)
+
+
+# Light
+
+
+@pytest.mark.parametrize("variance", [0.0, 1 / 12, 0.4])
+def test_light_is_convolved(variance):
+    taps = [variance / 2, 1 - variance, variance / 2]
+    expected = np.exp(-image(largest=7.0).numpy())
+    for axis in (1, 2):
+        expected = ndimage.convolve1d(expected, taps, axis=axis, mode="nearest")
+    got = blurred_light(image(largest=7.0), torch.tensor([variance], dtype=torch.float64))
+    np.testing.assert_allclose(got.numpy(), -np.log(expected), rtol=1e-12, atol=1e-12)
+
+
+def test_light_beside_an_opaque_pixel_is_finite_and_no_blur_changes_nothing():
+    opaque = image(1, 5, 7).float()
+    opaque[0, 2, 3] = 500.0
+    torch.testing.assert_close(blurred_light(opaque, torch.zeros(1)), opaque, rtol=0, atol=0)
+    spread = blurred_light(opaque.requires_grad_(), variance := torch.tensor([0.4], requires_grad=True))
+    spread.sum().backward()
+    assert all(bool(torch.isfinite(each).all()) for each in (spread, opaque.grad, variance.grad))
+
+
+@pytest.mark.parametrize("variance", [0.05, LARGEST_BLUR])
+def test_gradients_of_light(variance):
+    rays = image(1, 4, 5, largest=6.0).requires_grad_()
+    spread = torch.tensor([variance], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(blurred_light, (rays, spread))

@@ -14,7 +14,7 @@ from tomo_polysplat.fit.slabs import on_host
 from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model.gaussians import Gaussians
-from tomo_polysplat.physics.detector_blur import blurred
+from tomo_polysplat.physics.detector_blur import blurred, blurred_light
 from tomo_polysplat.physics.filter_slope import filter_slope
 from tomo_polysplat.physics.pixel_light import averaged_light
 from tomo_polysplat.physics.quadrature import Quadrature
@@ -113,7 +113,9 @@ class FitScene:
         sharp = self._seen(areal)
         if self.pixel_rays > 1:
             sharp = averaged_light(sharp, views.rows, views.columns)
-        return (blurred(sharp, gaussians.blur) if self.blurring else sharp), skipped
+        if not self.blurring:
+            return sharp, skipped
+        return (blurred_light if self.pixel_rays > 1 else blurred)(sharp, gaussians.blur), skipped
 
     def _seen(self, areal: torch.Tensor) -> torch.Tensor:
         """(views, rows, columns) -log(I/I0) of rays with these (curves, views, rows, columns) areal densities."""

@@ -8,9 +8,13 @@ interpolation. The model describes all of this as one blur of the projections:
 with A the blur of three taps (v/2, 1-v, v/2) along rows and along columns, whose variance is v squared pixels; the
 image is continued by its border. Averaging over a pixel's own area alone has v = 1/12.
 
-Light is spread before the logarithm, and -log of mixed light is less than this. But mixed light can hide any amount of
-metal at the edges of opaque metal. A model that mixes light then adds metal where that mends another error of its edges
-(docs/decisions/detector_blur.md). This one does not.
+Light is spread before the logarithm, and -log of mixed light is less than this:
+
+.. math:: P'_k = -\log \sum_j A_{kj} \exp(-P_j)
+
+So it is where the rays at metal show that pixels average light. Elsewhere the blur is that of P: mixed light can hide
+any amount of metal at the edges of opaque metal, and a model of thin rays that mixes it adds metal where that mends
+another error of its edges (docs/decisions/detector_blur.md).
 """
 
 from __future__ import annotations
@@ -21,10 +25,12 @@ import torch
 
 from tomo_polysplat.kernels.device import is_for_compiled
 
-__all__ = ["LARGEST_BLUR", "blurred"]
+__all__ = ["LARGEST_BLUR", "blurred", "blurred_light"]
 
 # Three taps make no wider blur without a dip in their middle.
 LARGEST_BLUR = 0.6
+# A pixel has no more than exp of this times as much light as one beside it, as far as that matters to either.
+MOST_BESIDE = 60.0
 
 
 def blurred(projections: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
@@ -52,6 +58,34 @@ def blurred(projections: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
             wide = torch.cat([first, projections, last], dim=axis)
             before, after = (wide.narrow(axis, k, count) for k in (0, 2))
             projections = same * projections + beside * (before + after)
+    return projections
+
+
+def blurred_light(projections: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
+    """-log of light as it arrives where the detector spreads it.
+
+    Parameters
+    ----------
+    projections : (views, rows, columns) tensor
+        -log of the light of each pixel.
+    variance : (1,) tensor
+        Of the blur along rows and along columns, in squared pixels, from 0 to `LARGEST_BLUR`.
+
+    Returns
+    -------
+    (views, rows, columns) tensor
+        Differentiable by both. An axis of one pixel is not blurred.
+    """
+    for axis in (1, 2):
+        count = projections.shape[axis]
+        if count > 1:
+            first, last = projections.narrow(axis, 0, 1), projections.narrow(axis, count - 1, 1)
+            wide = torch.cat([first, projections, last], dim=axis)
+            # Light beside a pixel, in that of its own: rounding then leaves a blur of 0 as it is.
+            beside = [
+                (projections - wide.narrow(axis, k, count)).clamp(max=MOST_BESIDE).exp() for k in (0, 2)
+            ]
+            projections = projections - torch.log1p(0.5 * variance * (beside[0] + beside[1] - 2))
     return projections
 
 

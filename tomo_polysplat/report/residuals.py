@@ -15,7 +15,7 @@ from tomo_polysplat.kernels.select import choose, pick_fast_device
 from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.model.gaussians import shares_of_curves
 from tomo_polysplat.parallel import kept_threads
-from tomo_polysplat.physics.detector_blur import LARGEST_BLUR, blurred
+from tomo_polysplat.physics.detector_blur import LARGEST_BLUR, blurred, blurred_light
 from tomo_polysplat.physics.filter_map import FilterMap
 from tomo_polysplat.physics.pixel_light import averaged_light
 from tomo_polysplat.physics.scatter import light_around
@@ -195,7 +195,9 @@ class _Model:
             # Relative to the open beam behind the filter.
             values = values - self.behind[2]
         variance = values.new_tensor([min(max(self.physics.blur, 0.0), LARGEST_BLUR)])
-        return blurred(values, variance) if self.physics.blur > 0 else values
+        if not self.physics.blur > 0:
+            return values
+        return (blurred_light if parts > 1 else blurred)(values, variance)
 
 
 def _collected(

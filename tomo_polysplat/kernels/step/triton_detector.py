@@ -6,9 +6,10 @@ its light reaches. The blur's matrix A (physics/detector_blur.py) is symmetric, 
 
     P'_k = sum_j A_kj P_j,   dP'_k / dP_j = A_kj,   dP'_k / dv = sum_j dA_kj/dv P_j
 
-Where a pixel averages the light of n rays (physics/pixel_light.py), with p_i of each:
+Where a pixel averages the light of n rays (physics/pixel_light.py), with p_i of each, the light is blurred:
 
-    P_j = log n - log sum_i exp(-p_i),   dP_j / dp_i = exp(P_j - p_i) / n
+    P_j = log n - log sum_i exp(-p_i),                dP_j / dp_i = exp(P_j - p_i) / n
+    P'_k = P_k - log R_k,   R_k = sum_j A_kj exp(P_k - P_j),   dP'_k / dP_j = A_kj exp(P_k - P_j) / R_k
 """
 
 from __future__ import annotations
@@ -27,8 +28,11 @@ from tomo_polysplat.kernels.step.triton_misfit import (
 )
 from tomo_polysplat.kernels.step.triton_update import WHOLE_OF_BLUR
 from tomo_polysplat.kernels.triton_maths import SIZES, on_device
+from tomo_polysplat.physics.detector_blur import MOST_BESIDE
 
 __all__ = ["detected_misfit_gradient"]
+
+_MOST = tl.constexpr(MOST_BESIDE)
 
 
 @triton.jit
@@ -78,13 +82,14 @@ def _sharp_kernel(
 def _blurred_kernel(
     sharp, slopes, blur, grad_blur, chosen, projections, totals, behind, sums,
     area, rows, columns, of_step, noise, held_out, corner,
-    FILTERED: tl.constexpr, HUBER: tl.constexpr, BLOCK: tl.constexpr,
+    FILTERED: tl.constexpr, HUBER: tl.constexpr, LIGHT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     k = tl.program_id(1).to(tl.int64)
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = pixel < area
     row, column, variance = pixel // columns, pixel % columns, tl.load(blur)
     image = sharp + k * area
+    own = tl.load(image + pixel, mask=inside, other=0.0)
     predicted, by_variance = tl.zeros([BLOCK], tl.float32), tl.zeros([BLOCK], tl.float32)
     for i in tl.static_range(-1, 2):
         along_v, slope_v, there_v = _taps(row, rows, i, variance)
@@ -92,8 +97,14 @@ def _blurred_kernel(
             along_u, slope_u, there_u = _taps(column, columns, j, variance)
             there = inside & there_v & there_u
             beside = tl.load(image + pixel + i * columns + j, mask=there, other=0.0)
+            if LIGHT:
+                beside = tl.exp(tl.minimum(own - beside, _MOST))
             predicted += along_v * along_u * beside
             by_variance += (slope_v * along_u + along_v * slope_u) * beside
+    ratio = predicted
+    if LIGHT:
+        ratio = tl.where(inside, predicted, 1.0)
+        predicted, by_variance = own - tl.log(ratio), -by_variance / ratio
     slope = ray_misfit(
         predicted, projections, totals, chosen, sums, k, pixel, inside, area, of_step, noise, held_out,
         corner, behind, HUBER, FILTERED,
@@ -101,6 +112,8 @@ def _blurred_kernel(
     slope = tl.where(inside, slope, 0.0)
     total = tl.sum((slope * by_variance).to(tl.float64), 0)
     tl.atomic_add(grad_blur, (total * WHOLE_OF_BLUR).to(tl.int64), sem="relaxed")
+    if LIGHT:
+        slope /= ratio
     tl.store(slopes + k * area + pixel, slope, mask=inside)
 
 
@@ -124,16 +137,20 @@ def _gather_kernel(
         raw, at, factor, log_weights, attenuation, nodes, behind, by_node, tl.minimum(pixel, area - 1), area,
         CURVES, FILTERED,
     )  # fmt: skip
-    gathered = tl.zeros([BLOCK], tl.float32)
+    gathered, averaged = tl.zeros([BLOCK], tl.float32), predicted
+    if DOWN * ACROSS > 1:
+        averaged = tl.load(sharp + k * area + pixel, mask=inside, other=0.0)
     for i in tl.static_range(-1, 2):
         along_v, _, there_v = _taps(row, rows, i, variance)
         for j in tl.static_range(-1, 2):
             along_u, _, there_u = _taps(column, columns, j, variance)
             there = inside & there_v & there_u
             slope = tl.load(slopes + k * area + pixel + i * columns + j, mask=there, other=0.0)
+            if DOWN * ACROSS > 1:
+                seen_by = tl.load(sharp + k * area + pixel + i * columns + j, mask=there, other=0.0)
+                slope *= tl.exp(tl.minimum(seen_by - averaged, _MOST))
             gathered += along_v * along_u * slope
     if DOWN * ACROSS > 1:
-        averaged = tl.load(sharp + k * area + pixel, mask=inside, other=0.0)
         gathered *= tl.where(inside, tl.exp(averaged - predicted) / (DOWN * ACROSS), 0.0)
     to = k * room + place(ray, rays_across, FOLD)
     store_gradients(pixels, to, gathered * factor, d0, d1, d2, live, CURVES)
@@ -169,7 +186,8 @@ def detected_misfit_gradient(splat: Splat, blur: torch.Tensor, grad_blur: torch.
             sharp, slopes, blur, grad_blur, splat.chosen, measurement.projections, measurement.totals,
             behind, splat.sums, splat.area, rows, columns, splat.of_step,
             measurement.noise, measurement.held_out, measurement.corner,
-            FILTERED=filtered, HUBER=measurement.corner > 0, BLOCK=PIXELS_A_PROGRAM, num_warps=4,
+            FILTERED=filtered, HUBER=measurement.corner > 0, LIGHT=down * across > 1,
+            BLOCK=PIXELS_A_PROGRAM, num_warps=4,
         )  # fmt: skip
         _gather_kernel[splat.gradient_blocks()](
             splat.raw, sharp, pixels, splat.table, slopes, blur, log_weights, attenuation,
