@@ -20,6 +20,7 @@ from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.decision import Decision, Known, When
 from tomo_polysplat.plan.decisions.agent import Agent
+from tomo_polysplat.plan.decisions.detector_blur import DetectorBlur
 from tomo_polysplat.plan.decisions.passes import Passes
 from tomo_polysplat.plan.decisions.seed_spacing import SeedSpacing
 from tomo_polysplat.plan.lab import Lab, Untold
@@ -39,6 +40,9 @@ _SHARP = 0.96
 # A short fit is one pass over the views. It need not have more steps than the first number, but has at least as many
 # views as the second: 40 views in steps of one came to 0.75 to 0.97 by the seed, and in 1.8 passes to 0.67 to 0.81.
 _STEPS, _FEWEST_VIEWS = 40, 72
+# Times as long where the detector's blur is fitted and thin seeds leave no less: at first the blur is too small, and
+# round seeds stand for it. Objects that move while views are taken, whose edges are blurred, stay at 0.99 and more.
+_LONGER = 2
 # Distance of the seeds, in distances that the detector could tell apart, beyond which nothing is asked. These seeds are
 # thin as it is, and gain less by being thinner than the short fits cost (teeth of 96^3, 128^3 and 256^3, 1.3, 1.4 and
 # 2.1 times as far: 2.0, 1.8 and 0.3 dB).
@@ -57,7 +61,7 @@ class Edges(Decision):
     """
 
     name = "edges"
-    needs = (Agent, Passes, SeedSpacing)
+    needs = (Agent, DetectorBlur, Passes, SeedSpacing)
     when = When.TRIAL
 
     def valid(self, value: object) -> bool:
@@ -79,13 +83,11 @@ class Edges(Decision):
         """Two short fits say whether thin seeds leave clearly less of the misfit."""
         short = settings_of_trial(lab)
         try:
-            of_round, of_thin = (
-                _misfit(lab.trial(short, edges=kind).gaussians, lab.scene, lab.rays, short)
-                for kind in ("blurred", "sharp")
-            )
+            share = _share(lab, short)
+            if share >= _SHARP and known[DetectorBlur]:
+                share = _share(lab, settings_of_trial(lab, _LONGER))
         except Untold:
             raise Untold(f"round seeds: {TOO_SHORT} how sharp edges are") from None
-        share = of_thin / of_round if of_round else 1.0
         sharp = share < _SHARP
         kind = "sharp, and seeds thin across them" if sharp else "not sharp enough for thin seeds"
         why = f"{kind}: after a short fit these leave {share:.2f} of the misfit that others leave"
@@ -99,11 +101,11 @@ class Edges(Decision):
         )
 
 
-def settings_of_trial(lab: Lab) -> Settings:
-    """Of a short fit of about a pass over the views, without smoothing."""
+def settings_of_trial(lab: Lab, longer: float = 1.0) -> Settings:
+    """Of a short fit of about a pass over the views, or of so many times as much, without smoothing."""
     views = lab.problem.geometry.views
     steps = _STEPS * views_of_short_steps(lab.plan, lab.problem)
-    passes = max(_FEWEST_VIEWS, min(views, steps)) / views
+    passes = max(_FEWEST_VIEWS, min(views, steps)) / views * longer
     return replace(lab.seeding, passes=passes, soft_gain=0.0, tv_weight=0.0)
 
 
@@ -125,6 +127,15 @@ def why_no_trial(spacing: float, passes: float, lab: Lab) -> str:
     if problem.geometry.views < FEW_VIEWS:
         return f"round seeds: fewer than {FEW_VIEWS} views do not tell how sharp edges are"
     return ""
+
+
+def _share(lab: Lab, short: Settings) -> float:
+    """How much thin seeds leave of the misfit that round ones leave."""
+    of_round, of_thin = (
+        _misfit(lab.trial(short, edges=kind).gaussians, lab.scene, lab.rays, short)
+        for kind in ("blurred", "sharp")
+    )
+    return of_thin / of_round if of_round else 1.0
 
 
 @torch.no_grad()
