@@ -5,8 +5,10 @@ import pytest
 from ellipsoids import BODY, chords, cone_scan, noisy, orbit, whole_turn
 
 from tomo_polysplat.scan.assumptions import compare
+from tomo_polysplat.scan.axis_offset import AxisOffset
 from tomo_polysplat.scan.centre import find_centre
 from tomo_polysplat.scan.check import DEFECT, OK, UNKNOWN, check_scan
+from tomo_polysplat.scan.probes.opposite import _centre
 
 ROWS, COLUMNS, VIEWS = 25, 47, 60
 
@@ -84,6 +86,14 @@ def test_neighbours_are_neighbours_by_place(kind):
     shuffled = np.random.default_rng(0).permutation(len(vectors))
     scan.projections = np.ascontiguousarray(scan.projections[:, shuffled])
     assert verdicts(scan)["order of views"] == DEFECT
+
+
+@pytest.mark.parametrize(
+    "off, error, verdict", [(0.83, 0.19, UNKNOWN), (0.83, 0.05, DEFECT), (0.3, 0.19, OK)]
+)
+def test_an_axis_that_may_be_off_is_not_called_right(off, error, verdict):
+    found = _centre(AxisOffset(off, error))
+    assert found.verdict == verdict and ("short fits" in found.remedy) == (verdict == UNKNOWN)
 
 
 # Half acquisition

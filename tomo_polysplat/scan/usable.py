@@ -14,6 +14,7 @@ from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.water_correction import undo_water_correction
 from tomo_polysplat.scan.apart_columns import columns_not_measured
 from tomo_polysplat.scan.counts import Counts, Marks
+from tomo_polysplat.scan.erratic import erratic_pixels
 from tomo_polysplat.scan.geometry import (
     Geometry,
     geometry_from_astra,
@@ -88,6 +89,12 @@ def usable_rays(
     counts["rays_of_stuck_pixels"] = _left_out(values, stuck)
     if stuck.any():
         logger.warning("Pixels that show the same value in every view are left out: %d.", stuck.sum())
+    if counts["rays_not_finite"]:
+        erratic = erratic_pixels(values)
+        counts["rays_of_stuck_pixels"] += _left_out(values, erratic)
+        if erratic.any():
+            words = "without light in some views and brighter than the open beam in others"
+            logger.warning("Pixels that are %s are left out: %d.", words, erratic.sum())
     apart = columns_not_measured(values, geometry)
     counts["rays_of_columns_apart"] = _left_out(values, np.broadcast_to(apart, stuck.shape))
     if apart.any():

@@ -25,6 +25,7 @@ _TOLERATED, _TELLING = 0.5, 0.5
 
 CENTRE, DIRECTION = "centre", "direction of the angles"
 _NEEDS = "a calibration of the scanner, or an object with detail where rays were measured from both ends"
+_FITS = "recon looks for it by short fits"
 
 
 def probe_centre_and_direction(measured: Measured) -> list[Finding]:
@@ -81,12 +82,15 @@ def _centre(found: AxisOffset) -> Finding:
     offset, error = -found.columns, found.error
     numbers = {"offset": offset}
     size = f"{abs(offset):.2f} columns (standard error {error:.2g})"
+    side = "above" if offset > 0 else "below"
     if abs(offset) > _TOLERATED + RULED_OUT * error:
-        side = "above" if offset > 0 else "below"
         text = f"the rotation axis falls {size} {side} where the geometry has it"
         remedy = f"move the detector: astra.geom_postalignment(proj_geom, ({-offset:.2f}, 0.0))"
         return Finding(CENTRE, DEFECT, text, remedy, numbers, error)
     if error > _TELLING:
         text = f"the axis is known to {error:.2g} columns only"
         return Finding(CENTRE, UNKNOWN, text, _NEEDS, numbers, error)
+    if abs(offset) > _TOLERATED:
+        text = f"the rotation axis may fall {size} {side} where the geometry has it"
+        return Finding(CENTRE, UNKNOWN, text, f"{_FITS}, or {_NEEDS}", numbers, error)
     return Finding(CENTRE, OK, f"within {size} of where the geometry has it", "", numbers, error)
