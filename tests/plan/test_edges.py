@@ -66,12 +66,12 @@ def test_two_short_fits_tell_sharp_edges_from_blurred_ones(blur):
     torch.testing.assert_close(seeds.parameters(), same.parameters(), rtol=0, atol=0)
 
 
-# After one pass thin seeds leave 0.97 and 1.05, after two 0.85 and 1.03.
+# After one pass thin seeds leave 1.03 and 1.08, after two 0.58 and 0.79: noise tells that light was spread.
 @pytest.mark.parametrize("of", ["detector", "object"])
-def test_longer_fits_tell_a_blurred_detector_from_a_blurred_object(of):
-    projections, *rest = walls(0.0 if of == "detector" else 1.0)
+def test_a_blurred_detector_is_told_from_a_blurred_object(of):
+    projections, *rest = walls(0.0 if of == "detector" else 0.6, views=60)
     if of == "detector":
-        projections = ndimage.gaussian_filter(projections, (0, 1.0, 1.0))
+        projections = ndimage.gaussian_filter(projections, (0, 0.8, 0.8))
     lab = lab_of(Problem.of(projections, *rest[:2], "cm", None, None), None)
     for decision in (Agent(), DetectorBlur(), Edges()):
         lab.plan.answers[decision.name] = answer_to(decision, lab)

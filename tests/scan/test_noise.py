@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+import torch
+from scipy import ndimage
 from small_scans import fan, reconstruct
 
-from tomo_polysplat.scan.noise import RayNoise, photons_per_ray, ray_noise
+from tomo_polysplat.scan.noise import RayNoise, correlation_of_noise, photons_per_ray, ray_noise
 from tomo_polysplat.scan.usable import usable_rays
 
 PARALLEL = {"type": "parallel3d", "DetectorSpacingX": 1.0, "DetectorSpacingY": 1.0}
@@ -128,3 +130,17 @@ def test_the_noise_of_a_scan_is_looked_at_once(monkeypatch):
     )
     result = reconstruct(fan(), calibrate=True)
     assert len(seen) == 1 and result.plan["photons_per_ray"].value == pytest.approx(5e4)
+
+
+def test_light_that_is_spread_correlates_the_noise_of_neighbours():
+    light = np.exp(-poisson(disc(1.5), 3e4).astype(np.float64))
+    # What stands still, as gains of pixels do, is none of it.
+    gains = 1 + 0.02 * ndimage.gaussian_filter(np.random.default_rng(1).normal(size=light.shape[1:]), (0, 2))
+    own, shared = (
+        torch.from_numpy(-np.log(each * gains))
+        for each in (light, ndimage.gaussian_filter(light, (0, 0.7, 0.7)))
+    )
+    shared[:, 3, 5] = torch.nan
+    assert correlation_of_noise(own) == pytest.approx(0, abs=0.03)
+    assert correlation_of_noise(shared) == pytest.approx(np.exp(-1 / (4 * 0.7**2)), abs=0.05)
+    assert correlation_of_noise(shared + 0.3) == 0

@@ -25,7 +25,7 @@ from tomo_polysplat.physics.filter_map import FilterMap
 from tomo_polysplat.physics.scatter import Scatter, made_level, without_scatter
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
-from tomo_polysplat.scan.noise import RayNoise, ray_noise
+from tomo_polysplat.scan.noise import RayNoise, correlation_of_noise, ray_noise
 from tomo_polysplat.scan.snapped import snapped_geometry, snapped_grid
 from tomo_polysplat.scan.view_order import sorted_in_place, view_order
 from tomo_polysplat.start.agreement import halves_agree
@@ -323,6 +323,10 @@ class Problem:
             told = self._copied(device), self.dimmed(device)
             self._known.noise = ray_noise(*told, given=self.given)
         return self._known.noise
+
+    def correlation_of_noise(self, device: torch.device) -> float:
+        """How the noise of neighbouring pixels correlates; see ``scan.noise``."""
+        return correlation_of_noise(self._copied(device))
 
     def photons(self, device: torch.device) -> float:
         """Photons of an unattenuated ray, by that noise."""

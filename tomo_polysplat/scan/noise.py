@@ -9,7 +9,9 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 import torch
 
-__all__ = ["RayNoise", "Values", "photons_per_ray", "ray_noise"]
+from tomo_polysplat.evenly_spread import evenly_spread
+
+__all__ = ["RayNoise", "Values", "correlation_of_noise", "photons_per_ray", "ray_noise"]
 
 Values = TypeVar("Values", np.ndarray, torch.Tensor)
 
@@ -20,6 +22,9 @@ _BINS = 16
 _LARGEST_EXPONENT = 700.0
 # Error of a variance told by the median absolute deviation of n normal values, times sqrt(n), and how many of it tell.
 _OF_A_MEDIAN, _CLEARLY = 2.33, 3.0
+
+# Rays beside the object have no larger -log(I/I0), by those beside them; so many of them tell how noise correlates.
+_AIR, _FEWEST_IN_AIR = 0.05, 500
 
 
 class RayNoise(NamedTuple):
@@ -120,6 +125,36 @@ def ray_noise(
     if dimmed is None and found.closer_alike() > _CLEARLY * found.error:
         return RayNoise(deviation=math.sqrt(found.alike))
     return RayNoise(max(1.0, 1 / found.of_counts))
+
+
+def correlation_of_noise(projections: torch.Tensor) -> float:
+    """How the noise of neighbouring pixels of a row correlates, by rays beside the object; 0 where these are too few.
+
+    It is 0 where each pixel counts photons of its own, and ``exp(-1 / (4 s**2))`` where a scintillator spreads the
+    light of each by a Gaussian of deviation s pixels.
+
+    Parameters
+    ----------
+    projections : (views, rows, columns) tensor
+        -log(I/I0); NaN where a ray is unusable.
+    """
+    views, columns = len(projections), projections.shape[2]
+    if views < 2 or columns < 5:
+        return 0.0
+    before = torch.from_numpy(evenly_spread(views - 1, min(_VIEWS, views - 1))).to(projections.device)
+    first, second = (projections[before + k].double() for k in (0, 1))
+    # What does not change from view to view, as gains of pixels do not, is no noise.
+    change, depth = second - first, 0.5 * (first + second)
+    beside = (depth[..., :-3] + depth[..., 3:]).abs() < 2 * _AIR
+    left, right = change[..., 1:-2], change[..., 2:-1]
+    good = beside & torch.isfinite(left) & torch.isfinite(right)
+    if int(good.sum()) < _FEWEST_IN_AIR:
+        return 0.0
+    middle, pair = torch.median(left[good]), (left[good], right[good])
+    most = 4 * 1.4826 * torch.median((pair[0] - middle).abs())
+    one, other = ((each - middle).clamp(-most, most) for each in pair)
+    power = (one.square().mean() * other.square().mean()).sqrt()
+    return float((one * other).mean() / power) if power > 0 else 0.0
 
 
 class _Scatter(NamedTuple):

@@ -40,9 +40,10 @@ _SHARP = 0.96
 # A short fit is one pass over the views. It need not have more steps than the first number, but has at least as many
 # views as the second: 40 views in steps of one came to 0.75 to 0.97 by the seed, and in 1.8 passes to 0.67 to 0.81.
 _STEPS, _FEWEST_VIEWS = 40, 72
-# Times as long where the detector's blur is fitted and thin seeds leave no less: at first the blur is too small, and
-# round seeds stand for it. Objects that move while views are taken, whose edges are blurred, stay at 0.99 and more.
-_LONGER = 2
+# Times as long where the detector spreads light and thin seeds leave no less: at first the blur that is fitted is too
+# small, and round seeds stand for it. Noise of neighbouring pixels that correlates by so much tells of such a detector,
+# as of 0.46 pixels: 0.52 to 0.78 in scans with 0.5 to 0.8 pixels, 0.14 at most in others.
+_LONGER, _SPREAD = 2, 0.3
 # Distance of the seeds, in distances that the detector could tell apart, beyond which nothing is asked. These seeds are
 # thin as it is, and gain less by being thinner than the short fits cost (teeth of 96^3, 128^3 and 256^3, 1.3, 1.4 and
 # 2.1 times as far: 2.0, 1.8 and 0.3 dB).
@@ -84,7 +85,7 @@ class Edges(Decision):
         short = settings_of_trial(lab)
         try:
             share = _share(lab, short)
-            if share >= _SHARP and known[DetectorBlur]:
+            if share >= _SHARP and known[DetectorBlur] and _spreads_light(lab):
                 share = _share(lab, settings_of_trial(lab, _LONGER))
         except Untold:
             raise Untold(f"round seeds: {TOO_SHORT} how sharp edges are") from None
@@ -127,6 +128,11 @@ def why_no_trial(spacing: float, passes: float, lab: Lab) -> str:
     if problem.geometry.views < FEW_VIEWS:
         return f"round seeds: fewer than {FEW_VIEWS} views do not tell how sharp edges are"
     return ""
+
+
+def _spreads_light(lab: Lab) -> bool:
+    """Whether the detector does, rather than the object having blurred edges, as the noise tells."""
+    return lab.problem.correlation_of_noise(lab.device) > _SPREAD
 
 
 def _share(lab: Lab, short: Settings) -> float:
