@@ -25,6 +25,8 @@ def test_what_two_halves_agree_on_is_smoothed_less():
     assert alone[0] == alone[1] and 0.02 < alone[0] < 0.1
     assert alone[0] < corners_for([0.15, None], (50, 50, 50), 0.0)[0] < 0.1
     assert alone[0] < corners_for([0.15, None], large, 0.7)[0] < 0.1
+    in_a_slice = corners_for([0.15, 0.9], (1, 512, 500), 0.0)
+    assert in_a_slice[0] < 0.1 and in_a_slice[1] == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize("light, share", [(1.0, 1.0), (0.5, 0.5), (0.01, 0.3)])

@@ -124,6 +124,9 @@ def corners_for(agreement: Sequence[float | None], shape: Sequence[int], alike: 
         least = _AT_LEAST * _ramp(min(shape), *_THICK)
         of_soft = max(_ramp(soft, *_OF_SOFT), least) * (1 - _ramp(alike, *_ONE_MATTER))
     of_dense = of_soft if dense is None else _ramp(dense, *_OF_DENSE)
+    if min(shape) == 1:
+        # Few rays a voxel: noise within dense matter is far above any texture that its surfaces seem to tell.
+        of_dense = 0.0
     ratio = _TEXTURED / _SMOOTH
     return _SMOOTH * ratio ** (fine * of_soft), _SMOOTH * ratio ** (fine * of_dense)
 
