@@ -82,8 +82,10 @@ class Fitter:
                 self._grow()
             elif self.relocation_due:
                 self._relocate()
+            if made == 0:
+                # Amid a pass several ranks hold what was fitted since.
+                self._hold_blur(share)
             views = self._next_views(self.batch)
-            self._hold_blur(share)
             self.step(views, share)
             clock.done += 1
             clock.tick()

@@ -24,13 +24,12 @@ from typing import Any
 import torch
 
 from tomo_polysplat.kernels.device import is_for_compiled
+from tomo_polysplat.kernels.step.mixed_light import MOST_BESIDE
 
 __all__ = ["LARGEST_BLUR", "blurred", "blurred_light"]
 
 # Three taps make no wider blur without a dip in their middle.
 LARGEST_BLUR = 0.6
-# A pixel has no more than exp of this times as much light as one beside it, as far as that matters to either.
-MOST_BESIDE = 60.0
 
 
 def blurred(projections: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:

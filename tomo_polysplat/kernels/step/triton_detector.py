@@ -19,6 +19,7 @@ import triton  # noqa: TID253 - imported only where a kernel runs
 import triton.language as tl  # noqa: TID253
 
 from tomo_polysplat.kernels.project.triton_image import folded, gradient_room, pixel_factor, place
+from tomo_polysplat.kernels.step.mixed_light import MOST_BESIDE
 from tomo_polysplat.kernels.step.triton_misfit import (
     PIXELS_A_PROGRAM,
     Splat,
@@ -28,7 +29,6 @@ from tomo_polysplat.kernels.step.triton_misfit import (
 )
 from tomo_polysplat.kernels.step.triton_update import WHOLE_OF_BLUR
 from tomo_polysplat.kernels.triton_maths import SIZES, on_device
-from tomo_polysplat.physics.detector_blur import MOST_BESIDE
 
 __all__ = ["detected_misfit_gradient"]
 
