@@ -82,11 +82,3 @@ def test_blur_is_fitted_where_there_is_metal_and_held_where_asked():
     assert "in so few passes" in reconstruct(fan(metal=False)).plan["detector_blur"].why
     held = reconstruct(fan(metal=False), settings={"passes": 1, "blur": 0.3, "learning_rate_blur": 0})
     assert "0.300" in held.plan["detector_blur"].why
-
-
-def test_in_a_slice_the_blur_waits_for_the_metals_numbers():
-    found = [
-        reconstruct(fan(), settings={"material_from": since}).plan["fitted_blur"].value
-        for since in (0.0, 1.0)
-    ]
-    assert found[1] == pytest.approx(0.1) and abs(found[0] - 0.1) > 0.01

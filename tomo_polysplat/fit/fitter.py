@@ -64,7 +64,7 @@ class Fitter:
         hurry, shared = hurried(settings, steps), None if beside is None else beside.step
         self.step: Step = make_step(setup._replace(settings=hurry), batch=batch, beside=shared)
         self.batch, self.order = batch, np.empty(0, int)
-        self.steps, self._blur_held = steps, False
+        self.steps = steps
         self.steps_of_a_pass = max(1, round(_views_of_a_pass(rays) / batch))
         self.relocated = 0
         self.relocation_due = False
@@ -82,9 +82,6 @@ class Fitter:
                 self._grow()
             elif self.relocation_due:
                 self._relocate()
-            if made == 0:
-                # Amid a pass several ranks hold what was fitted since.
-                self._hold_blur(share)
             views = self._next_views(self.batch)
             self.step(views, share)
             clock.done += 1
@@ -126,21 +123,7 @@ class Fitter:
         """Take the learning rates of a run of so many steps."""
         if steps != self.steps:
             self.steps = steps
-            self._set_rates()
-
-    def _hold_blur(self, share: float) -> None:
-        """In a slice the detector's blur stays at its start for as long as the metals' numbers do.
-
-        Gaussians of few rays each are rough at first. A blur would make up for that, and keep them so.
-        """
-        held = self.gaussians.planar and share < self.settings.material_from
-        if held != self._blur_held:
-            self._blur_held = held
-            self._set_rates()
-
-    def _set_rates(self) -> None:
-        rates = step_rates(hurried(self.settings, self.steps), self.spacing)
-        self.step.set_rates(rates | ({"blur": 0.0} if self._blur_held else {}))
+            self.step.set_rates(step_rates(hurried(self.settings, steps), self.spacing))
 
     @torch.no_grad()
     def _end_pass(self, share: float) -> tuple[float, float, int]:
