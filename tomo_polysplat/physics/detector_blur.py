@@ -51,11 +51,8 @@ def blurred(projections: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
         return _Blurred.apply(projections, variance)
     beside, same = 0.5 * variance, 1 - variance
     for axis in (1, 2):
-        count = projections.shape[axis]
-        if count > 1:
-            first, last = projections.narrow(axis, 0, 1), projections.narrow(axis, count - 1, 1)
-            wide = torch.cat([first, projections, last], dim=axis)
-            before, after = (wide.narrow(axis, k, count) for k in (0, 2))
+        if projections.shape[axis] > 1:
+            before, after = _neighbours(projections, axis)
             projections = same * projections + beside * (before + after)
     return projections
 
@@ -76,16 +73,21 @@ def blurred_light(projections: torch.Tensor, variance: torch.Tensor) -> torch.Te
         Differentiable by both. An axis of one pixel is not blurred.
     """
     for axis in (1, 2):
-        count = projections.shape[axis]
-        if count > 1:
-            first, last = projections.narrow(axis, 0, 1), projections.narrow(axis, count - 1, 1)
-            wide = torch.cat([first, projections, last], dim=axis)
+        if projections.shape[axis] > 1:
             # Light beside a pixel, in that of its own: rounding then leaves a blur of 0 as it is.
-            beside = [
-                (projections - wide.narrow(axis, k, count)).clamp(max=MOST_BESIDE).exp() for k in (0, 2)
-            ]
-            projections = projections - torch.log1p(0.5 * variance * (beside[0] + beside[1] - 2))
+            before, after = (
+                (projections - one).clamp(max=MOST_BESIDE).exp() for one in _neighbours(projections, axis)
+            )
+            projections = projections - torch.log1p(0.5 * variance * (before + after - 2))
     return projections
+
+
+def _neighbours(projections: torch.Tensor, axis: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """The pixel before each one along an axis, and the one behind; beyond the border lies the border's own again."""
+    count = projections.shape[axis]
+    first, last = projections.narrow(axis, 0, 1), projections.narrow(axis, count - 1, 1)
+    wide = torch.cat([first, projections, last], dim=axis)
+    return wide.narrow(axis, 0, count), wide.narrow(axis, 2, count)
 
 
 class _Blurred(torch.autograd.Function):
