@@ -32,10 +32,14 @@ def volume(gaussians):
     return voxelise_gaussians(gaussians, gaussians.weights(None), box, "numba")[0].double()
 
 
+def all_of(gaussians):
+    return torch.ones(len(gaussians), dtype=torch.bool)
+
+
 def test_the_hardest_pulled_is_split_into_the_dead_ones_place():
     gaussians = cloud([1.0, 0.0, 2.0, 0.5])
     before = gaussians.copy()
-    changed = relocate(gaussians, torch.tensor([0.1, 9.0, 3.0, 0.2]), 0.5)
+    changed = relocate(gaussians, torch.tensor([0.1, 9.0, 3.0, 0.2]), 0.5, all_of(gaussians))
     assert sorted(changed.tolist()) == [1, 2]
     for index in (0, 3):
         assert torch.equal(gaussians.position[index], before.position[index])
@@ -49,7 +53,7 @@ def test_the_hardest_pulled_is_split_into_the_dead_ones_place():
 def test_splitting_keeps_the_mass_and_nearly_the_shape():
     gaussians = cloud([1.0, 0.0])
     before = volume(gaussians)
-    relocate(gaussians, torch.tensor([1.0, 0.0]), 1.0)
+    relocate(gaussians, torch.tensor([1.0, 0.0]), 1.0, all_of(gaussians))
     after = volume(gaussians)
     assert float(after.sum()) == pytest.approx(float(before.sum()), rel=0.01)
     # Two Gaussians 0.7 as long, a deviation apart, have 0.7^2 + 0.5^2 = 0.74 of the old variance.
@@ -60,15 +64,26 @@ def test_splitting_keeps_the_mass_and_nearly_the_shape():
 def test_nothing_moves_without_the_dead_or_without_leave(attenuation, share):
     gaussians = cloud(attenuation)
     before = gaussians.copy()
-    assert len(relocate(gaussians, torch.ones(3), share)) == 0
+    assert len(relocate(gaussians, torch.ones(3), share, all_of(gaussians))) == 0
     assert all(
         torch.equal(a, b) for a, b in zip(gaussians.parameters().values(), before.parameters().values())
     )
 
 
+def test_what_may_not_be_split_stays_and_nothing_moves_for_it():
+    gaussians = cloud([1.0, 0.0, 2.0, 0.5, 0.0])
+    before = gaussians.copy()
+    changed = relocate(
+        gaussians, torch.tensor([1.0, 0.0, 9.0, 0.2, 0.0]), 0.4, torch.tensor([1, 1, 0, 1, 1]).bool()
+    )
+    # The hardest two are the first and the third, and the fourth does not take the third's turn.
+    assert sorted(changed.tolist()) == [0, 1]
+    assert torch.equal(gaussians.position[2], before.position[2])
+
+
 def test_no_more_move_than_are_worth_splitting():
     gaussians = cloud([1.0, 0.0, 0.0, 0.0])
-    relocate(gaussians, torch.ones(4), 1.0)
+    relocate(gaussians, torch.ones(4), 1.0, all_of(gaussians))
     assert bool(torch.isfinite(gaussians.position).all())
     assert int((gaussians.attenuation > 0).sum()) == 2
     assert math.isfinite(float(gaussians.attenuation.sum()))

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from tomo_polysplat.fit.choose_step import make_step
+from tomo_polysplat.fit.finer import may_be_finer
 from tomo_polysplat.fit.learning_rates import hurried
 from tomo_polysplat.fit.light_matter import tell_light
 from tomo_polysplat.fit.metal_numbers import number_metals
@@ -20,7 +21,7 @@ from tomo_polysplat.fit.rays import Rays
 from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.fit.snapshot import Snapshot
 from tomo_polysplat.fit.soft_matter import flatten
-from tomo_polysplat.fit.step import Step, step_rates
+from tomo_polysplat.fit.step import Step, log_scale_bounds, step_rates
 from tomo_polysplat.fit.stopping import Clock
 from tomo_polysplat.kernels.compile_time import working_time
 from tomo_polysplat.kernels.spatial_order import spatial_order
@@ -172,7 +173,9 @@ class Fitter:
     def _relocate(self) -> None:
         """Put Gaussians that hold nothing where they are wanted, with a fresh memory of the optimiser."""
         self.relocation_due = False
-        changed = relocate(self.gaussians, self.step.pull, self.settings.relocated)
+        smallest, _ = log_scale_bounds(self.scene, self.spacing, self.gaussians.planar, self.settings)
+        may = may_be_finer(self.gaussians, self.scene, smallest)
+        changed = relocate(self.gaussians, self.step.pull, self.settings.relocated, may)
         self.step.pull.zero_()
         if not len(changed):
             return

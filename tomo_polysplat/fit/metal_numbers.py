@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy import ndimage
 
+from tomo_polysplat.fit.metal_voxels import levels_of_pieces, metal_around
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
@@ -41,21 +41,7 @@ def number_metals(gaussians: Gaussians, scene: FitScene, settings: Settings, sha
     if not len(members):
         return
     metal = gaussians.select(members)
-    group = metal.group.cpu().numpy()
-    pieces = np.unique(group)
-    # The median of its Gaussians' voxels: the outermost ones hold something else as well.
-    levels = ndimage.median(_at_centres(metal, scene), group, pieces)
+    pieces, levels = levels_of_pieces(metal_around(metal, scene)[0], metal.group.cpu().numpy())
     numbers = np.round(scene.solid_number(levels), _DIGITS)
     shared = gaussians.shared_material
     shared[torch.from_numpy(pieces).to(shared.device)] = torch.from_numpy(numbers).to(shared)
-
-
-def _at_centres(metal: Gaussians, scene: FitScene) -> np.ndarray:
-    """Attenuation in soft references of the voxel that each Gaussian is in, or of the nearest one."""
-    box = scene.box
-    index = box.voxels_of(metal.position)
-    lowest = index.amin(dim=0)
-    nz, ny, nx = (index.amax(dim=0) - lowest + 1).tolist()
-    z, y, x = lowest.tolist()
-    values = scene.attenuation(metal, box.part((z, y, x), (nz, ny, nx)))
-    return values[tuple((index - lowest).T)].cpu().numpy()

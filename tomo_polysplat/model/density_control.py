@@ -8,14 +8,16 @@ import torch
 
 from tomo_polysplat.model.gaussians import Gaussians
 
-__all__ = ["grow", "relocate", "splittable"]
+__all__ = ["HALF", "grow", "relocate", "splittable"]
 
 # Attenuation, in soft references, below which a Gaussian holds nothing.
 _DEAD = 1e-3
+# A half's length in that of the Gaussian that was split.
+HALF = 0.7
 
 
 @torch.no_grad()
-def relocate(gaussians: Gaussians, pull: torch.Tensor, share: float) -> torch.Tensor:
+def relocate(gaussians: Gaussians, pull: torch.Tensor, share: float, may: torch.Tensor) -> torch.Tensor:
     """Split the Gaussians that the rays pull hardest; their halves take the places of empty Gaussians.
 
     A Gaussian that is pulled both ways at once covers something finer than itself. It becomes two; see `_halve`.
@@ -28,6 +30,8 @@ def relocate(gaussians: Gaussians, pull: torch.Tensor, share: float) -> torch.Te
         How hard the rays have pulled at each position: lengths of the loss's gradients, added up.
     share : float
         At most this share of the Gaussians moves.
+    may : (n,) bool tensor
+        Which may be split. Those of the hardest pulled that may not stay as they are, and fewer move.
 
     Returns
     -------
@@ -39,8 +43,9 @@ def relocate(gaussians: Gaussians, pull: torch.Tensor, share: float) -> torch.Te
     count = min(int(dead.sum()), int(alive.sum()), int(share * len(gaussians)))
     if count == 0:
         return dead.new_zeros(0, dtype=torch.int64)
-    target = dead.nonzero()[:count, 0]
     source = _hardest(pull, alive, count)
+    source = source[may[source]]
+    target = dead.nonzero()[: len(source), 0]
     half = _halve(gaussians, source)
     for tensor in gaussians.each().values():
         tensor[target] = tensor[source]
@@ -102,13 +107,13 @@ def _hardest(pull: torch.Tensor, alive: torch.Tensor, count: int) -> torch.Tenso
 def _halve(gaussians: Gaussians, source: torch.Tensor) -> torch.Tensor:
     """(m, 3) offsets of the two halves of some Gaussians from their middle, to either side; sizes are set in place.
 
-    Halves lie half a deviation from the middle along the longest axis, and are 0.7 times as long there. Both together
-    have the mass of the old Gaussian.
+    Halves lie half a deviation from the middle along the longest axis, and are `HALF` times as long there. Both
+    together have the mass of the old Gaussian.
     """
     axis = gaussians.log_scale[source].argmax(dim=1)
     half = 0.5 * gaussians.log_scale[source, axis].exp()[:, None] * _axis(gaussians.rotation[source], axis)
-    gaussians.log_scale[source, axis] += math.log(0.7)
-    gaussians.attenuation[source] *= 0.5 / 0.7
+    gaussians.log_scale[source, axis] += math.log(HALF)
+    gaussians.attenuation[source] *= 0.5 / HALF
     return half
 
 
