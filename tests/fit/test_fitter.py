@@ -56,6 +56,15 @@ def test_its_pace_goes_with_a_branch_and_a_snapshot():
     assert rates(resumed) == rates(hurried.branch(pixel_rays=1)) == rates(hurried)
 
 
+def test_what_is_not_finite_any_more_is_told_and_not_looked_at():
+    fitter = fitter_of(400)
+    with torch.no_grad():
+        fitter.gaussians.position[:] = math.nan
+        fitter.gaussians.attenuation[:2] = 0.0
+    fitter.relocation_due = True
+    assert len(fitter.ahead(Clock(400, None), 2)) == 2 and fitter.relocated == 0
+
+
 def test_a_cloud_grows_after_its_old_step_has_gone(monkeypatch):
     """Which on a GPU holds as much as the new one."""
     fitter = after_a_pass(400, Clock)
