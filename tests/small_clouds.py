@@ -3,6 +3,7 @@
 import numpy as np
 import torch
 
+from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.kernels.voxelise.box import VoxelBox
 from tomo_polysplat.model.gaussians import Gaussians
 
@@ -23,3 +24,11 @@ def blocks(levels, size=11):
     )  # fmt: skip
     box = VoxelBox(np.zeros(3), np.ones(3), (2 * size * len(levels), size, size))
     return gaussians, box
+
+
+def scene_of(box, numbers=None):
+    """A scene of one energy with these voxels; ``numbers`` tells solids by their attenuation."""
+    return FitScene(
+        box, None, 1.0, None, None, -0.1, "reference", 0.1, False, (0.1, 0.1), False, 1, 0.2,
+        solid_number=numbers,
+    )  # fmt: skip

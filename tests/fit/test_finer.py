@@ -4,14 +4,9 @@ import math
 
 import numpy as np
 import torch
-from small_clouds import blocks
+from small_clouds import blocks, scene_of
 
 from tomo_polysplat.fit.finer import may_be_finer
-from tomo_polysplat.fit.scene import FitScene
-
-
-def scene_of(box):
-    return FitScene(box, None, 1.0, None, None, -0.1, "reference", 0.1, False, (0.1, 0.1), False, 1, 0.2)
 
 
 def test_metal_is_split_at_its_edge_alone_and_soft_matter_everywhere():

@@ -56,12 +56,17 @@ def test_its_pace_goes_with_a_branch_and_a_snapshot():
     assert rates(resumed) == rates(hurried.branch(pixel_rays=1)) == rates(hurried)
 
 
-def test_what_is_not_finite_any_more_is_told_and_not_looked_at():
+def test_what_is_not_finite_any_more_is_told_and_not_looked_at(monkeypatch):
     fitter = fitter_of(400)
-    with torch.no_grad():
-        fitter.gaussians.position[:] = math.nan
-        fitter.gaussians.attenuation[:2] = 0.0
-    fitter.relocation_due = True
+    read = fitter.step.read
+
+    def diverged():
+        told = read()
+        with torch.no_grad():
+            fitter.gaussians.position[fitter.gaussians.group.argmax()] = math.nan
+        return told
+
+    monkeypatch.setattr(fitter.step, "read", diverged)
     assert len(fitter.ahead(Clock(400, None), 2)) == 2 and fitter.relocated == 0
 
 

@@ -2,22 +2,14 @@
 
 import numpy as np
 import pytest
-from small_clouds import blocks
+from small_clouds import blocks, scene_of
 from small_scans import disc
 
 from tomo_polysplat import reconstruct
 from tomo_polysplat.fit.metal_numbers import number_metals
-from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.physics.materials import density
 from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.settings import Settings
-
-
-def scene_of(box, numbers):
-    return FitScene(
-        box, None, 1.0, None, None, -0.1, "reference", 0.1, False, (0.1, 0.1), False, 1, 0.2,
-        solid_number=numbers,
-    )  # fmt: skip
 
 
 def test_each_piece_gets_the_number_of_its_own_attenuation():

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 import math
 
 import torch
 
-from tomo_polysplat.fit.metal_voxels import levels_of_pieces, metal_around
+from tomo_polysplat.fit.metal_voxels import levels_of_pieces, metal_voxels
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.density_control import HALF
 from tomo_polysplat.model.gaussians import Gaussians
@@ -37,9 +39,18 @@ def may_be_finer(gaussians: Gaussians, scene: FitScene, smallest: float) -> torc
     members = (gaussians.group > 0).nonzero()[:, 0]
     if len(members):
         metal = gaussians.select(members)
-        own, least = metal_around(metal, scene)
-        group = metal.group.cpu().numpy()
-        pieces, levels = levels_of_pieces(own, group)
-        inside = least >= _EDGE * levels[pieces.searchsorted(group)]
+        values, index = metal_voxels(metal, scene)
+        _, levels, of_each = levels_of_pieces(metal, values, index)
+        inside = _least_around(values, index).cpu().numpy() >= _EDGE * levels[of_each]
         may[members] &= torch.from_numpy(~inside).to(may.device)
     return may
+
+
+def _least_around(values: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
+    """(n,) least value of the voxels at (n, 3) indices and of all that touch them; a volume goes on at its faces."""
+    last = index.new_tensor(values.shape) - 1
+    beside = (
+        torch.minimum((index + index.new_tensor(step)).clamp(min=0), last)
+        for step in itertools.product((-1, 0, 1), repeat=3)
+    )
+    return functools.reduce(torch.minimum, (values[tuple(at.T)] for at in beside))

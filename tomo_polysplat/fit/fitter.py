@@ -137,6 +137,8 @@ class Fitter:
             flatten(self.gaussians, self.scene, self.settings, share)
             number_metals(self.gaussians, self.scene, self.settings, share)
             tell_light(self.gaussians, self.scene, share)
+        else:
+            self.relocation_due = False
         return told
 
     def snapshot(self, best: Gaussians | None, numbers: dict[str, Any]) -> Snapshot:
@@ -173,9 +175,6 @@ class Fitter:
     def _relocate(self) -> None:
         """Put Gaussians that hold nothing where they are wanted, with a fresh memory of the optimiser."""
         self.relocation_due = False
-        # As at the end of a pass: who made several at once has not looked yet.
-        if not self.gaussians.finite():
-            return
         smallest, _ = log_scale_bounds(self.scene, self.spacing, self.gaussians.planar, self.settings)
         may = may_be_finer(self.gaussians, self.scene, smallest)
         changed = relocate(self.gaussians, self.step.pull, self.settings.relocated, may)

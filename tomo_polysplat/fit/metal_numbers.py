@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.metal_voxels import levels_of_pieces, metal_around
+from tomo_polysplat.fit.metal_voxels import levels_of_pieces, metal_voxels
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
 from tomo_polysplat.settings import Settings
@@ -41,7 +41,7 @@ def number_metals(gaussians: Gaussians, scene: FitScene, settings: Settings, sha
     if not len(members):
         return
     metal = gaussians.select(members)
-    pieces, levels = levels_of_pieces(metal_around(metal, scene)[0], metal.group.cpu().numpy())
+    pieces, levels, _ = levels_of_pieces(metal, *metal_voxels(metal, scene))
     numbers = np.round(scene.solid_number(levels), _DIGITS)
     shared = gaussians.shared_material
     shared[torch.from_numpy(pieces).to(shared.device)] = torch.from_numpy(numbers).to(shared)

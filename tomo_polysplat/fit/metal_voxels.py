@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import torch
 from scipy import ndimage
@@ -11,11 +9,11 @@ from scipy import ndimage
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
 
-__all__ = ["levels_of_pieces", "metal_around"]
+__all__ = ["levels_of_pieces", "metal_voxels"]
 
 
-def metal_around(metal: Gaussians, scene: FitScene) -> tuple[np.ndarray, np.ndarray]:
-    """Attenuation of metal in the voxel that each of its Gaussians is in, or in the nearest one, and beside that voxel.
+def metal_voxels(metal: Gaussians, scene: FitScene) -> tuple[torch.Tensor, torch.Tensor]:
+    """The part of the volume that metal is in, with the voxels that touch it.
 
     Parameters
     ----------
@@ -25,40 +23,40 @@ def metal_around(metal: Gaussians, scene: FitScene) -> tuple[np.ndarray, np.ndar
 
     Returns
     -------
-    own : (n,) float array
-        In soft references.
-    least : (n,) float array
-        The least of this voxel and of all that touch it, likewise.
+    values : (nz, ny, nx) tensor
+        Attenuation in soft references.
+    index : (n, 3) int64 tensor
+        Indices (z, y, x) of the voxel that each Gaussian is in, or of the nearest one.
     """
     index = scene.box.voxels_of(metal.position)
-    last = index.new_tensor(scene.box.shape) - 1
-    lowest, highest = (index.amin(dim=0) - 1).clamp(min=0), torch.minimum(index.amax(dim=0) + 1, last)
+    lowest = (index.amin(dim=0) - 1).clamp(min=0)
+    highest = torch.minimum(index.amax(dim=0) + 1, index.new_tensor(scene.box.shape) - 1)
     z, y, x = lowest.tolist()
     nz, ny, nx = (highest - lowest + 1).tolist()
-    values = scene.attenuation(metal, scene.box.part((z, y, x), (nz, ny, nx)))
-    own = values[tuple((index - lowest).T)]
-    least = own
-    for step in itertools.product((-1, 0, 1), repeat=3):
-        # At a face of the volume metal is taken to go on.
-        beside = torch.minimum((index + index.new_tensor(step)).clamp(min=0), last)
-        least = torch.minimum(least, values[tuple((beside - lowest).T)])
-    return own.cpu().numpy(), least.cpu().numpy()
+    return scene.attenuation(metal, scene.box.part((z, y, x), (nz, ny, nx))), index - lowest
 
 
-def levels_of_pieces(values: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The pieces of metal, and the level of each: the median, as the outermost Gaussians' voxels hold other matter too.
+def levels_of_pieces(
+    metal: Gaussians, values: torch.Tensor, index: torch.Tensor
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The pieces of metal, and how dense each is, from what `metal_voxels` gave.
+
+    The level of a piece is the median of its Gaussians' voxels: the outermost ones hold something else as well.
 
     Parameters
     ----------
-    values : (n,) float array
-        What the voxels of the metal's Gaussians hold.
-    group : (n,) int array
-        The piece that each belongs to.
+    metal : Gaussians
+        n of them.
+    values : (nz, ny, nx) tensor
+    index : (n, 3) int64 tensor
 
     Returns
     -------
     pieces : (m,) int array
     levels : (m,) float array
+    of_each : (n,) int array
+        The place of each Gaussian's piece among the pieces.
     """
-    pieces = np.unique(group)
-    return pieces, ndimage.median(values, group, pieces)
+    own = values[tuple(index.T)].cpu().numpy()
+    pieces, of_each = np.unique(metal.group.cpu().numpy(), return_inverse=True)
+    return pieces, ndimage.median(own, of_each, range(len(pieces))), of_each
