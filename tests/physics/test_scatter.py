@@ -60,7 +60,7 @@ def test_scatter_is_found_although_the_matter_has_taken_some_of_it_up(scatter):
     measured = -np.log(total) + noise.normal(0.0, 0.003, light.shape)
     measured[::97] += 1.0  # rays that nothing explains
     thinner = areal * np.array([[0.97], [1.02], [0.95]])
-    found = estimate_scatter(
+    found, _ = estimate_scatter(
         FittedRays(thinner, measured, np.ones_like(measured), light), SPECTRUM, MATERIALS
     )
     assert found.varies == scatter.varies
@@ -77,7 +77,7 @@ def test_faint_scatter_shows_behind_metal_beyond_the_noise_of_counts(scatter, sh
     measured = -np.log(np.maximum(counts, 0.5) / photons)
     weight = 1 / np.sqrt(1 + np.exp(measured) / (photons * 0.015**2))
     sample = FittedRays(areal, measured, weight, np.ones_like(measured))
-    found = estimate_scatter(sample, SPECTRUM, MATERIALS)
+    found, _ = estimate_scatter(sample, SPECTRUM, MATERIALS)
     assert (misfit_left(sample, SPECTRUM, MATERIALS, Scatter(), found) < 0.97) == shows
     assert misfit_left(sample, SPECTRUM, MATERIALS, found, found) == 1.0
 
@@ -86,7 +86,7 @@ def test_scatter_shows_in_rays_that_are_straight_sums_too():
     depth, noise = np.linspace(0.0, 8.0, 501), np.random.default_rng(7)
     measured = -np.log(np.exp(-depth) + 0.001) + noise.normal(0.0, 0.003, 501)
     sample = FittedRays(0.97 * depth[None], measured, np.ones(501), np.ones(501))
-    found = estimate_scatter(sample, None, None)
+    found, _ = estimate_scatter(sample, None, None)
     assert found.constant == pytest.approx(0.001, rel=0.05)
     assert misfit_left(sample, None, None, Scatter(), found) < 0.2
 
@@ -96,7 +96,9 @@ def test_rays_that_nothing_passes_tell_nothing():
     measured = value_of(rays(), FULL)
     measured = np.append(measured, np.full(5, 700.0))
     light = np.linspace(0.2, 1.0, len(measured))
-    found = estimate_scatter(FittedRays(areal, measured, np.ones_like(measured), light), SPECTRUM, MATERIALS)
+    found, _ = estimate_scatter(
+        FittedRays(areal, measured, np.ones_like(measured), light), SPECTRUM, MATERIALS
+    )
     assert not found.varies and found.constant < 1e-3
 
 

@@ -169,9 +169,12 @@ def test_a_stage_is_taken_where_its_short_fits_had_their_time(seconds, cut, made
 
     monkeypatch.setattr("tomo_polysplat.plan.calibration.short_fit", fit)
     monkeypatch.setattr("tomo_polysplat.plan.calibration.first_volume", lambda *scan: (None, ""))
-    monkeypatch.setattr("tomo_polysplat.nuisances.scatter.estimate_scatter", lambda *rays: Scatter(0.05))
     monkeypatch.setattr(
-        "tomo_polysplat.nuisances.scatter.misfit_left", lambda *rays: 0.5 if rays[-1] != rays[-2] else 1.0
+        "tomo_polysplat.nuisances.scatter.estimate_scatter", lambda *rays, **free: (Scatter(0.05), 1.0)
+    )
+    monkeypatch.setattr(
+        "tomo_polysplat.nuisances.scatter.misfit_left",
+        lambda *rays, **free: 0.5 if rays[-1] != rays[-2] else 1.0,
     )
     problem, wanted = problem_of(fan(0.0), SPECTRUM), Calibration(("scatter",), None)
     found = calibrated(problem, wanted, make_settings(), torch.device("cpu"), 0, 0.6)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from tomo_polysplat.nuisances.light_gate import MARGIN, light_gate
 from tomo_polysplat.nuisances.nuisance import Found, Nuisance, Parameter, Place, Verdict
@@ -12,13 +12,30 @@ from tomo_polysplat.physics.ray_estimates import FittedRays, estimate_scatter, m
 from tomo_polysplat.physics.scatter import LARGEST_SCATTER, Scatter
 from tomo_polysplat.physics.spectrum import Spectrum
 
-__all__ = ["ScatteredLight"]
+__all__ = ["ScatteredLight", "Shown"]
 
 # Beside the object, views that differ by more than this share of the most scatter tell of a drifting beam.
 _DRIFT = 0.3
 _ASKED = "calibrate=True fits it all the same"
 # Scatter adds to every ray. So many rays, and such a share of them, may be darker than it by some fault of theirs.
 _FEW_DARKER, _DARKER_SHARE = 7, 1.5e-4
+
+
+class Shown(NamedTuple):
+    """What the residuals of rays show.
+
+    Attributes
+    ----------
+    scatter : Scatter
+    beam : float
+        Its brightness, in those that were assumed.
+    left : float
+        How much of the rays' misfit is left under both.
+    """
+
+    scatter: Scatter
+    beam: float
+    left: float
 
 
 class ScatteredLight(Nuisance):
@@ -91,6 +108,30 @@ class ScatteredLight(Nuisance):
         return words + (f" and {scatter.of_light:.4g} of the light around a ray" if scatter.varies else "")
 
     @classmethod
+    def shown(
+        cls, level: float, sample: FittedRays, spectrum: Spectrum | None, materials: Materials | None
+    ) -> list[Shown]:
+        """What the residuals of rays show: scatter alone, and with another beam where that explains more.
+
+        A source that is dimmer than its open field hides scatter beside the object, but not behind it.
+
+        Parameters
+        ----------
+        level : float
+            Constant scatter that the fit assumed.
+        sample : FittedRays
+        spectrum, materials : Spectrum, Materials, or None
+            See `physics.ray_estimates.estimate_scatter`.
+        """
+        model, found = (spectrum, materials), []
+        for free in (False, True):
+            scatter, beam = estimate_scatter(sample, *model, level, beam_free=free)
+            left = misfit_left(sample, *model, Scatter(level), scatter, beam_free=free)
+            found.append(Shown(scatter, beam, left))
+        alone, both = found
+        return found if both.left < (1 - MARGIN) * alone.left else [alone]
+
+    @classmethod
     def moved(
         cls,
         was: Scatter,
@@ -98,8 +139,8 @@ class ScatteredLight(Nuisance):
         sample: FittedRays,
         spectrum: Spectrum,
         materials: Materials,
-    ) -> dict[str, float]:
-        """The parameters where the residuals of rays say that they are; nothing where that is where they were.
+    ) -> list[dict[str, float]]:
+        """The parameters where the residuals of rays say that they are; none where that is where they were.
 
         Parameters
         ----------
@@ -110,9 +151,19 @@ class ScatteredLight(Nuisance):
         sample : FittedRays
         spectrum : Spectrum
         materials : Materials
+
+        Returns
+        -------
+        list of dict
+            One for each that they show; with ``beam``, in beams that were assumed, where that is another.
         """
-        found = estimate_scatter(sample, spectrum, materials, level)
-        new = Scatter(was.constant + found.constant - level, was.of_light + found.of_light)
-        if misfit_left(sample, spectrum, materials, Scatter(level), found) > 1 - MARGIN:
-            return {}
-        return {"scatter": new.constant} | ({"scatter_of_light": new.of_light} if new.varies else {})
+        places = []
+        for found in cls.shown(level, sample, spectrum, materials):
+            if found.left > 1 - MARGIN:
+                continue
+            new = Scatter(
+                was.constant + found.scatter.constant - level, was.of_light + found.scatter.of_light
+            )
+            values = {"scatter": new.constant} | ({"scatter_of_light": new.of_light} if new.varies else {})
+            places.append(values if found.beam == 1.0 else values | {"beam": found.beam})
+        return places

@@ -46,8 +46,13 @@ class FittedRays(NamedTuple):
 
 
 def estimate_scatter(
-    sample: FittedRays, spectrum: Spectrum | None, materials: Materials | None, start: float = 0.0
-) -> Scatter:
+    sample: FittedRays,
+    spectrum: Spectrum | None,
+    materials: Materials | None,
+    start: float = 0.0,
+    *,
+    beam_free: bool = False,
+) -> tuple[Scatter, float]:
     """Scatter that explains the residuals of rays, at least one, best; it varies where that is needed.
 
     Gauss-Newton steps with Huber's weights on the scatter together with one factor for the amount of each of
@@ -61,23 +66,41 @@ def estimate_scatter(
         None where the areal densities of the one curve are -log(I / I0) themselves.
     start : float
         Constant scatter, as a fraction of the open beam.
+    beam_free : bool
+        Whether the brightness of the beam is estimated as well. Rays beside the object then do not tell scatter, which
+        is constant.
+
+    Returns
+    -------
+    Scatter
+        As a fraction of the beam.
+    float
+        Brightness of the beam, in those that ``sample`` is relative to; 1 unless it is free.
     """
-    rays, light = _rays(sample, spectrum, materials), sample.light
+    rays, light = _Rays.of(sample, spectrum, materials, beam_free), sample.light
     mean = float(light.mean())
     kinds = np.stack([np.ones_like(light), light - mean])
-    (constant,), plain = _scatter_of(kinds[:1], np.array([start]), *rays)
+    (constant,), beam, plain = _scatter_of(kinds[:1], np.array([start]), rays)
     spread = float(np.ptp(light))
-    if spread >= _LEAST_SPREAD:
-        (level, of_light), varied = _scatter_of(kinds, np.array([constant, 0.0]), *rays)
+    # A constant under another beam is as free as scatter that varies under the open field.
+    if spread >= _LEAST_SPREAD and not beam_free:
+        (level, of_light), _, varied = _scatter_of(kinds, np.array([constant, 0.0]), rays)
         corner = _corner(plain)
         left = [float((np.minimum(deviation, corner) ** 2).sum()) for deviation in (plain, varied)]
         if left[1] < (1 - _BETTER) * left[0] and abs(of_light) * spread < LARGEST_SCATTER:
-            return Scatter(level - of_light * mean, of_light)
-    return Scatter(min(max(constant, 0.0), LARGEST_SCATTER))
+            return Scatter(level - of_light * mean, of_light), beam
+    return Scatter(min(max(constant, 0.0), LARGEST_SCATTER)), beam
 
 
+# The rays, their physics, and the two kinds of light that are compared.
 def misfit_left(
-    sample: FittedRays, spectrum: Spectrum | None, materials: Materials | None, was: Scatter, now: Scatter
+    sample: FittedRays,
+    spectrum: Spectrum | None,
+    materials: Materials | None,
+    was: Scatter,
+    now: Scatter,
+    *,
+    beam_free: bool = False,
 ) -> float:
     """How much of the rays' misfit is left under other scatter, each with the best factor of every curve's amount.
 
@@ -90,34 +113,59 @@ def misfit_left(
     spectrum, materials : Spectrum, Materials, or None
         See `estimate_scatter`.
     was, now : Scatter
+    beam_free : bool
+        Whether the second has the best brightness of the beam as well.
     """
     from scipy.special import huber
 
-    rays, light = _rays(sample, spectrum, materials), torch.as_tensor(sample.light)
-    before, after = (_deviation(scatter.at(light).numpy(), *rays) for scatter in (was, now))
+    light = torch.as_tensor(sample.light)
+    free = {False: _Rays.of(sample, spectrum, materials, False)}
+    if beam_free:
+        free[True] = _Rays.of(sample, spectrum, materials, True)
+    before = _deviation(was.at(light).numpy(), free[False])
+    after = _deviation(now.at(light).numpy(), free[beam_free])
     corner = _corner(before)
     sums = [float(huber(corner, deviation).sum()) for deviation in (before, after)]
     return sums[1] / sums[0] if sums[0] else 1.0
 
 
-def _rays(
-    sample: FittedRays, spectrum: Spectrum | None, materials: Materials | None
-) -> tuple[np.ndarray, ...]:
+class _Rays(NamedTuple):
     """What passes of rays, its slopes by a factor of each curve's amount, what was measured, and its weight."""
-    if spectrum is None or materials is None:
-        return np.exp(-sample.areal[0]), sample.areal[:1], sample.measured, sample.weight
-    lit = spectrum.weights > 0
-    curves = materials.mass_attenuation(spectrum.energies[lit])[: len(sample.areal)]
-    value, share = shares(sample.areal, np.log(spectrum.weights[lit]), curves)
-    slopes = np.einsum("kn,nr->kr", curves, share) * sample.areal
-    return np.exp(-value), slopes, sample.measured, sample.weight
+
+    primary: np.ndarray
+    slopes: np.ndarray
+    measured: np.ndarray
+    weight: np.ndarray
+    beam_free: bool
+
+    @classmethod
+    def of(
+        cls, sample: FittedRays, spectrum: Spectrum | None, materials: Materials | None, beam_free: bool
+    ) -> _Rays:
+        """Those of a sample."""
+        told = sample.measured, sample.weight, beam_free
+        if spectrum is None or materials is None:
+            return cls(np.exp(-sample.areal[0]), sample.areal[:1], *told)
+        lit = spectrum.weights > 0
+        curves = materials.mass_attenuation(spectrum.energies[lit])[: len(sample.areal)]
+        value, share = shares(sample.areal, np.log(spectrum.weights[lit]), curves)
+        return cls(np.exp(-value), np.einsum("kn,nr->kr", curves, share) * sample.areal, *told)
+
+    def linearised(self, kinds: np.ndarray, scatter: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What rays under some scatter change by with each kind of it, each curve's amount and the beam's log.
+
+        The second array is what they lack.
+        """
+        within = (scatter >= 0) & (scatter <= LARGEST_SCATTER)
+        total = self.primary + np.clip(scatter, 0.0, LARGEST_SCATTER) + np.finfo(np.float64).tiny
+        beam = -np.ones((int(self.beam_free), len(total)))
+        columns = np.concatenate([-kinds * within / total, self.slopes * (self.primary / total), beam])
+        return columns * self.weight, (self.measured + np.log(total)) * self.weight
 
 
-def _deviation(
-    scatter: np.ndarray, primary: np.ndarray, slopes: np.ndarray, measured: np.ndarray, weight: np.ndarray
-) -> np.ndarray:
+def _deviation(scatter: np.ndarray, rays: _Rays) -> np.ndarray:
     """What rays lack under some scatter, with the amounts of the curves that are best under it."""
-    columns, target = _linearised(np.empty((0, len(scatter))), scatter, primary, slopes, measured, weight)
+    columns, target = rays.linearised(np.empty((0, len(scatter))), scatter)
     deviation = np.abs(target)
     for _ in range(_GAUSS_NEWTON_STEPS):
         robust = _robust(deviation)
@@ -126,42 +174,21 @@ def _deviation(
     return deviation
 
 
-def _scatter_of(
-    kinds: np.ndarray,
-    amounts: np.ndarray,
-    primary: np.ndarray,
-    slopes: np.ndarray,
-    measured: np.ndarray,
-    weight: np.ndarray,
-) -> tuple[list[float], np.ndarray]:
-    """Amounts of some kinds of scatter, from the first ones on, that explain rays best, and what these then lack."""
-    robust = np.ones_like(measured)
+def _scatter_of(kinds: np.ndarray, amounts: np.ndarray, rays: _Rays) -> tuple[list[float], float, np.ndarray]:
+    """Amounts of some kinds of scatter, from the first ones on, and the beam, that explain rays best; what is left."""
+    robust = np.ones_like(rays.measured)
     for _ in range(_GAUSS_NEWTON_STEPS):
-        columns, target = _linearised(kinds, amounts @ kinds, primary, slopes, measured, weight)
+        columns, target = rays.linearised(kinds, amounts @ kinds)
         step = np.linalg.lstsq((columns * robust).T, target * robust, rcond=None)[0]
         amounts = amounts + step[: len(kinds)]
         # The mean scatter; what it differs by is bounded ray by ray.
         amounts[0] = np.clip(amounts[0], 0.0, LARGEST_SCATTER)
         deviation = np.abs(target - step @ columns)
         robust = _robust(deviation)
-    columns, target = _linearised(kinds[:0], amounts @ kinds, primary, slopes, measured, weight)
+    columns, target = rays.linearised(kinds[:0], amounts @ kinds)
     step = np.linalg.lstsq((columns * robust).T, target * robust, rcond=None)[0]
-    return [float(amount) for amount in amounts], np.abs(target - step @ columns)
-
-
-def _linearised(
-    kinds: np.ndarray,
-    scatter: np.ndarray,
-    primary: np.ndarray,
-    slopes: np.ndarray,
-    measured: np.ndarray,
-    weight: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """What rays under some scatter change by with each kind of it and each curve's amount, and what they lack."""
-    within = (scatter >= 0) & (scatter <= LARGEST_SCATTER)
-    total = primary + np.clip(scatter, 0.0, LARGEST_SCATTER) + np.finfo(np.float64).tiny
-    columns = np.concatenate([-kinds * within / total, slopes * (primary / total)]) * weight
-    return columns, (measured + np.log(total)) * weight
+    beam = float(np.exp(step[-1])) if rays.beam_free else 1.0
+    return [float(amount) for amount in amounts], beam, np.abs(target - step @ columns)
 
 
 def _robust(deviation: np.ndarray) -> np.ndarray:

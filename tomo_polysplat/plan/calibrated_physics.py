@@ -6,6 +6,7 @@ What each nuisance is, and its gate, is in `nuisances`; here they meet the probl
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from tomo_polysplat.nuisances.light_gate import more_likely
 from tomo_polysplat.nuisances.nuisance import Nuisance
 from tomo_polysplat.nuisances.open_beam import OpenBeam
 from tomo_polysplat.nuisances.scatter import ScatteredLight
-from tomo_polysplat.physics.scatter import LARGEST_SCATTER
+from tomo_polysplat.physics.scatter import LARGEST_SCATTER, Scatter
 from tomo_polysplat.plan.short_fit import ShortFit
 
 __all__ = [
@@ -52,7 +53,8 @@ def with_fitted(problem: Problem, fitted: Mapping[str, float]) -> Problem:
 
 def describe_scatter(fitted: Mapping[str, float]) -> str:
     """In words; `with_fitted` tells what is in ``fitted``."""
-    return OpenBeam.describe(fitted) if "beam" in fitted else ScatteredLight.describe(fitted)
+    kinds = [kind.describe(fitted) for kind in (ScatteredLight, OpenBeam) if kind.name in fitted]
+    return ", and ".join(kinds)
 
 
 def scatter_beside(first: ShortFit) -> dict[str, float]:
@@ -61,14 +63,16 @@ def scatter_beside(first: ShortFit) -> dict[str, float]:
     return {"scatter": min(level, LARGEST_SCATTER)} if level > _DEVIATIONS * error else {}
 
 
-def moved_scatter(last: ShortFit, problem: Problem) -> dict[str, float]:
-    """The scatter where the last short fit says that it is; nothing where that is where it was."""
+def moved_scatter(last: ShortFit, problem: Problem) -> list[dict[str, float]]:
+    """The scatter where the last short fit says that it is, alone and with another beam; none where it was there."""
     physics, rays = with_fitted(problem, last.fitted), last.rays
     assert physics.spectrum is not None and physics.materials is not None
     if not len(rays.light):
-        return {}
+        return []
     model = (physics.spectrum, physics.materials)
-    return ScatteredLight.moved(physics.scatter, last.scatter_level, rays.fitted, *model)
+    places = ScatteredLight.moved(physics.scatter, last.scatter_level, rays.fitted, *model)
+    beams = [physics.beam * place.pop("beam", 1.0) for place in places]
+    return [place | ({} if beam == 1.0 else {"beam": beam}) for place, beam in zip(places, beams)]
 
 
 def moved_factor(name: str, last: ShortFit, soft_density: float, problem: Problem) -> dict[str, float]:
@@ -95,7 +99,25 @@ def judge_factor(
 def judge_scatter(
     before: ShortFit, stage: Sequence[ShortFit], suspected: bool
 ) -> tuple[ShortFit | None, str]:
-    """The best of the fits with scatter, or with a brighter beam, where the rays tell that it is."""
+    """The best of the fits with scatter, with another beam, or with both, where the rays tell that it is."""
+    both = [fit for fit in stage if "scatter" in fit.fitted and "beam" in fit.fitted]
+    alone = [fit for fit in stage if fit not in both]
+    chosen, why = _one_of_both(before, alone, suspected) if alone else (None, "")
+    if not both:
+        return chosen, why
+    # What has two explanations has to explain more than the best that has one, or none.
+    fit, rival = (min(fits, key=lambda fit: fit.held_out) for fits in (both, [before, *alone]))
+    share = rival.share_of_darkest(_scatter_seen(rival, fit))
+    verdict = ScatteredLight.gate(_evidence(rival, fit, suspected, share, []))
+    words = describe_scatter(fit.fitted)
+    if verdict.kept:
+        return fit, f"{words}, accepted: {_in_words(rival, fit)}"
+    refused = f"{words}, not accepted, as {verdict.why}: {_in_words(rival, fit)}"
+    return chosen, why if chosen is not None else "; ".join(filter(None, [why, refused]))
+
+
+def _one_of_both(before: ShortFit, stage: Sequence[ShortFit], suspected: bool) -> tuple[ShortFit | None, str]:
+    """Which is taken of scatter and another beam, if any, and why."""
     kinds = [[fit for fit in stage if name in fit.fitted] for name in ("scatter", "beam")]
     best = [min(fits, key=lambda fit: fit.held_out) for fits in kinds if fits]
     share = max(before.share_of_darkest(ScatteredLight.of(fit.fitted)) for fit in best)
@@ -131,6 +153,13 @@ def _kind(fit: ShortFit) -> type[Nuisance]:
     return ScatteredLight if "scatter" in fit.fitted else OpenBeam
 
 
+def _scatter_seen(before: ShortFit, fit: ShortFit) -> Scatter:
+    """The scatter of a fit, as a fraction of the beam that the fit before it assumed."""
+    scatter = ScatteredLight.of(fit.fitted)
+    ratio = fit.fitted.get("beam", 1.0) / before.fitted.get("beam", 1.0)
+    return replace(scatter, constant=scatter.constant * ratio)
+
+
 def _in_words(before: ShortFit, fit: ShortFit) -> str:
     errors = f"held-out error {before.held_out:.3e} before, {fit.held_out:.3e} after"
     return f"{errors}, of the darkest rays {before.darkest:.3e} and {fit.darkest:.3e}"
@@ -154,7 +183,7 @@ def _evidence(
     numbers |= {"darkest_before": before.darkest, "darkest_after": fit.darkest}
     numbers |= {"darkest_rays": float(len(before.darkest_rays)), "darkest_share": share}
     if "scatter" in fit.fitted:
-        darker = before.rays.darker_than(ScatteredLight.of(fit.fitted))
+        darker = before.rays.darker_than(_scatter_seen(before, fit))
         numbers |= {"darker": darker, "rays": len(before.rays.measured)}
         numbers |= {"of_light": float(fit.fitted.get("scatter_of_light", 0.0))}
     for rival in rivals:

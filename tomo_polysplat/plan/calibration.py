@@ -246,10 +246,12 @@ def _stage_of_scatter(
     made: list[ShortFit] = []
     if moved := moved_scatter(begin, problem):
         # Matter that has taken up the scatter behind it hides a part of it, or shows more elsewhere; air does not.
-        made = [trial(others | found) for found in (scatter_beside(begin), moved) if found]
-        for fit in [fit for fit in made if fit.held_out < begin.held_out]:
-            if moved := moved_scatter(fit, problem):
-                made.append(trial(others | moved))
+        made = [trial(others | found) for found in (scatter_beside(begin), *moved) if found]
+        better = sorted((fit for fit in made if fit.held_out < begin.held_out), key=lambda fit: fit.held_out)
+        for fit in better:
+            # All go on alone; the best with another beam as well, where it shows one.
+            places = moved_scatter(fit, problem)
+            made += [trial(others | found) for found in (places if fit is better[0] else places[:1])]
     beam = begin.rays.beam()
     if wanted.suspected and beam - 1.0 > LEAST_BRIGHTER:
         made.append(trial({**begin.fitted, "beam": beam}))

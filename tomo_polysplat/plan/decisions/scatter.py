@@ -15,8 +15,6 @@ import torch
 
 from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.nuisances.scatter import ScatteredLight
-from tomo_polysplat.physics.ray_estimates import estimate_scatter, misfit_left
-from tomo_polysplat.physics.scatter import Scatter
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.decision import Decision, Known, When, is_number
 from tomo_polysplat.plan.lab import Lab, Untold
@@ -110,9 +108,8 @@ def _shown(rays: RaySample, problem: Problem, *, straight: bool) -> dict[str, fl
         return {"most": 0.0, "left": 1.0}
     # Without hardening there are no areal densities in g/cm2.
     model = (None, None) if straight else (problem.spectrum, problem.materials)
-    scatter = estimate_scatter(rays.fitted, *model)
-    most = float(scatter.at(torch.as_tensor(rays.light)).max())
-    return {"most": most, "left": misfit_left(rays.fitted, *model, Scatter(), scatter)}
+    shown = min(ScatteredLight.shown(0.0, rays.fitted, *model), key=lambda one: one.left)
+    return {"most": float(shown.scatter.at(torch.as_tensor(rays.light)).max()), "left": shown.left}
 
 
 def _drift(rays: RaySample) -> float | None:
