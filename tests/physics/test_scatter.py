@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from tomo_polysplat.nuisances.scatter import ScatteredLight
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.beer_lambert import projection
 from tomo_polysplat.physics.quadrature import fit_quadrature
@@ -100,6 +101,28 @@ def test_rays_that_nothing_passes_tell_nothing():
         FittedRays(areal, measured, np.ones_like(measured), light), SPECTRUM, MATERIALS
     )
     assert not found.varies and found.constant < 1e-3
+
+
+@pytest.mark.parametrize(("beam", "scatter"), [(0.98, 0.03), (1.02, 0.01), (1.0, 0.03), (0.98, 0.0)])
+def test_another_beam_is_told_from_scatter_by_the_rays_that_it_makes_dimmer(beam, scatter):
+    """Beside the object a beam of 0.98 with scatter of 0.03 is as bright as one of 1.01."""
+    areal, noise = rays(), np.random.default_rng(9)
+    light = noise.uniform(0.3, 1.0, areal.shape[1])
+    measured = -np.log(beam * (np.exp(-value_of(areal, FULL)) + scatter)) + noise.normal(
+        0.0, 0.003, light.shape
+    )
+    sample = FittedRays(areal * np.array([[0.98], [1.0], [1.02]]), measured, np.ones_like(measured), light)
+    found, told = estimate_scatter(sample, SPECTRUM, MATERIALS, beam_free=True)
+    assert not found.varies and found.constant == pytest.approx(scatter, abs=1e-3)
+    assert told == pytest.approx(beam, abs=1e-3)
+    held, open_field = estimate_scatter(sample, SPECTRUM, MATERIALS)
+    assert open_field == 1.0
+    left = misfit_left(sample, SPECTRUM, MATERIALS, Scatter(), held)
+    left_by_both = misfit_left(sample, SPECTRUM, MATERIALS, Scatter(), found, beam_free=True)
+    shown = ScatteredLight.shown(0.0, sample, SPECTRUM, MATERIALS)
+    # The second is looked at only where it explains more.
+    assert (left_by_both < 0.97 * left) == (beam != 1.0) == (len(shown) == 2)
+    assert [one.left for one in shown] == [left, left_by_both][: len(shown)]
 
 
 def test_the_light_around_a_ray_is_a_mean_of_its_view():

@@ -194,25 +194,58 @@ def test_air_shows_scatter_beyond_its_noise(noise, shown):
     assert found == ({"scatter": pytest.approx(0.003)} if shown else {})
 
 
-@pytest.mark.parametrize("beside, goes_on", [(0.4, [0.003, 0.001]), (1.2, [0.001])])
-def test_scatter_is_moved_from_each_short_fit_that_explains_more(beside, goes_on, monkeypatch):
-    """Air shows 0.003 of the open beam, and all rays 0.001."""
-    module, from_where = "tomo_polysplat.plan.calibration", []
+@pytest.mark.parametrize(
+    ("errors", "goes_on"),
+    [
+        ({0.003: 0.4, 0.001: 0.7, 0.004: 1.2}, {0.003: [0.0031, 0.0041], 0.001: [0.0011]}),
+        ({0.003: 1.2, 0.001: 1.1, 0.004: 0.8}, {0.004: [0.0041, 0.0042]}),
+    ],
+)
+def test_scatter_is_moved_from_each_short_fit_that_explains_more(errors, goes_on, monkeypatch):
+    """Air shows 0.003 of the open beam, all rays 0.001 alone and 0.004 under a dimmer beam."""
+    module = "tomo_polysplat.plan.calibration"
+    # What each fit shows: scatter alone, or under the beam that it assumed, and with another beam.
+    alone = {0.003: 0.0031, 0.001: 0.0011, 0.004: 0.0041}
+    other = {0.003: 0.0041, 0.001: 0.0041, 0.004: 0.0042}
 
     def moved(fit, problem):
-        if not fit.fitted:
-            return {"scatter": 0.001}
-        from_where.append(fit.fitted["scatter"])
-        return {}
+        at = fit.fitted.get("scatter")
+        here, there = (0.001, 0.004) if at is None else (alone[at], other[at])
+        beam = {"beam": fit.fitted["beam"]} if "beam" in fit.fitted else {}
+        return [{"scatter": here} | beam, {"scatter": there, "beam": 0.99}]
 
     monkeypatch.setattr(f"{module}.scatter_beside", lambda first: {"scatter": 0.003})
     monkeypatch.setattr(f"{module}.moved_scatter", moved)
     problem, wanted = problem_of(fan(0.0), SPECTRUM), Calibration(("scatter",), None)
-    errors = {0.003: beside, 0.001: 0.7}
     stage = _stage(
-        "scatter", of_fit({}, 1.0), wanted, problem, lambda fitted: of_fit(fitted, errors[fitted["scatter"]])
+        "scatter",
+        of_fit({}, 1.0),
+        wanted,
+        problem,
+        lambda fitted: of_fit(fitted, errors.get(fitted["scatter"], 2.0)),
     )
-    assert [fit.fitted["scatter"] for fit in stage] == [0.003, 0.001] and from_where == goes_on
+    tried = [fit.fitted["scatter"] for fit in stage]
+    assert tried == [0.003, 0.001, 0.004, *(at for each in goes_on.values() for at in each)]
+
+
+@pytest.mark.parametrize(
+    ("error", "darkest", "taken"), [(0.38, 0.3, 1), (0.395, 0.3, 0), (0.38, 0.41, 0), (0.2, 0.5, 0)]
+)
+def test_scatter_under_another_beam_has_to_beat_the_best_that_explains_the_rays_alone(error, darkest, taken):
+    problem, wanted = problem_of(fan(0.0), SPECTRUM), Calibration(("scatter",), None, suspected=True)
+    stage = [
+        of_fit({"scatter": 0.02}, 0.4, darkest=0.4),
+        of_fit({"scatter": 0.03, "beam": 0.99}, error, darkest=darkest),
+        of_fit({"beam": 1.02}, 0.7, darkest=0.99),
+    ]
+    chosen, why = _judge("scatter", of_fit({}, 1.0), stage, problem, wanted)
+    assert chosen is stage[taken] and "accepted" in why
+    assert ("a beam 0.99 times" in why) == bool(taken)
+    # Where nothing explains the rays alone, both have to beat the fit without either.
+    chosen, why = _judge("scatter", of_fit({}, 1.0), stage[1:2], problem, wanted)
+    assert chosen is stage[1]
+    chosen, why = _judge("scatter", of_fit({}, 0.19, darkest=0.2), stage[1:2], problem, wanted)
+    assert chosen is None and "not accepted" in why
 
 
 @pytest.mark.parametrize("kvp, density, factors", [(420, 3.0, (1.0, 450 / 420)), (22, 0.03, (20 / 22, 1.0))])
