@@ -77,7 +77,7 @@ def estimate_scatter(
     float
         Brightness of the beam, in those that ``sample`` is relative to; 1 unless it is free.
     """
-    rays, light = _Rays.of(sample, spectrum, materials, beam_free), sample.light
+    rays, light = _Rays.of(sample, spectrum, materials)._replace(beam_free=beam_free), sample.light
     mean = float(light.mean())
     kinds = np.stack([np.ones_like(light), light - mean])
     (constant,), beam, plain = _scatter_of(kinds[:1], np.array([start]), rays)
@@ -118,12 +118,9 @@ def misfit_left(
     """
     from scipy.special import huber
 
-    light = torch.as_tensor(sample.light)
-    free = {False: _Rays.of(sample, spectrum, materials, False)}
-    if beam_free:
-        free[True] = _Rays.of(sample, spectrum, materials, True)
-    before = _deviation(was.at(light).numpy(), free[False])
-    after = _deviation(now.at(light).numpy(), free[beam_free])
+    light, rays = torch.as_tensor(sample.light), _Rays.of(sample, spectrum, materials)
+    before = _deviation(was.at(light).numpy(), rays)
+    after = _deviation(now.at(light).numpy(), rays._replace(beam_free=beam_free))
     corner = _corner(before)
     sums = [float(huber(corner, deviation).sum()) for deviation in (before, after)]
     return sums[1] / sums[0] if sums[0] else 1.0
@@ -136,20 +133,18 @@ class _Rays(NamedTuple):
     slopes: np.ndarray
     measured: np.ndarray
     weight: np.ndarray
-    beam_free: bool
+    beam_free: bool = False
 
     @classmethod
-    def of(
-        cls, sample: FittedRays, spectrum: Spectrum | None, materials: Materials | None, beam_free: bool
-    ) -> _Rays:
-        """Those of a sample."""
-        told = sample.measured, sample.weight, beam_free
+    def of(cls, sample: FittedRays, spectrum: Spectrum | None, materials: Materials | None) -> _Rays:
+        """Those of a sample, under the beam that it is relative to."""
         if spectrum is None or materials is None:
-            return cls(np.exp(-sample.areal[0]), sample.areal[:1], *told)
+            return cls(np.exp(-sample.areal[0]), sample.areal[:1], sample.measured, sample.weight)
         lit = spectrum.weights > 0
         curves = materials.mass_attenuation(spectrum.energies[lit])[: len(sample.areal)]
         value, share = shares(sample.areal, np.log(spectrum.weights[lit]), curves)
-        return cls(np.exp(-value), np.einsum("kn,nr->kr", curves, share) * sample.areal, *told)
+        slopes = np.einsum("kn,nr->kr", curves, share) * sample.areal
+        return cls(np.exp(-value), slopes, sample.measured, sample.weight)
 
     def linearised(self, kinds: np.ndarray, scatter: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What rays under some scatter change by with each kind of it, each curve's amount and the beam's log.

@@ -100,8 +100,8 @@ def judge_scatter(
     before: ShortFit, stage: Sequence[ShortFit], suspected: bool
 ) -> tuple[ShortFit | None, str]:
     """The best of the fits with scatter, with another beam, or with both, where the rays tell that it is."""
-    both = [fit for fit in stage if "scatter" in fit.fitted and "beam" in fit.fitted]
-    alone = [fit for fit in stage if fit not in both]
+    both = [fit for fit in stage if {"scatter", "beam"} <= fit.fitted.keys()]
+    alone = [fit for fit in stage if not {"scatter", "beam"} <= fit.fitted.keys()]
     chosen, why = _one_of_both(before, alone, suspected) if alone else (None, "")
     if not both:
         return chosen, why
