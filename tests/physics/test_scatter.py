@@ -9,7 +9,14 @@ from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.beer_lambert import projection
 from tomo_polysplat.physics.quadrature import fit_quadrature
 from tomo_polysplat.physics.ray_estimates import FittedRays, estimate_scatter, matching_factor, misfit_left
-from tomo_polysplat.physics.scatter import Scatter, add_scatter, light_around, made_level, without_scatter
+from tomo_polysplat.physics.scatter import (
+    LARGEST_SCATTER,
+    Scatter,
+    add_scatter,
+    light_around,
+    made_level,
+    without_scatter,
+)
 from tomo_polysplat.physics.spectral_change import with_voltage
 from tomo_polysplat.physics.spectrum import Spectrum
 
@@ -123,6 +130,16 @@ def test_another_beam_is_told_from_scatter_by_the_rays_that_it_makes_dimmer(beam
     # The second is looked at only where it explains more.
     assert (left_by_both < 0.97 * left) == (beam != 1.0) == (len(shown) == 2)
     assert [one.left for one in shown] == [left, left_by_both][: len(shown)]
+
+
+def test_faint_matter_tells_no_beam():
+    """Light that bends upwards asks for as much scatter as may be, under a beam that makes up for it."""
+    areal = 0.002 * rays()
+    value = value_of(areal, FULL)
+    sample = FittedRays(areal, value - 5.0 * value**2, np.ones_like(value), np.ones_like(value))
+    scatter, beam = estimate_scatter(sample, SPECTRUM, MATERIALS, beam_free=True)
+    assert scatter.constant == pytest.approx(LARGEST_SCATTER) and beam < 0.9
+    assert len(ScatteredLight.shown(0.0, sample, SPECTRUM, MATERIALS)) == 1
 
 
 def test_the_light_around_a_ray_is_a_mean_of_its_view():

@@ -4,11 +4,16 @@ import logging
 
 import numpy as np
 import pytest
+import torch
 from small_scans import QUICK, disc
 
 import tomo_polysplat as tps
+from tomo_polysplat.fit.problem import Problem
+from tomo_polysplat.physics.scatter import Scatter
+from tomo_polysplat.plan.one_energy import _doubt_hardening
 from tomo_polysplat.plan.unit_check import doubt_lengths, tell_impossible
 from tomo_polysplat.report.decided import doubts
+from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.units import cm_per, density_in_doubt
 
 
@@ -151,3 +156,13 @@ def test_nothing_but_noise_is_no_matter_of_a_wrong_unit(noise):
     assert (
         "lengths" not in tps.reconstruct(values, *geometry, unit="cm", spectrum=spectrum, settings=QUICK).plan
     )
+
+
+@pytest.mark.parametrize(("beam", "doubted"), [(1.0, True), (0.9, False)])
+def test_rays_without_any_matter_are_told_no_polynomial(beam, doubted):
+    """Faint rays are as straight as those that a scanner has corrected; under a dimmer beam none is left of them."""
+    spectrum = tps.Spectrum.from_tube(90, filters={"Al": 0.1})
+    values, *geometry = disc("water", spectrum)
+    problem = Problem.of(0.002 * values[:, None], *from_astra(*geometry), "cm", spectrum, None)
+    found = _doubt_hardening(problem.under(spectrum, Scatter(), beam), torch.device("cpu"))
+    assert (found is not None) == doubted

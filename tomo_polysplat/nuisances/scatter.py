@@ -129,7 +129,9 @@ class ScatteredLight(Nuisance):
             left = misfit_left(sample, *model, Scatter(level), scatter, beam_free=free)
             found.append(Shown(scatter, beam, left))
         alone, both = found
-        return found if both.left < (1 - MARGIN) * alone.left else [alone]
+        # Of faint matter scatter, the beam and the amounts explain the same: the most that there is, is no finding.
+        told = both.scatter.constant < LARGEST_SCATTER and both.left < (1 - MARGIN) * alone.left
+        return found if told else [alone]
 
     @classmethod
     def moved(

@@ -78,6 +78,8 @@ def _doubt_hardening(problem: Problem, device: torch.device) -> Answer | None:
     if shown is None or not shown.none:
         return None
     largest = float(largest_finite(problem.measured(device)))
+    if largest <= 0:
+        return None
     polynomial = ", ".join(f"{c:.6g}" for c in usual_water_correction(spectrum, largest))
     words = (
         f"all views see the same mass, which shows {shown.share:.2f} (standard error {shown.error:.2g}) of the"
