@@ -1,4 +1,4 @@
-"""A beam that is brighter than its open field, as a nuisance: beside the object it looks like scatter."""
+"""A beam of another brightness than its open field: beside the object a brighter one looks like scatter."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ class ScatteredLight(Nuisance):
     }
     found_by = Found.RESIDUALS
     gauge = "matter that took up some of the scatter: one factor for each curve's amount is fitted beside it"
-    cost = "two to five short fits"
+    cost = "two to nine short fits"
 
     @classmethod
     def gate(cls, evidence: Mapping[str, float]) -> Verdict:
