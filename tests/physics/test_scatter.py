@@ -69,7 +69,7 @@ def test_scatter_is_found_although_the_matter_has_taken_some_of_it_up(scatter):
     measured[::97] += 1.0  # rays that nothing explains
     thinner = areal * np.array([[0.97], [1.02], [0.95]])
     found, _ = estimate_scatter(
-        FittedRays(thinner, measured, np.ones_like(measured), light), SPECTRUM, MATERIALS
+        FittedRays(thinner, measured, np.ones_like(measured), light).under(SPECTRUM, MATERIALS)
     )
     assert found.varies == scatter.varies
     np.testing.assert_allclose(beside(found, light), beside(scatter, light), atol=1.5e-3)
@@ -85,18 +85,18 @@ def test_faint_scatter_shows_behind_metal_beyond_the_noise_of_counts(scatter, sh
     measured = -np.log(np.maximum(counts, 0.5) / photons)
     weight = 1 / np.sqrt(1 + np.exp(measured) / (photons * 0.015**2))
     sample = FittedRays(areal, measured, weight, np.ones_like(measured))
-    found, _ = estimate_scatter(sample, SPECTRUM, MATERIALS)
-    assert (misfit_left(sample, SPECTRUM, MATERIALS, Scatter(), found) < 0.97) == shows
-    assert misfit_left(sample, SPECTRUM, MATERIALS, found, found) == 1.0
+    found, _ = estimate_scatter(sample.under(SPECTRUM, MATERIALS))
+    assert (misfit_left(sample.under(SPECTRUM, MATERIALS), Scatter(), found) < 0.97) == shows
+    assert misfit_left(sample.under(SPECTRUM, MATERIALS), found, found) == 1.0
 
 
 def test_scatter_shows_in_rays_that_are_straight_sums_too():
     depth, noise = np.linspace(0.0, 8.0, 501), np.random.default_rng(7)
     measured = -np.log(np.exp(-depth) + 0.001) + noise.normal(0.0, 0.003, 501)
     sample = FittedRays(0.97 * depth[None], measured, np.ones(501), np.ones(501))
-    found, _ = estimate_scatter(sample, None, None)
+    found, _ = estimate_scatter(sample.under(None, None))
     assert found.constant == pytest.approx(0.001, rel=0.05)
-    assert misfit_left(sample, None, None, Scatter(), found) < 0.2
+    assert misfit_left(sample.under(None, None), Scatter(), found) < 0.2
 
 
 def test_rays_that_nothing_passes_tell_nothing():
@@ -105,7 +105,7 @@ def test_rays_that_nothing_passes_tell_nothing():
     measured = np.append(measured, np.full(5, 700.0))
     light = np.linspace(0.2, 1.0, len(measured))
     found, _ = estimate_scatter(
-        FittedRays(areal, measured, np.ones_like(measured), light), SPECTRUM, MATERIALS
+        FittedRays(areal, measured, np.ones_like(measured), light).under(SPECTRUM, MATERIALS)
     )
     assert not found.varies and found.constant < 1e-3
 
@@ -119,13 +119,13 @@ def test_another_beam_is_told_from_scatter_by_the_rays_that_it_makes_dimmer(beam
         0.0, 0.003, light.shape
     )
     sample = FittedRays(areal * np.array([[0.98], [1.0], [1.02]]), measured, np.ones_like(measured), light)
-    found, told = estimate_scatter(sample, SPECTRUM, MATERIALS, beam_free=True)
+    found, told = estimate_scatter(sample.under(SPECTRUM, MATERIALS), beam_free=True)
     assert not found.varies and found.constant == pytest.approx(scatter, abs=1e-3)
     assert told == pytest.approx(beam, abs=1e-3)
-    held, open_field = estimate_scatter(sample, SPECTRUM, MATERIALS)
+    held, open_field = estimate_scatter(sample.under(SPECTRUM, MATERIALS))
     assert open_field == 1.0
-    left = misfit_left(sample, SPECTRUM, MATERIALS, Scatter(), held)
-    left_by_both = misfit_left(sample, SPECTRUM, MATERIALS, Scatter(), found, beam_free=True)
+    left = misfit_left(sample.under(SPECTRUM, MATERIALS), Scatter(), held)
+    left_by_both = misfit_left(sample.under(SPECTRUM, MATERIALS), Scatter(), found, beam_free=True)
     shown = ScatteredLight.shown(0.0, sample, SPECTRUM, MATERIALS)
     # The second is looked at only where it explains more.
     assert (left_by_both < 0.97 * left) == (beam != 1.0) == (len(shown) == 2)
@@ -137,7 +137,7 @@ def test_faint_matter_tells_no_beam():
     areal = 0.002 * rays()
     value = value_of(areal, FULL)
     sample = FittedRays(areal, value - 5.0 * value**2, np.ones_like(value), np.ones_like(value))
-    scatter, beam = estimate_scatter(sample, SPECTRUM, MATERIALS, beam_free=True)
+    scatter, beam = estimate_scatter(sample.under(SPECTRUM, MATERIALS), beam_free=True)
     assert scatter.constant == pytest.approx(LARGEST_SCATTER) and beam < 0.9
     assert len(ScatteredLight.shown(0.0, sample, SPECTRUM, MATERIALS)) == 1
 

@@ -121,12 +121,12 @@ class ScatteredLight(Nuisance):
             Constant scatter that the fit assumed.
         sample : FittedRays
         spectrum, materials : Spectrum, Materials, or None
-            See `physics.ray_estimates.estimate_scatter`.
+            See `physics.ray_estimates.FittedRays.under`.
         """
-        model, found = (spectrum, materials), []
+        rays, found = sample.under(spectrum, materials), []
         for free in (False, True):
-            scatter, beam = estimate_scatter(sample, *model, level, beam_free=free)
-            left = misfit_left(sample, *model, Scatter(level), scatter, beam_free=free)
+            scatter, beam = estimate_scatter(rays, level, beam_free=free)
+            left = misfit_left(rays, Scatter(level), scatter, beam_free=free)
             found.append(Shown(scatter, beam, left))
         alone, both = found
         # Of faint matter scatter, the beam and the amounts explain the same: the most that there is, is no finding.

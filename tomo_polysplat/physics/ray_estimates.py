@@ -14,7 +14,7 @@ from tomo_polysplat.physics.materials import MaterialLike, mass_attenuation
 from tomo_polysplat.physics.scatter import LARGEST_SCATTER, Scatter
 from tomo_polysplat.physics.spectrum import Spectrum
 
-__all__ = ["FittedRays", "estimate_scatter", "matching_factor", "misfit_left"]
+__all__ = ["FittedRays", "RaysUnder", "estimate_scatter", "matching_factor", "misfit_left"]
 
 _GAUSS_NEWTON_STEPS = 8
 # Scatter varies where that leaves so much less of the squared residuals: of constant one chance takes 0.2 % at most.
@@ -44,14 +44,59 @@ class FittedRays(NamedTuple):
     weight: np.ndarray
     light: np.ndarray
 
+    def under(self, spectrum: Spectrum | None, materials: Materials | None) -> RaysUnder:
+        """What they are under a spectrum.
+
+        Parameters
+        ----------
+        spectrum, materials : Spectrum, Materials, or None
+            None where the areal densities of the one curve are -log(I / I0) themselves.
+        """
+        measured = self.measured, self.weight, self.light
+        if spectrum is None or materials is None:
+            return RaysUnder(np.exp(-self.areal[0]), self.areal[:1], *measured)
+        lit = spectrum.weights > 0
+        curves = materials.mass_attenuation(spectrum.energies[lit])[: len(self.areal)]
+        value, share = shares(self.areal, np.log(spectrum.weights[lit]), curves)
+        return RaysUnder(np.exp(-value), np.einsum("kn,nr->kr", curves, share) * self.areal, *measured)
+
+
+class RaysUnder(NamedTuple):
+    """Some rays under a spectrum.
+
+    Attributes
+    ----------
+    primary : (rays,) array
+        What passes of each, as a fraction of the beam.
+    slopes : (curves, rays) array
+        What ``-log(I / I0)`` changes by with a factor of each curve's amount.
+    measured, weight, light : (rays,) arrays
+        See `FittedRays`.
+    beam_free : bool
+        Whether the brightness of the beam is free as well.
+    """
+
+    primary: np.ndarray
+    slopes: np.ndarray
+    measured: np.ndarray
+    weight: np.ndarray
+    light: np.ndarray
+    beam_free: bool = False
+
+    def linearised(self, kinds: np.ndarray, scatter: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What rays under some scatter change by with each kind of it, each curve's amount and the beam's log.
+
+        The second array is what they lack.
+        """
+        within = (scatter >= 0) & (scatter <= LARGEST_SCATTER)
+        total = self.primary + np.clip(scatter, 0.0, LARGEST_SCATTER) + np.finfo(np.float64).tiny
+        beam = -np.ones((int(self.beam_free), len(total)))
+        columns = np.concatenate([-kinds * within / total, self.slopes * (self.primary / total), beam])
+        return columns * self.weight, (self.measured + np.log(total)) * self.weight
+
 
 def estimate_scatter(
-    sample: FittedRays,
-    spectrum: Spectrum | None,
-    materials: Materials | None,
-    start: float = 0.0,
-    *,
-    beam_free: bool = False,
+    rays: RaysUnder, start: float = 0.0, *, beam_free: bool = False
 ) -> tuple[Scatter, float]:
     """Scatter that explains the residuals of rays, at least one, best; it varies where that is needed.
 
@@ -60,10 +105,8 @@ def estimate_scatter(
 
     Parameters
     ----------
-    sample : FittedRays
+    rays : RaysUnder
         Of a fit that assumed ``start``.
-    spectrum, materials : Spectrum, Materials, or None
-        None where the areal densities of the one curve are -log(I / I0) themselves.
     start : float
         Constant scatter, as a fraction of the open beam.
     beam_free : bool
@@ -75,9 +118,9 @@ def estimate_scatter(
     Scatter
         As a fraction of the beam.
     float
-        Brightness of the beam, in those that ``sample`` is relative to; 1 unless it is free.
+        Brightness of the beam, in those that the rays are relative to; 1 unless it is free.
     """
-    rays, light = _Rays.of(sample, spectrum, materials)._replace(beam_free=beam_free), sample.light
+    rays, light = rays._replace(beam_free=beam_free), rays.light
     mean = float(light.mean())
     kinds = np.stack([np.ones_like(light), light - mean])
     (constant,), beam, plain = _scatter_of(kinds[:1], np.array([start]), rays)
@@ -92,33 +135,22 @@ def estimate_scatter(
     return Scatter(min(max(constant, 0.0), LARGEST_SCATTER)), beam
 
 
-# The rays, their physics, and the two kinds of light that are compared.
-def misfit_left(
-    sample: FittedRays,
-    spectrum: Spectrum | None,
-    materials: Materials | None,
-    was: Scatter,
-    now: Scatter,
-    *,
-    beam_free: bool = False,
-) -> float:
+def misfit_left(rays: RaysUnder, was: Scatter, now: Scatter, *, beam_free: bool = False) -> float:
     """How much of the rays' misfit is left under other scatter, each with the best factor of every curve's amount.
 
     The misfit is Huber's, and where it has its corner changes hardly anything.
 
     Parameters
     ----------
-    sample : FittedRays
+    rays : RaysUnder
         Of a fit that assumed the scatter ``was``.
-    spectrum, materials : Spectrum, Materials, or None
-        See `estimate_scatter`.
     was, now : Scatter
     beam_free : bool
         Whether the second has the best brightness of the beam as well.
     """
     from scipy.special import huber
 
-    light, rays = torch.as_tensor(sample.light), _Rays.of(sample, spectrum, materials)
+    light = torch.as_tensor(rays.light)
     before = _deviation(was.at(light).numpy(), rays)
     after = _deviation(now.at(light).numpy(), rays._replace(beam_free=beam_free))
     corner = _corner(before)
@@ -126,39 +158,7 @@ def misfit_left(
     return sums[1] / sums[0] if sums[0] else 1.0
 
 
-class _Rays(NamedTuple):
-    """What passes of rays, its slopes by a factor of each curve's amount, what was measured, and its weight."""
-
-    primary: np.ndarray
-    slopes: np.ndarray
-    measured: np.ndarray
-    weight: np.ndarray
-    beam_free: bool = False
-
-    @classmethod
-    def of(cls, sample: FittedRays, spectrum: Spectrum | None, materials: Materials | None) -> _Rays:
-        """Those of a sample, under the beam that it is relative to."""
-        if spectrum is None or materials is None:
-            return cls(np.exp(-sample.areal[0]), sample.areal[:1], sample.measured, sample.weight)
-        lit = spectrum.weights > 0
-        curves = materials.mass_attenuation(spectrum.energies[lit])[: len(sample.areal)]
-        value, share = shares(sample.areal, np.log(spectrum.weights[lit]), curves)
-        slopes = np.einsum("kn,nr->kr", curves, share) * sample.areal
-        return cls(np.exp(-value), slopes, sample.measured, sample.weight)
-
-    def linearised(self, kinds: np.ndarray, scatter: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What rays under some scatter change by with each kind of it, each curve's amount and the beam's log.
-
-        The second array is what they lack.
-        """
-        within = (scatter >= 0) & (scatter <= LARGEST_SCATTER)
-        total = self.primary + np.clip(scatter, 0.0, LARGEST_SCATTER) + np.finfo(np.float64).tiny
-        beam = -np.ones((int(self.beam_free), len(total)))
-        columns = np.concatenate([-kinds * within / total, self.slopes * (self.primary / total), beam])
-        return columns * self.weight, (self.measured + np.log(total)) * self.weight
-
-
-def _deviation(scatter: np.ndarray, rays: _Rays) -> np.ndarray:
+def _deviation(scatter: np.ndarray, rays: RaysUnder) -> np.ndarray:
     """What rays lack under some scatter, with the amounts of the curves that are best under it."""
     columns, target = rays.linearised(np.empty((0, len(scatter))), scatter)
     deviation = np.abs(target)
@@ -169,7 +169,9 @@ def _deviation(scatter: np.ndarray, rays: _Rays) -> np.ndarray:
     return deviation
 
 
-def _scatter_of(kinds: np.ndarray, amounts: np.ndarray, rays: _Rays) -> tuple[list[float], float, np.ndarray]:
+def _scatter_of(
+    kinds: np.ndarray, amounts: np.ndarray, rays: RaysUnder
+) -> tuple[list[float], float, np.ndarray]:
     """Amounts of some kinds of scatter, from the first ones on, and the beam, that explain rays best; what is left."""
     robust = np.ones_like(rays.measured)
     for _ in range(_GAUSS_NEWTON_STEPS):
