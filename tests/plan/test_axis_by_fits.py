@@ -1,6 +1,7 @@
 """The axis of rotation where no ray was measured from both ends: short fits tell it, or say that they cannot."""
 
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 import pytest
@@ -75,9 +76,14 @@ def test_pixels_become_finer_down_to_what_a_fit_can_take(columns, factors):
     assert joined_columns(columns) == factors
 
 
+@cache
+def pins(turn):
+    return tps.simulate_scan("pins", size=17, views=VIEWS, geometry="parallel", arc_degrees=turn, photons=1e5)
+
+
 def found(turn, off):
     """What is found of pins, seen in parallel rays over so many degrees, told so many columns off."""
-    scan = tps.simulate_scan("pins", size=17, views=VIEWS, geometry="parallel", arc_degrees=turn, photons=1e5)
+    scan = pins(turn)
     told = dict(vector_form(scan.proj_geom))
     vectors = np.array(told["Vectors"])
     vectors[:, 3:6] -= off * vectors[:, 6:9]
@@ -87,7 +93,8 @@ def found(turn, off):
     return axis.find_axis(problem, OPTIONS, lambda *_: None)
 
 
-def test_less_than_half_a_turn_tells_the_axis_by_fits():
+def test_less_than_half_a_turn_tells_the_axis_by_fits(monkeypatch):
+    monkeypatch.setattr(axis_by_fits, "_STEPS", 60)  # half of them tell it of so few pixels
     right, wrong = found(150.0, 0.0), found(150.0, 0.7)
     assert right.value == {} and "where it was told" in right.why and axis.is_known(right)
     assert wrong.value["u"] == pytest.approx(0.7, abs=0.1) and "short fits" in wrong.why
