@@ -86,9 +86,9 @@ def bias(result):
 
 
 def reconstructed(scan, **options):
-    # Where the scanner stood is asked in other files.
+    # Where the scanner stood, and whether it scattered, is asked in other files.
     settings = {"passes": 6.0, "views_per_step": 20}
-    return tps.reconstruct(scan, settings=settings, align=False, **options)
+    return tps.reconstruct(scan, settings=settings, align=False, calibrate=False, **options)
 
 
 @cache
@@ -136,6 +136,7 @@ def test_the_command_line_takes_it(tmp_path):
     save_scan(scan, tmp_path / "scan.npz")
     np.savetxt(tmp_path / "bowtie.txt", BOWTIE[None])
     asked = ["recon", str(tmp_path / "scan.npz"), "-o", str(tmp_path / "out.npy"), "--set", "passes=1"]
+    asked += ["--set", "views_per_step=20", "--no-align", "--no-calibrate"]
     assert (
         main([*asked, "--filter-map", f"Al:{tmp_path / 'bowtie.txt'}", "--json", str(tmp_path / "plan.json")])
         == 0
