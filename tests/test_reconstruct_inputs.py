@@ -146,7 +146,7 @@ def test_a_few_views_are_explained_though_not_enough(views, flat):
     else:
         part, proj_geom, vol_geom = scan.projections[:, chosen], astra.geom_2vec(scan.proj_geom), None
     proj_geom = proj_geom | {"Vectors": proj_geom["Vectors"][chosen]}
-    result = reconstruct(scan, part, proj_geom, vol_geom, settings={"passes": 12.0})
+    result = reconstruct(scan, part, proj_geom, vol_geom, settings={"passes": 6.0})
     assert np.isfinite(result.volume).all()
     first, last = result.history[0]["loss"], result.history[-1]["loss"]
     assert last < 0.5 * first

@@ -10,8 +10,8 @@ from tomo_polysplat.start.fdk import fdk
 astra = pytest.importorskip("astra")
 
 
-def planar_cases():
-    half, turn = np.linspace(0, np.pi, 90, endpoint=False), np.linspace(0, 2 * np.pi, 180, endpoint=False)
+def planar_cases(views=180):
+    half, turn = np.linspace(0, np.pi, 90, endpoint=False), np.linspace(0, 2 * np.pi, views, endpoint=False)
     square, window = astra.create_vol_geom(64, 64), astra.create_vol_geom(50, 64, -24, 40, -20, 30)
     fan = astra.create_proj_geom("fanflat", 1.5, 90, turn, 150.0, 80.0)
     beam = astra.create_proj_geom("parallel", 1.0, 80, half)
@@ -64,7 +64,7 @@ def test_discs_as_astras_fbp(case):
 @pytest.mark.parametrize("case", ["fan", "fan window", "fan offset", "parallel offset"])
 def test_discs_as_astras_sirt(case):
     """From ASTRA's own projections of an image: the detector runs, and the image lies, as ASTRA has it."""
-    proj_geom, vol_geom = planar_cases()[case]
+    proj_geom, vol_geom = planar_cases(120)[case]
     geometry, grid = from_astra(proj_geom, vol_geom)
     image = truth(grid, DISCS).astype(np.float32)
     kind = "line_fanflat" if proj_geom["type"].startswith("fan") else "linear"
