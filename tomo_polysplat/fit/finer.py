@@ -41,8 +41,7 @@ def may_be_finer(gaussians: Gaussians, scene: FitScene, smallest: float) -> torc
         metal = gaussians.select(members)
         values, index = metal_voxels(metal, scene)
         _, levels, of_each = levels_of_pieces(metal, values, index)
-        inside = _least_around(values, index).cpu().numpy() >= _EDGE * levels[of_each]
-        may[members] &= torch.from_numpy(~inside).to(may.device)
+        may[members] &= _least_around(values, index) < _EDGE * levels[of_each]
     return may
 
 

@@ -42,6 +42,6 @@ def number_metals(gaussians: Gaussians, scene: FitScene, settings: Settings, sha
         return
     metal = gaussians.select(members)
     pieces, levels, _ = levels_of_pieces(metal, *metal_voxels(metal, scene))
-    numbers = np.round(scene.solid_number(levels), _DIGITS)
+    numbers = np.round(scene.solid_number(levels.cpu().numpy()), _DIGITS)
     shared = gaussians.shared_material
-    shared[torch.from_numpy(pieces).to(shared.device)] = torch.from_numpy(numbers).to(shared)
+    shared[pieces] = torch.from_numpy(numbers).to(shared)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
-from scipy import ndimage
 
 from tomo_polysplat.fit.scene import FitScene
 from tomo_polysplat.model.gaussians import Gaussians
@@ -38,7 +36,7 @@ def metal_voxels(metal: Gaussians, scene: FitScene) -> tuple[torch.Tensor, torch
 
 def levels_of_pieces(
     metal: Gaussians, values: torch.Tensor, index: torch.Tensor
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """The pieces of metal, and how dense each is, from what `metal_voxels` gave.
 
     The level of a piece is the median of its Gaussians' voxels: the outermost ones hold something else as well.
@@ -52,11 +50,15 @@ def levels_of_pieces(
 
     Returns
     -------
-    pieces : (m,) int array
-    levels : (m,) float array
-    of_each : (n,) int array
+    pieces : (m,) int64 tensor
+    levels : (m,) tensor
+    of_each : (n,) int64 tensor
         The place of each Gaussian's piece among the pieces.
     """
-    own = values[tuple(index.T)].cpu().numpy()
-    pieces, of_each = np.unique(metal.group.cpu().numpy(), return_inverse=True)
-    return pieces, ndimage.median(own, of_each, range(len(pieces))), of_each
+    own = values[tuple(index.T)]
+    pieces, of_each, many = metal.group.unique(return_inverse=True, return_counts=True)
+    ranked = own.argsort()
+    ranked = ranked[of_each[ranked].argsort(stable=True)]
+    first = many.cumsum(0) - many
+    lower, upper = (own[ranked[first + half]] for half in ((many - 1) // 2, many // 2))
+    return pieces, (lower + upper) / 2, of_each
