@@ -12,14 +12,20 @@ from small_scans import QUICK, cone, fan, reconstruct
 
 import tomo_polysplat as tps
 from tomo_polysplat.fit.misses import misses
+from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.fit.step import EagerStep
 from tomo_polysplat.kernels import compile_time
 from tomo_polysplat.plan.decision import When
+from tomo_polysplat.plan.first_volume import first_volume
+from tomo_polysplat.plan.fit_options import FitOptions
 from tomo_polysplat.plan.lab import Lab
+from tomo_polysplat.plan.one_energy import _after_short_fits
 from tomo_polysplat.plan.order import decide, decide_start
 from tomo_polysplat.plan.preparation import fit_start
 from tomo_polysplat.report.decided import doubts
+from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.scan.noise import RayNoise
+from tomo_polysplat.scan.usable import usable_rays
 from tomo_polysplat.settings import Settings
 
 SPECTRA_ARE_DOUBTED = True  # see tests/conftest.py
@@ -156,15 +162,13 @@ def test_the_truth_misses_its_rays_by_their_noise(held_out):
     assert math.isinf(silent.times) and silent.least == 0 and "allowed" in silent.describe()
 
 
-def lab_of_scan(scan, held_out):
-    from tomo_polysplat.fit.problem import Problem
-    from tomo_polysplat.plan.first_volume import first_volume
-    from tomo_polysplat.scan.geometry import from_astra
-    from tomo_polysplat.scan.usable import usable_rays
-
+def problem_of(scan):
     values, _, _ = usable_rays(scan.projections, scan.proj_geom, None, None, scan.spectrum)
-    problem = Problem.of(values, *from_astra(scan.proj_geom, scan.vol_geom), scan.unit, scan.spectrum, None)
-    settings = Settings(held_out=held_out, **UNASKED)
+    return Problem.of(values, *from_astra(scan.proj_geom, scan.vol_geom), scan.unit, scan.spectrum, None)
+
+
+def lab_of_scan(scan, held_out):
+    problem, settings = problem_of(scan), Settings(held_out=held_out, **UNASKED)
     lab = Lab(problem, first_volume(problem, CPU, settings)[0], settings, CPU, short_fit=fit_start)
     decide_start(lab)
     decide(lab, When.TRIAL)
@@ -180,3 +184,14 @@ def test_a_spectrum_that_fits_worse_than_one_energy_is_named(caplog):
         bad = reconstruct(scan, spectrum=tps.Spectrum.from_tube(40, filters={}))
     assert "spectrum does not fit" in caplog.text and "voltage" in bad.plan["spectrum_doubt"].why
     assert any("the spectrum" in words for words in doubts(bad.plan))
+
+
+def test_joined_pixels_show_a_wrong_spectrum_as_well():
+    """Of 73 columns 36 are left: a bare tube of 60 kV told for one of 90 kV with its filter."""
+    scan = tps.simulate_scan("pancreas", size=37, views=49, columns=73, geometry="parallel", metal=False)
+    options = FitOptions(Settings(**UNASKED), None, 0, CPU)
+    by_energy, by_own = _after_short_fits(problem_of(scan), options)
+    again, by_wrong = _after_short_fits(
+        problem_of(replace(scan, spectrum=tps.Spectrum.from_tube(60))), options
+    )
+    assert by_energy == pytest.approx(again) and again < 0.9 * by_wrong and by_energy > 0.9 * by_own

@@ -31,7 +31,7 @@ from tomo_polysplat.physics.filter_map import FilterMap
 from tomo_polysplat.physics.filter_shape import bowtie_map, filter_shapes, filter_thickness
 from tomo_polysplat.physics.materials import density
 from tomo_polysplat.plan.answer import Answer, Status
-from tomo_polysplat.plan.coarse import coarse_problem, coarse_settings
+from tomo_polysplat.plan.coarse import coarse_settings, small_problem
 from tomo_polysplat.plan.fall_of_misfits import fall_of_misfits
 from tomo_polysplat.plan.fit_options import FitOptions
 from tomo_polysplat.plan.plan import Plan
@@ -43,8 +43,8 @@ logger = logging.getLogger(__name__)
 
 # Nodes of the spectrum hold up to so many cm of it, and no filter is thicker.
 _THICKEST = 5.0
-# At least so many columns are left, and this share of them as views; passes of a fit, and views of a step.
-_COLUMNS, _VIEWS, _PASSES, _BATCH = 36, 1.25, 12, 4
+# At least so many columns are left; passes of a fit, and views of a step.
+_COLUMNS, _PASSES, _BATCH = 36, 12, 4
 # Shares of the passes between which the filter goes along, and by how many times what is left says: the object hides a
 # part of it. Before, the object is too rough; afterwards it gets used to it.
 _FROM, _UNTIL, _FURTHER = 0.3, 0.8, 1.5
@@ -62,7 +62,7 @@ def find_bowtie(problem: Problem, options: FitOptions, report: Callable[[float, 
         Gets the share done, none, and words.
     """
     report(0.0, "bowtie")
-    search = _Search(_fewer(problem), options)
+    search = _Search(small_problem(problem, _COLUMNS), options)
     plain, _ = search.fit(moving=False)
     behind, found = search.fit(moving=True)
     better, error = fall_of_misfits(plain.held_out, behind.held_out, -math.inf)
@@ -81,16 +81,6 @@ def behind_bowtie(problem: Problem, found: dict[str, float]) -> Problem:
     rows, columns = problem.projections.shape[1:]
     told = bowtie_map(found, rows, columns)
     return problem if told is None else problem.behind(FilterMap.of(told, "cm", rows, columns))
-
-
-def _fewer(problem: Problem) -> Problem:
-    """The problem by joined pixels, and by some of its views."""
-    coarse, _ = coarse_problem(problem, max(1, problem.geometry.columns // _COLUMNS))
-    every = max(1, int(coarse.geometry.views / (_VIEWS * coarse.geometry.columns)))
-    if every == 1:
-        return coarse
-    some = np.arange(0, coarse.geometry.views, every)
-    return replace(coarse, projections=coarse.projections[some], geometry=coarse.geometry.select(some))
 
 
 class _Search:

@@ -14,13 +14,15 @@ from tomo_polysplat.parallel import run_tasks, split_range
 from tomo_polysplat.scan.geometry import VolumeGrid
 from tomo_polysplat.settings import Settings
 
-__all__ = ["LEAST_PASSES", "coarse_problem", "coarse_settings", "joined_pixels"]
+__all__ = ["LEAST_PASSES", "coarse_problem", "coarse_settings", "joined_pixels", "small_problem"]
 
 # A run of fewer passes is not asked by joined pixels: these are a quarter of all, or less, and a pass over them would
 # take more than a tenth of it.
 LEAST_PASSES = 2.5
 # Voxels of the coarsest volume along its edges, and the share of rays that is held out of a fit.
 _FEWEST_VOXELS, _HELD_OUT = 8, 0.1
+# Views of a small problem, over the columns that are left.
+_VIEWS = 1.25
 # Rays that are joined at once.
 _AT_ONCE = 1 << 22
 
@@ -42,6 +44,20 @@ def coarse_problem(problem: Problem, factor: int) -> tuple[Problem, int]:
     behind = None if problem.filter_map is None else problem.filter_map.joined(rows, factor)
     whole = replace(problem, projections=values, geometry=geometry, grid=grid, margin=NO_MARGIN)
     return replace(whole, filter_map=behind), rows
+
+
+def small_problem(problem: Problem, columns: int) -> Problem:
+    """The problem by joined pixels, so many columns of them at least, and by as many of its views as these need.
+
+    What beam and filters did shows in it as well, whatever the scan's size.
+    """
+    geometry = problem.geometry
+    factor = max(1, geometry.columns // columns)
+    every = max(1, int(geometry.views / (_VIEWS * (geometry.columns // factor))))
+    if every > 1:
+        some = np.arange(0, geometry.views, every)
+        problem = replace(problem, projections=problem.projections[some], geometry=geometry.select(some))
+    return coarse_problem(problem, factor)[0]
 
 
 def coarse_settings(settings: Settings) -> Settings:

@@ -13,6 +13,7 @@ from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.physics.typical import largest_finite
 from tomo_polysplat.physics.water_correction import usual_water_correction
 from tomo_polysplat.plan.answer import Answer, Status
+from tomo_polysplat.plan.coarse import coarse_settings, small_problem
 from tomo_polysplat.plan.first_volume import first_volume
 from tomo_polysplat.plan.fit_options import FitOptions
 from tomo_polysplat.plan.lab import Lab
@@ -32,6 +33,8 @@ logger = logging.getLogger(__name__)
 _CLEARLY = 0.9
 # It takes a second start, which of more voxels is not cheap.
 _MOST_VOXELS = 1 << 24
+# Short fits of more pixels than those are of joined ones, of which at least so many columns are left.
+_COLUMNS = 36
 
 
 def doubt_spectrum(problem: Problem, misfit: float, options: FitOptions) -> Answer | None:
@@ -53,7 +56,7 @@ def doubt_spectrum(problem: Problem, misfit: float, options: FitOptions) -> Answ
     try:
         if _by_seeds(one, options) >= _CLEARLY * misfit:
             return None
-        left = [_after_short_fit(of, options) for of in (one, problem)]
+        left = _after_short_fits(problem, options)
     except (ValueError, RuntimeError, MemoryError) as error:  # no room for it, or no such start
         logger.info("The spectrum is not compared with one energy: %s", error)
         return None
@@ -101,6 +104,13 @@ def _by_seeds(one: Problem, options: FitOptions) -> float:
     return misses(lab.seeds(), lab.scene, lab.rays, one.noise(device), settings).misfit
 
 
-def _after_short_fit(of: Problem, options: FitOptions) -> float:
-    start, _ = first_volume(of, options.device, options.settings)
-    return short_fit(of, start, {}, options).held_out
+def _after_short_fits(problem: Problem, options: FitOptions) -> list[float]:
+    """Held-out misfits of one energy and of the spectrum: large scans are asked by joined pixels, which cost little."""
+    if problem.geometry.columns >= 2 * _COLUMNS:
+        problem = small_problem(problem, _COLUMNS)
+        options = replace(options, settings=coarse_settings(options.settings))
+    left = []
+    for of in (problem.with_one_energy(), problem):
+        start, _ = first_volume(of, options.device, options.settings)
+        left.append(short_fit(of, start, {}, options).held_out)
+    return left
