@@ -1,6 +1,7 @@
 """Rays and voxels show the same Gaussians."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -202,6 +203,37 @@ def test_slices_show_the_values_at_their_centres():
     of_voxels = voxelise_means(gaussians, weights, voxel_box(grid), KERNEL)
     assert float((shown - centres).norm() / centres.norm()) < 1e-5
     assert float((of_voxels - centres).norm() / centres.norm()) > 0.03
+
+
+@pytest.mark.parametrize("slices", [1, 3, 7])
+def test_slices_show_what_their_rays_see_of_thin_gaussians(slices):
+    """Discs in the middle of each slice, thinner than it: a ray meets all of their density; of two rays each a part."""
+    half = 0.05 * slices
+    grid = VolumeGrid((slices, 20, 20), [-1.0, -1.0, -half], [1.0, 1.0, half])
+    discs = cloud(count=slices)
+    discs.position[:] = (
+        torch.tensor([[0.05, 0.05, 0.05 - half]]) + 0.1 * torch.arange(slices)[:, None] * torch.eye(3)[2]
+    )
+    discs.log_scale[:] = torch.tensor([0.4, 0.4, 0.02]).log()
+    discs.rotation[:] = torch.eye(4)[0]
+    rays = rays_through_slices(1)
+    rays = replace(rays, corner=rays.corner + [0.0, 0.0, 0.15 - half])
+    seen = voxel_box(grid, rays)
+    assert not voxel_box(grid, replace(rays, corner=rays.corner + [0.0, 0.0, 0.03])).levels, (
+        "rows beside the middle"
+    )
+    assert not voxel_box(grid, replace(rays, u=rays.u + [0.0, 0.0, 0.001])).levels, "a rolled detector"
+    shown = [
+        voxelise_means(discs, torch.ones(1, slices), box, KERNEL)[0, :, 10, 10]
+        for box in (seen, replace(seen, levels=2), voxel_box(grid))
+    ]
+    expected = [
+        1.0,
+        math.exp(-0.5 * (0.025 / 0.02) ** 2),
+        0.2 * math.sqrt(2 * math.pi) * math.erf(2.5 / math.sqrt(2)),
+    ]
+    for values, value in zip(shown, expected):
+        assert values.tolist() == pytest.approx([value] * slices, rel=0.03)
 
 
 @pytest.mark.parametrize("planar", [False, True])

@@ -219,13 +219,14 @@ class FitScene:
     def _means(self, gaussians: Gaussians, weights: torch.Tensor) -> torch.Tensor:
         """Means over the voxels, with the tails of metal put back inside it."""
         metal = gaussians.group > 0
+        box = replace(self.box, levels=self.box.levels * self.pixel_rays)
         chosen = [flag.nonzero()[:, 0] for flag in (~metal, metal)]
         rest, inside = (
-            voxelise_means(gaussians.select(index), weights[:, index], self.box, self.kernel)
+            voxelise_means(gaussians.select(index), weights[:, index], box, self.kernel)
             for index in chosen
         )
         seen, some = self._visible(inside), gaussians.select(chosen[1])
-        tail = tails(seen, some, self._output_weights(some), self.box, self.kernel, self.metal_tail)
+        tail = tails(seen, some, self._output_weights(some), box, self.kernel, self.metal_tail)
         return rest + inside * tail_factors(seen, self._visible(rest), tail)
 
     def _visible(self, densities: torch.Tensor) -> torch.Tensor:

@@ -167,4 +167,4 @@ def _coarse(box: VoxelBox) -> VoxelBox:
     """The volume at no more than so many points an axis, each a voxel's centre."""
     step = [-(-n // _POINTS) for n in box.shape]
     nz, ny, nx = (-(-n // k) for n, k in zip(box.shape, step))
-    return VoxelBox(box.first, box.spacing * np.array(step[::-1]), (nz, ny, nx), box.whole)
+    return VoxelBox(box.first, box.spacing * np.array(step[::-1]), (nz, ny, nx), box.whole, box.levels)

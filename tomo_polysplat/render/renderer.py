@@ -43,6 +43,8 @@ _SAMPLE_STEP = 5 / 3
 _FINE = 1.4
 # Heights that a ray changes by on its way, and rows are apart, in those of slices, which then have one row each.
 _LEVEL, _ROW = 0.5, 0.8
+# How far a row may run beside the middle of its slice, in its heights: half of the least deviation of a Gaussian.
+_BESIDE_MIDDLE = 0.1
 # Rounding, as a share of a sample: the least deviation that a fit allows needs a whole number of samples.
 _ROUNDING = 1e-3
 
@@ -61,7 +63,8 @@ def voxel_box(grid: VolumeGrid, geometry: Geometry | None = None, distance: floa
     """All voxels of a grid, as rays of a geometry and a cloud of seeds so many voxels apart show them."""
     slices = geometry is not None and _by_slices(geometry, grid)
     whole = distance <= _FINE and not slices
-    return VoxelBox(grid.lower + 0.5 * grid.voxel_size, grid.voxel_size, grid.shape, whole)
+    levels = int(geometry is not None and slices and _in_middles(geometry, grid))
+    return VoxelBox(grid.lower + 0.5 * grid.voxel_size, grid.voxel_size, grid.shape, whole, levels)
 
 
 def _by_slices(geometry: Geometry, grid: VolumeGrid) -> bool:
@@ -75,6 +78,17 @@ def _by_slices(geometry: Geometry, grid: VolumeGrid) -> bool:
         direction, axis=1
     )
     return bool(level.all() and (np.abs(geometry.v[:, 2]) > _ROW * height).all())
+
+
+def _in_middles(geometry: Geometry, grid: VolumeGrid) -> bool:
+    """Whether a row runs through the middle of each slice that the detector sees, along all of the row."""
+    height = float(grid.voxel_size[2])
+    middles = grid.lower[2] + height * (0.5 + np.arange(grid.shape[0]))
+    row = (middles - geometry.corner[:, 2:]) / geometry.v[:, 2:]
+    seen = (row > -0.5) & (row < geometry.rows - 0.5)
+    beside = np.abs(row - np.rint(row)) * np.abs(geometry.v[:, 2:])
+    risen = np.abs(geometry.u[:, 2]).max() * geometry.columns
+    return bool(seen.any() and max(beside[seen].max(), risen) < _BESIDE_MIDDLE * height)
 
 
 def project_gaussians(
@@ -120,7 +134,7 @@ def voxelise_means(gaussians: Gaussians, weights: torch.Tensor, box: VoxelBox, k
 
     Whether a Gaussian thinner than half a voxel shows at voxel centres depends on where it lies between them. So thin
     Gaussians are sampled at several points per voxel, and at more along the long edges of an oblong voxel. The mean of
-    a wider one is that of a Gaussian of `_widened` variance at the centre.
+    a wider one is that of a Gaussian of `_widened` variance at the centre. Slices show the heights that rays see.
     """
     dims = gaussians.log_scale.shape[1]
     edge = float(box.spacing[:dims].max())
@@ -182,8 +196,8 @@ def _reached(gaussians: Gaussians, box: VoxelBox) -> tuple[tuple[int, int, int],
 def voxelise_peaks(gaussians: Gaussians, weights: torch.Tensor, box: VoxelBox, kernel: str) -> torch.Tensor:
     """(channels, nz, ny, nx) largest sum of the Gaussians at points in each voxel; not differentiable."""
     fine = np.full(3, _PEAK_SAMPLES)
-    if gaussians.planar:
-        fine[0] = 1
+    if gaussians.planar or box.levels:
+        fine[0] = 1 if gaussians.planar else box.levels
     volume = weights.new_empty((len(weights), *box.shape))
     for where, peaks in _of_samples(gaussians, weights, box, kernel, fine, torch.amax):
         volume[where] = peaks
@@ -216,6 +230,6 @@ def _samples(box: VoxelBox, thinnest: float, *, planar: bool) -> np.ndarray:
     """(z, y, x) samples per voxel for Gaussians whose least deviation is ``thinnest``."""
     needed = np.ceil(box.spacing[::-1] / (_SAMPLE_STEP * thinnest) - _ROUNDING)
     counts = np.clip(needed, _SAMPLES[0], _SAMPLES[-1]).astype(int)
-    if planar:
-        counts[0] = 1
+    if planar or box.levels:
+        counts[0] = 1 if planar else box.levels
     return counts

@@ -23,12 +23,15 @@ class VoxelBox:
     shape : (nz, ny, nx)
     whole : bool
         Whether wide Gaussians count over all of a voxel, and not at its centre alone.
+    levels : int
+        At how many heights of each slice all its rays run, evenly spread: what lies between is not measured. Else 0.
     """
 
     first: np.ndarray
     spacing: np.ndarray
     shape: tuple[int, int, int]
     whole: bool = True
+    levels: int = 0
 
     def part(self, start: tuple[int, int, int], shape: tuple[int, int, int]) -> VoxelBox:
         """The sub-block of ``shape`` that begins at voxel ``start`` (z, y, x)."""
