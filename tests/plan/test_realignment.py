@@ -159,3 +159,23 @@ def test_a_fit_by_a_rolled_scanner_does_not_warn_of_matter_beside_a_few_rows(cap
     caplog.clear()
     realignment._Realignment(told, AXIS, OPTIONS)._fitted(rolled)
     assert "reaches beyond" not in caplog.text
+
+
+def test_rows_that_are_alike_tell_no_roll_and_no_shifts_along_columns():
+    """Rods through all of three rows, and views that wobble across them: rows differ by noise, which tells no move."""
+    rng, degrees = np.random.default_rng(2), np.linspace(0, 180, 60, endpoint=False)
+    wobbled, turned = rng.normal(0, 0.5, 60), np.deg2rad(degrees)
+    across = (np.arange(41) - 20 + wobbled[:, None]) * 0.1
+    values = np.zeros((60, 41))
+    for x, y, radius, density in ((0.1, 0.0, 1.6, 0.2), (0.7, -0.4, 0.4, 3.0), (-0.5, 0.6, 0.3, -0.2)):
+        away = across - (x * np.cos(turned) + y * np.sin(turned))[:, None]
+        values += 2 * density * np.sqrt(np.maximum(radius**2 - away**2, 0))
+    rows = values[:, None] + rng.normal(0, 0.003, (60, 3, 41)) * np.exp(0.5 * values)[:, None]
+    told = from_astra(*tps.parallel_geometry(pixel=0.1, detector=(3, 41), degrees=degrees))
+    told = Problem.of(rows.astype(np.float32), *told, "cm", None, None)
+    moved, misfits = realignment._Realignment(told, AXIS, OPTIONS).moved({})
+    order = np.arange(60) if told.order is None else told.order
+    shifts = moved["views"].numpy()
+    assert list(moved) == ["views"] and np.abs(shifts[:, 1]).max() < 1e-9
+    assert np.corrcoef(shifts[:, 0], wobbled[order])[0, 1] ** 2 > 0.9
+    assert np.nanmean(misfits[-1]) < 0.7 * np.nanmean(misfits[0])

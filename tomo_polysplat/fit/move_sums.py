@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
-from tomo_polysplat.fit.by_views import Walk, by_views, views_at_once
+from tomo_polysplat.fit.by_views import Batch, Walk, by_views, views_at_once
 from tomo_polysplat.fit.clipped import allowed_error, clipped, usual_error
 from tomo_polysplat.fit.loss import misfit_by_view
 from tomo_polysplat.fit.rays import Rays
@@ -37,11 +38,15 @@ class MoveSums:
         Sums of slopes times measurement less model.
     held_out : (views,) array
         Mean misfit of the rays held out; NaN in views without any.
+    rows : float
+        How much of what rows differ by in the model the rays held out show, less its standard error: about 1, or less
+        than 0 where it is noise that was fitted; 1 where no ray is held out.
     """
 
     normal: np.ndarray
     told: np.ndarray
     held_out: np.ndarray
+    rows: float = 1.0
 
 
 def move_sums(
@@ -60,8 +65,10 @@ def move_sums(
     at_once = views_at_once(rays, _AT_ONCE, _RAYS, len(falls) + 1)
     walk = Walk(gaussians, scene, rays, settings, np.arange(len(rays.views)), at_once)
     parts = by_views(_of_part, walk, falls)
-    normal, told, held_out = (torch.cat(of_each).cpu().numpy() for of_each in zip(*parts))
-    return MoveSums(normal.swapaxes(0, 1), told.swapaxes(0, 1), held_out)
+    normal, told, held_out, rows = (torch.cat(of_each).cpu().numpy() for of_each in zip(*parts))
+    own, left, squares = rows.sum(axis=0)
+    shown = 1.0 + (left - math.sqrt(squares)) / own if own > 0 else 1.0
+    return MoveSums(normal.swapaxes(0, 1), told.swapaxes(0, 1), held_out, float(shown))
 
 
 def _of_part(walk: Walk, falls: torch.Tensor) -> list[torch.Tensor]:
@@ -69,18 +76,19 @@ def _of_part(walk: Walk, falls: torch.Tensor) -> list[torch.Tensor]:
     views, columns, many = len(walk), walk.rays.views.columns, len(falls) + 1
     double = torch.zeros((), dtype=torch.float64, device=walk.rays.target)
     normal, told = double.new_zeros((views, 2, many, many)), double.new_zeros((views, 2, many))
-    held_out = double.new_full((views,), torch.nan)
+    held_out, rows = double.new_full((views,), torch.nan), double.new_zeros((views, 3))
     for some in walk:
         held_out[some.here] = misfit_by_view(some.predicted, some.measured, some.aside, walk.settings)
         left = _left(some.measured - some.predicted, some.fitted, allowed_error(walk.settings))
         slopes, trust = _slopes(some.predicted, falls[:, some.now]), some.fitted.square()
+        rows[some.here] = _of_rows(some)
         for side, half in enumerate((slice(0, columns // 2), slice(columns // 2, columns))):
             # Row by row: a GPU would make the products of a whole view on a single multiprocessor.
             one = slopes[..., half].double().transpose(1, 2)
             weighed = one * trust[:, :, None, half].double()
             normal[some.here, side] = (weighed @ one.transpose(2, 3)).sum(dim=1)
             told[some.here, side] = (weighed @ left[..., half, None].double())[..., 0].sum(dim=1)
-    return [normal, told, held_out]
+    return [normal, told, held_out, rows]
 
 
 def _left(residual: torch.Tensor, fitted: torch.Tensor, allowed: float) -> torch.Tensor:
@@ -88,6 +96,16 @@ def _left(residual: torch.Tensor, fitted: torch.Tensor, allowed: float) -> torch
     used = (fitted > 0).to(residual.dtype)
     near = clipped(residual, fitted, usual_error(residual, fitted, allowed))
     return _smoothed(near * used) / _smoothed(used).clamp(min=1e-6)
+
+
+def _of_rows(some: Batch) -> torch.Tensor:
+    """(views, 3) sums over rays held out: of squares of what rows differ by in the model, and times what is left."""
+    weight = some.aside.double().square()
+    own = (some.predicted - some.predicted.mean(dim=1, keepdim=True)).double()
+    left = own * (some.measured - some.predicted) * weight
+    return torch.stack(
+        [(own.square() * weight).sum(dim=(1, 2)), left.sum(dim=(1, 2)), left.square().sum(dim=(1, 2))], 1
+    )
 
 
 def _slopes(predicted: torch.Tensor, falls: torch.Tensor) -> torch.Tensor:

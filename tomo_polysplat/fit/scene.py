@@ -222,8 +222,7 @@ class FitScene:
         box = replace(self.box, levels=self.box.levels * self.pixel_rays)
         chosen = [flag.nonzero()[:, 0] for flag in (~metal, metal)]
         rest, inside = (
-            voxelise_means(gaussians.select(index), weights[:, index], box, self.kernel)
-            for index in chosen
+            voxelise_means(gaussians.select(index), weights[:, index], box, self.kernel) for index in chosen
         )
         seen, some = self._visible(inside), gaussians.select(chosen[1])
         tail = tails(seen, some, self._output_weights(some), box, self.kernel, self.metal_tail)

@@ -28,6 +28,12 @@ class WholeMoves:
     value: np.ndarray
     error: np.ndarray
 
+    def among(self, many: int, which: Sequence[int]) -> WholeMoves:
+        """These as those of so many moves with the numbers ``which``; the rays do not tell the rest."""
+        value, error = np.zeros(many), np.full(many, np.inf)
+        value[list(which)], error[list(which)] = self.value, self.error
+        return WholeMoves(value, error)
+
 
 def whole_moves(normal: np.ndarray, told: np.ndarray, which: Sequence[int]) -> WholeMoves:
     """Moves that all views have in common, by the jackknife over groups of neighbouring views (Efron 1982).

@@ -48,6 +48,8 @@ _TOLD, _AXIS_KNOWN = 0.1, 0.02
 # Moves of more than this, in pixels of what is seen, beyond so many standard errors are looked for, and views shifted
 # by more than that; once any is, all that are sure to so many standard errors are made.
 _LEAST, _SURE, _LEAST_OF_VIEWS, _FOUND = 0.01, 2.5, 0.05, 2.0
+# Roll, and shifts along columns, are told by what rows differ by in the fit: held-out rays must show so much of that.
+_ROWS = 0.5
 # They are kept where the misfit of the same held-out rays falls by more than this, and by so many standard errors.
 _BETTER, _SURELY_BETTER = 0.01, 2.5
 # Fits, their passes, and the change, in pixels, after which the moves are known.
@@ -229,7 +231,13 @@ class _Realignment:
         falls = falls_of(self.scanner, values, (*self.names, "u", "v"))
         sums = move_sums(gaussians, scene, rays, self.settings, falls)
         normal, told, many = sums.normal, sums.told, len(self.names)
-        moves = whole_moves(normal.sum(axis=0), told.sum(axis=0), range(many))
+        # Of an object that is the same in all rows these differ by noise, which told shifts of 13 rows.
+        alike = sums.rows < _ROWS
+        which = [k for k, name in enumerate(self.names) if name == "u" or not alike]
+        moves = whole_moves(normal.sum(axis=0), told.sum(axis=0), which).among(many, which)
+        if alike:
+            along = np.arange(many + 3) != many + 1
+            normal, told = normal * along * along[:, None], told * along
         size, error = np.abs(moves.value) * self.seen, moves.error * self.seen
         whole = np.where((size > _FOUND * error) | self.made, moves.value, 0.0)
         told = told - normal[..., :many] @ whole
@@ -238,7 +246,9 @@ class _Realignment:
         rms = np.sqrt(np.mean(shifts**2, axis=0))
         pixels = float(max((np.abs(whole) * self.seen).max(initial=0.0), rms.max()))
         clear = bool((size > _LEAST + _SURE * error).any() or (rms > _LEAST_OF_VIEWS).any())
-        logger.debug("left: %s of errors %s, views %s px", moves.value, moves.error, rms)
+        logger.debug(
+            "left: %s of errors %s, views %s px, rows %.2f", moves.value, moves.error, rms, sums.rows
+        )
         return _Left(whole, shifts, pixels, clear, sums.held_out)
 
     def _stepped(
