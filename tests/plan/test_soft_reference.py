@@ -24,15 +24,19 @@ HARD = Spectrum.from_tube(160, filters={"Cu": 0.05})
 SETTINGS = Settings()
 
 
-def of(volume, materials=None, **settings):
-    """The reference of a volume in g/cm3."""
-    problem = SimpleNamespace(
+def problem_of(spectrum, materials=None):
+    """What a reference is asked of, besides the start."""
+    return SimpleNamespace(
         depth=1.0,
-        spectrum=HARD,
+        spectrum=spectrum,
         materials=Materials.of(materials),
         projections=np.linspace(0, 3, 50, dtype=np.float32).reshape(2, 5, 5),
     )
-    return soft_reference(volume.astype(np.float32), problem, Settings(**settings))
+
+
+def of(volume, materials=None, **settings):
+    """The reference of a volume in g/cm3."""
+    return soft_reference(volume.astype(np.float32), problem_of(HARD, materials), Settings(**settings))
 
 
 def ball(level, noise=0.0, size=25):
@@ -154,6 +158,19 @@ def test_soft_matter_beside_it_and_several_solids_leave_water():
     layers[:, :, ::3] *= 0.3
     layers[:, :, 1::3] *= 4
     assert of(half).value == 1.0 and of(layers).value == 1.0
+
+
+@pytest.mark.parametrize(("shell", "metal"), [(4.2, False), (4.2, True), (8.0, True), (13.0, True)])
+def test_a_shell_of_metal_around_soft_matter_is_metal(shell, metal):
+    """At 160 kV 4.2 is dense mineral, bone with marrow, say; at 300 kV titanium."""
+    problem = problem_of(Spectrum.from_tube(300, filters="Cu 5mm", detector="counting") if metal else HARD)
+    axes = np.meshgrid(*[np.linspace(-1, 1, 25)] * 3, indexing="ij")
+    away = np.sqrt(sum(a**2 for a in axes))
+    volume = np.where(away < 0.9, np.where(away < 0.6, 1.0, shell), 0.0).astype(np.float32)
+    found = soft_reference(volume, problem, SETTINGS)
+    assert found.value == 1.0 and found.dense == (0.0 if metal else pytest.approx(shell))
+    assert found.adapted(SETTINGS).metal_level == (6.0 if metal else pytest.approx(3 * shell))
+    assert ("metal" in found.why) == metal
 
 
 @pytest.mark.parametrize("material", ["aluminium", "titanium", "iron"])

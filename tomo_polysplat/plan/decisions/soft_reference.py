@@ -19,6 +19,7 @@ from tomo_polysplat.model.seed_samples import box_mean, widened
 from tomo_polysplat.physics.base_materials import Materials
 from tomo_polysplat.physics.materials import MaterialLike, known_density
 from tomo_polysplat.physics.solids import number_of_solid
+from tomo_polysplat.physics.spectrum import Spectrum
 from tomo_polysplat.physics.water import transmitted_energy
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.decision import Decision, Known, is_number
@@ -64,6 +65,8 @@ _ALIKE_VOXELS, _ABOVE_NOISE, _UPPER = 3, 3.0, 0.75
 # Water is taken after all where so large a share of the matter has about its density, all around it too, which edges of
 # pores have not: marrow in bone of 192^3, measured by bone, left 0.91 of bone's contrast, by water 0.99 (one seed).
 _LIKE_WATER, _SOFT_INSIDE = (0.6, 1.6), 0.05
+# From this number on, half way from aluminium to titanium, dense matter around soft matter is a metal pipe, no bone.
+_METAL = 0.52
 # Material number of main matter that is not the first of curves of which nothing is known.
 _BETWEEN = 0.3
 
@@ -136,14 +139,14 @@ def soft_reference(
         why = f"soft matter: half of the object's mass is at most {level:.3g} times as dense"
         return Reference(first, first, settings.soft_u, why, level=level)
     if _holds_soft_matter(relative, settings):
-        why = f"soft matter: it lies within what is {main:.3g} times as dense"
-        return Reference(first, first, settings.soft_u, why, dense=main)
+        metal = _number_of(main * first, problem, problem.spectrum) >= _METAL
+        why = f"soft matter: it lies within {'metal that' if metal else 'what'} is {main:.3g} times as dense"
+        return Reference(first, first, settings.soft_u, why, dense=0.0 if metal else main)
     value, number = main * first, _BETWEEN
     if settings.soft_u or settings.curves == 1:  # Asked for, or the first curve is to do for all there is.
         number = settings.soft_u
     elif problem.materials == Materials():
-        some = problem.projections[:: -(-len(problem.projections) // _VIEWS)]
-        number = float(number_of_solid(value, transmitted_energy(some, problem.spectrum)))
+        number = _number_of(value, problem, problem.spectrum)
     why = f"the object's main matter, as there is nothing like soft matter; material number {number:.2f}"
     return Reference(value, first, number, why)
 
@@ -194,6 +197,12 @@ def _holds_soft_matter(relative: torch.Tensor, settings: Settings) -> bool:
     edges = widened((relative > settings.bone_level) | (mean < _MATTER), 1)
     soft = (mean > _LIKE_WATER[0]) & (mean < _LIKE_WATER[1]) & ~edges
     return int(soft.sum()) > _SOFT_INSIDE * int((relative > _MATTER).sum())
+
+
+def _number_of(value: float, problem: Problem, spectrum: Spectrum) -> float:
+    """Material number of a solid of so many g/cm3 of water, by the energy that is transmitted."""
+    some = problem.projections[:: -(-len(problem.projections) // _VIEWS)]
+    return float(number_of_solid(value, transmitted_energy(some, spectrum)))
 
 
 def _first_density(material: MaterialLike, level: float) -> float:
