@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+import torch
 
 from tomo_polysplat.fit.long_object import long_object
+from tomo_polysplat.fit.problem import Problem
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid
 from tomo_polysplat.start.orbit import find_turns
 
@@ -112,3 +114,17 @@ def test_nothing_at_all_is_no_long_object():
     values = np.full((geometry.views, geometry.rows, geometry.columns), np.nan, np.float32)
     long = long_object(values, geometry, GRID, find_turns(geometry)[0])
     assert (long.lower, long.upper) == (-0.5, 0.5) and not long.missed.any()
+
+
+@pytest.mark.parametrize("narrow", [False, True])
+def test_a_long_object_that_is_wider_than_the_volume_is_warned_of(narrow, caplog):
+    """What goes on above and below is fitted; what a narrow volume leaves out on its sides is not."""
+    geometry = scanner("cone", 0.9)
+    values = 0.02 * of_cylinder(points(geometry), -9.0, 9.0).sum(axis=0).astype(np.float32)
+    side = 0.4 if narrow else 1.0
+    grid = VolumeGrid((8, 11, 11), [-side, -side, -0.5], [side, side, 0.5])
+    problem = Problem.of(values, geometry, grid, "cm", None, None, surroundings=0.5)
+    closed, words = problem.closed(torch.device("cpu"))
+    assert problem.margin[0] and not any(problem.margin[2:])
+    assert not closed and "longer than the volume" in words
+    assert ("reaches beyond the volume: rays next to it see matter" in caplog.text) == narrow

@@ -335,11 +335,12 @@ class Problem:
     def closed(self, device: torch.device) -> tuple[bool, str]:
         """Whether no matter lies beside the volume, and words that say so."""
         if self._known.closed is None:
-            self._known.closed = (
-                (False, self.surroundings)
-                if self.surroundings
-                else matter_is_inside(self._copied(device), self.geometry, self.grid)
-            )
+            closed, words = False, self.surroundings
+            # What goes on above and below may be all that is wanted less of; matter beside the volume is told of.
+            if not any(self.margin[2:]):
+                closed, inside = matter_is_inside(self._copied(device), self.geometry, self.grid)
+                closed, words = (False, words) if words else (closed, inside)
+            self._known.closed = closed, words
         return self._known.closed
 
     def dimmed(self, device: torch.device) -> torch.Tensor | None:
