@@ -53,6 +53,17 @@ def test_ssim_falls_with_noise_and_takes_a_slice_as_an_image():
     assert compare(truth[0] + 0.05 * noise[0], truth[0])["ssim"] == pytest.approx(scores[1])
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_ssim_of_two_slices_is_their_mean(axis):
+    rng = np.random.default_rng(3)
+    truth, noise = np.abs(rng.normal(size=(2, 2, 9, 11)))
+    volume = truth + np.array([0.05, 0.4])[:, None, None] * noise
+    truth[0, 0, 0] = truth[1, 0, 0] = 4.0  # the same range in both
+    alone = [compare(volume[k], truth[k])["ssim"] for k in (0, 1)]
+    both = compare(np.moveaxis(volume, 0, axis), np.moveaxis(truth, 0, axis))
+    assert both["ssim"] == pytest.approx(np.mean(alone)) and alone[0] > alone[1]
+
+
 def test_what_does_not_depend_on_the_unit():
     truth = cube()
     volume = truth + np.random.default_rng(2).normal(0, 0.05, truth.shape)
@@ -69,7 +80,7 @@ def test_what_does_not_depend_on_the_unit():
         (np.full((3, 4, 5), np.nan), np.ones((3, 4, 5)), None, "finite"),
         (np.ones((3, 4, 5)), np.ones((3, 4, 5)), np.ones((3, 4, 5), bool), "not metal"),
         (np.ones((3, 4, 5)), np.zeros((3, 4, 5)), None, "positive largest value"),
-        (np.ones((2, 4, 5)), np.ones((2, 4, 5)), None, "at least 3 voxels"),
+        (np.ones((2, 2, 5)), np.ones((2, 2, 5)), None, "at least 3 voxels"),
     ],
 )
 def test_what_cannot_be_compared_is_refused(volume, truth, metal, message):

@@ -71,9 +71,13 @@ def psnr(error: np.ndarray, span: float) -> float:
 def ssim(volume: np.ndarray, truth: np.ndarray, span: float) -> float:
     """Structural similarity (Wang et al. 2004, doi:10.1109/TIP.2003.819861) over 7-voxel windows.
 
-    Axes of one voxel are dropped, and the window shrinks to the largest odd size that fits.
+    Axes of one voxel are dropped, and the window shrinks to the largest odd size that fits. Of two slices, which no
+    window of three dimensions fits, it is the mean.
     """
     volume, truth = np.squeeze(volume).astype(np.float64), np.squeeze(truth).astype(np.float64)
+    if truth.ndim == 3 and 2 in truth.shape:
+        pair = truth.shape.index(2)
+        return float(np.mean([ssim(volume.take(k, pair), truth.take(k, pair), span) for k in (0, 1)]))
     smallest = min(truth.shape, default=1)
     window = min(7, smallest - 1 + smallest % 2)
     if window < 3:
