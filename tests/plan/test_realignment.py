@@ -132,7 +132,7 @@ def test_what_is_left_of_a_roll_that_was_made_needs_not_be_sure(first_told, roll
     """Two standard errors tell that there is one. How large it is, is told best by where no more is left."""
     told = iter([first_told, -0.1, 0.0])
     many = np.zeros((2, VIEWS, 4, 4))
-    sums = MoveSums(many, many[..., 0], np.ones(VIEWS))
+    sums = MoveSums(many, many[..., 0], np.ones(VIEWS), rows=1.0)
     monkeypatch.setattr(realignment, "move_sums", lambda *_: sums)
     monkeypatch.setattr(realignment, "falls_of", lambda *_: None)
     monkeypatch.setattr(

@@ -46,7 +46,7 @@ class MoveSums:
     normal: np.ndarray
     told: np.ndarray
     held_out: np.ndarray
-    rows: float = 1.0
+    rows: float
 
 
 def move_sums(

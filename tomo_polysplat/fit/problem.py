@@ -335,11 +335,11 @@ class Problem:
     def closed(self, device: torch.device) -> tuple[bool, str]:
         """Whether no matter lies beside the volume, and words that say so."""
         if self._known.closed is None:
-            closed, words = False, self.surroundings
-            # What goes on above and below may be all that is wanted less of; matter beside the volume is told of.
+            closed, words = not self.surroundings, self.surroundings
+            # Of matter beside the volume the log warns, also where what lies above and below is fitted.
             if not any(self.margin[2:]):
-                closed, inside = matter_is_inside(self._copied(device), self.geometry, self.grid)
-                closed, words = (False, words) if words else (closed, inside)
+                inside, why = matter_is_inside(self._copied(device), self.geometry, self.grid)
+                closed, words = closed and inside, words or why
             self._known.closed = closed, words
         return self._known.closed
 

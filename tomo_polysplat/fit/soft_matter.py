@@ -8,6 +8,7 @@ not depend on how deep it lies. A number too high makes the inside look denser t
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -167,4 +168,4 @@ def _coarse(box: VoxelBox) -> VoxelBox:
     """The volume at no more than so many points an axis, each a voxel's centre."""
     step = [-(-n // _POINTS) for n in box.shape]
     nz, ny, nx = (-(-n // k) for n, k in zip(box.shape, step))
-    return VoxelBox(box.first, box.spacing * np.array(step[::-1]), (nz, ny, nx), box.whole, box.levels)
+    return replace(box, spacing=box.spacing * np.array(step[::-1]), shape=(nz, ny, nx))

@@ -195,9 +195,7 @@ def _reached(gaussians: Gaussians, box: VoxelBox) -> tuple[tuple[int, int, int],
 
 def voxelise_peaks(gaussians: Gaussians, weights: torch.Tensor, box: VoxelBox, kernel: str) -> torch.Tensor:
     """(channels, nz, ny, nx) largest sum of the Gaussians at points in each voxel; not differentiable."""
-    fine = np.full(3, _PEAK_SAMPLES)
-    if gaussians.planar or box.levels:
-        fine[0] = 1 if gaussians.planar else box.levels
+    fine = _at_heights_of_rays(np.full(3, _PEAK_SAMPLES), box, planar=gaussians.planar)
     volume = weights.new_empty((len(weights), *box.shape))
     for where, peaks in _of_samples(gaussians, weights, box, kernel, fine, torch.amax):
         volume[where] = peaks
@@ -229,7 +227,10 @@ def _of_samples(
 def _samples(box: VoxelBox, thinnest: float, *, planar: bool) -> np.ndarray:
     """(z, y, x) samples per voxel for Gaussians whose least deviation is ``thinnest``."""
     needed = np.ceil(box.spacing[::-1] / (_SAMPLE_STEP * thinnest) - _ROUNDING)
-    counts = np.clip(needed, _SAMPLES[0], _SAMPLES[-1]).astype(int)
-    if planar or box.levels:
-        counts[0] = 1 if planar else box.levels
-    return counts
+    return _at_heights_of_rays(np.clip(needed, _SAMPLES[0], _SAMPLES[-1]).astype(int), box, planar=planar)
+
+
+def _at_heights_of_rays(counts: np.ndarray, box: VoxelBox, *, planar: bool) -> np.ndarray:
+    """(z, y, x) samples per voxel, those along z at the heights of rays where these are all that is measured."""
+    levels = 1 if planar else box.levels
+    return np.array([levels, *counts[1:]]) if levels else counts
