@@ -166,17 +166,18 @@ def test_each_way_has_steps_enough_to_get_used_to_it_but_no_more_than_a_fifth_of
 
 
 @pytest.mark.parametrize(
-    ("left", "passes"), [((1.5, 1.45), 2), ((1.0, 1.05), 2), ((1.5, 1.35, 1.35), 3), ((1.4, 1.3, 1.2), 3)]
+    ("left", "passes"), [((1.5, 1.45), 2), ((1.1, 1.12), 2), ((1.5, 1.35, 1.35), 3), ((1.4, 1.3, 1.2), 3)]
 )
 def test_no_pass_is_made_that_would_have_to_change_more_than_the_last_one_did(monkeypatch, left, passes):
     (answer, _, _), asked = passes_asked(monkeypatch, left, steps=24)
     assert asked == 2 * passes * [1] and answer.value == (2 if left[-1] < 1.25 else 1)
 
 
-def test_one_pass_each_way_is_enough_where_averaged_light_leaves_far_more(monkeypatch):
-    (answer, run, fitter), asked = passes_asked(monkeypatch, (2.0,))
-    assert asked == [1, 1]
-    assert answer.value == 1 and run.fitter is fitter and run.made == (0.2, 0.3, 1)
+@pytest.mark.parametrize(("left", "averaged"), [(2.0, False), (1.0, True)])
+def test_one_pass_each_way_is_enough_where_its_share_is_far_from_the_limit(monkeypatch, left, averaged):
+    (answer, run, fitter), asked = passes_asked(monkeypatch, (left,))
+    assert asked == [1, 1] and run.made == (0.2, 0.3, 1)
+    assert answer.value == (2 if averaged else 1) and (run.fitter is fitter) is not averaged
 
 
 def test_a_run_resumed_around_the_question_is_the_uninterrupted_one(tmp_path, monkeypatch):
