@@ -15,11 +15,16 @@ from tomo_polysplat.fit.loss import (
     slope_of_variation,
     total_variation,
     variation_of_slab,
-    weighted_huber,
-    weighted_l1,
 )
 from tomo_polysplat.kernels.step.faint import HALO
 from tomo_polysplat.settings import Settings
+
+L1 = Settings(loss="l1")
+
+
+def huber(width):
+    """Settings of Huber's loss with its corner at this residual of a ray of weight 1."""
+    return replace(Settings(loss="huber"), huber_corner=1.0, model_error=width)
 
 
 def uneven(seed=0, count=37):
@@ -28,26 +33,26 @@ def uneven(seed=0, count=37):
     return predicted, measured, torch.rand((3, 5, count), generator=generator, dtype=torch.float64) + 0.1
 
 
-def test_weighted_l1_is_the_weighted_mean_of_absolute_residuals():
+def test_l1_is_the_weighted_mean_of_absolute_residuals():
     predicted, measured, weight = uneven()
     expected = np.average((predicted - measured).abs().numpy(), weights=weight.numpy())
-    assert float(weighted_l1(predicted, measured, weight)) == pytest.approx(expected, rel=1e-12)
+    assert float(misfit(predicted, measured, weight, L1)) == pytest.approx(expected, rel=1e-12)
 
 
 def test_a_constant_factor_of_all_weights_changes_nothing_for_l1():
     predicted, measured, weight = uneven()
-    once, thrice = (float(weighted_l1(predicted, measured, k * weight)) for k in (1, 3))
+    once, thrice = (float(misfit(predicted, measured, k * weight, L1)) for k in (1, 3))
     assert once == pytest.approx(thrice, rel=1e-12)
 
 
-@pytest.mark.parametrize("loss", [weighted_l1, lambda p, m, w: weighted_huber(p, m, w, 0.1)])
-def test_rays_without_weight_do_not_count(loss):
+@pytest.mark.parametrize("settings", [L1, huber(0.1)])
+def test_rays_without_weight_do_not_count(settings):
     predicted, measured, weight = uneven()
     weight[1] = 0
-    expected = loss(predicted[[0, 2]], measured[[0, 2]], weight[[0, 2]])
+    expected = misfit(predicted[[0, 2]], measured[[0, 2]], weight[[0, 2]], settings)
     predicted[1] = 1e30
-    assert float(loss(predicted, measured, weight)) == pytest.approx(float(expected), rel=1e-12)
-    assert float(loss(predicted, measured, 0 * weight)) == 0
+    assert float(misfit(predicted, measured, weight, settings)) == pytest.approx(float(expected), rel=1e-12)
+    assert float(misfit(predicted, measured, 0 * weight, settings)) == 0
 
 
 def test_huber_is_quadratic_within_the_corner_and_absolute_far_beyond():
@@ -55,9 +60,9 @@ def test_huber_is_quadratic_within_the_corner_and_absolute_far_beyond():
     corner = width / 0.5
     zero = torch.zeros(1, dtype=torch.float64)
     for residual in (0.01, 0.5 * corner, 0.999 * corner):
-        value = float(weighted_huber(zero + residual, zero, weight, width))
+        value = float(misfit(zero + residual, zero, weight, huber(width)))
         assert value == pytest.approx(0.5 * (0.5 * residual) ** 2 / width / 0.5, rel=1e-9)
-    far = float(weighted_huber(zero + 1e4, zero, weight, width))
+    far = float(misfit(zero + 1e4, zero, weight, huber(width)))
     assert far == pytest.approx(1e4, rel=1e-4), "the weighted mean of absolute residuals"
 
 
@@ -66,23 +71,15 @@ def test_huber_and_its_slope_are_continuous_at_the_corner():
     slopes = []
     for residual in (0.15 - 1e-9, 0.15 + 1e-9):
         x = torch.tensor([residual], dtype=torch.float64, requires_grad=True)
-        weighted_huber(x, torch.zeros_like(x), weight, width).backward()
+        misfit(x, torch.zeros_like(x), weight, huber(width)).backward()
         slopes.append(float(x.grad))
     assert slopes[0] == pytest.approx(slopes[1], rel=1e-6) == pytest.approx(1.0, rel=1e-6)
 
 
 def test_huber_tends_to_l1_as_its_corner_goes_to_zero():
     predicted, measured, weight = uneven()
-    sharp = float(weighted_huber(predicted, measured, weight, 1e-9))
-    assert sharp == pytest.approx(float(weighted_l1(predicted, measured, weight)), rel=1e-6)
-
-
-def test_the_settings_choose_the_loss():
-    rays = uneven()
-    corner = Settings().huber_corner * Settings().model_error
-    assert misfit(*rays, Settings(loss="huber")) == weighted_huber(*rays, corner)
-    assert misfit(*rays, Settings(loss="l1")) == weighted_l1(*rays)
-    assert misfit(*rays, Settings(loss="huber")) != misfit(*rays, Settings(loss="l1"))
+    sharp = float(misfit(predicted, measured, weight, huber(1e-9)))
+    assert sharp == pytest.approx(float(misfit(predicted, measured, weight, L1)), rel=1e-6)
 
 
 @pytest.mark.parametrize("loss", ["huber", "l1"])

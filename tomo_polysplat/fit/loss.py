@@ -16,6 +16,7 @@ from tomo_polysplat.settings import Settings
 
 __all__ = [
     "away_from_edges",
+    "losses",
     "misfit",
     "misfit_by_view",
     "misfits_of_step",
@@ -23,8 +24,6 @@ __all__ = [
     "slope_of_variation",
     "total_variation",
     "variation_of_slab",
-    "weighted_huber",
-    "weighted_l1",
 ]
 
 
@@ -40,9 +39,22 @@ def misfit(
     dims: tuple[int, ...] | None = None,
 ) -> torch.Tensor:
     """The loss of the rays that the settings name: the mean over all, or over the axes ``dims``."""
-    if settings.loss == "huber":
-        return weighted_huber(predicted, measured, weight, settings.huber_corner * settings.model_error, dims)
-    return weighted_l1(predicted, measured, weight, dims)
+    return losses(predicted, measured, weight, settings).sum(dims) / weight.sum(dims).clamp(min=1e-12)
+
+
+def losses(
+    predicted: torch.Tensor, measured: torch.Tensor, weight: torch.Tensor, settings: Settings
+) -> torch.Tensor:
+    """That of each ray times its weight; `misfit` is their sum over that of the weights, 0 when every weight is 0.
+
+    ``w |p - m|``, or Huber's function (1964, doi:10.1214/aoms/1177703732), which counts residuals squared where noise
+    explains them and absolute beyond, with its corner at the same multiple of each ray's deviation.
+    """
+    scaled = (predicted - measured).abs() * weight
+    if settings.loss != "huber":
+        return scaled
+    width = settings.huber_corner * settings.model_error
+    return torch.where(scaled < width, scaled.square() / (2 * width), scaled - 0.5 * width)
 
 
 def misfits_of_step(
@@ -96,33 +108,6 @@ def misfit_by_view(
     """(views,) that of each view of (views, rows, columns); NaN where no ray of a view has weight."""
     means = misfit(predicted, measured, weight, settings, _OF_VIEW)
     return torch.where(weight.amax(_OF_VIEW) > 0, means, torch.nan)
-
-
-def weighted_l1(
-    predicted: torch.Tensor,
-    measured: torch.Tensor,
-    weight: torch.Tensor,
-    dims: tuple[int, ...] | None = None,
-) -> torch.Tensor:
-    r"""Weighted mean of the absolute residuals, ``sum w |p - m| / sum w``; 0 when every weight is 0."""
-    return ((predicted - measured).abs() * weight).sum(dims) / weight.sum(dims).clamp(min=1e-12)
-
-
-def weighted_huber(
-    predicted: torch.Tensor,
-    measured: torch.Tensor,
-    weight: torch.Tensor,
-    width: float,
-    dims: tuple[int, ...] | None = None,
-) -> torch.Tensor:
-    """Weighted mean of residuals that count squared where noise explains them and absolute beyond.
-
-    Huber's function (1964, doi:10.1214/aoms/1177703732) with its corner at ``width / weight``, so at the same
-    multiple of each ray's deviation.
-    """
-    scaled = (predicted - measured).abs() * weight
-    value = torch.where(scaled < width, scaled.square() / (2 * width), scaled - 0.5 * width)
-    return value.sum(dims) / weight.sum(dims).clamp(min=1e-12)
 
 
 def pull_of_roughness(

@@ -9,9 +9,9 @@ from tomo_polysplat.nuisances.nuisance import Found, Nuisance, Parameter, Place,
 
 __all__ = ["PixelLight"]
 
-# Light is averaged where that leaves at most so much of the misfit of the rays at metal: a fit makes up for most of
-# what it does not model (docs/decisions/pixel_rays.md).
-_AS_WELL = 1.28
+# Light is averaged where that leaves at most so much of the misfit of the rays that it changes: a fit makes up for most
+# of what it does not model (docs/decisions/pixel_rays.md).
+_AS_WELL = 1.4
 
 
 class PixelLight(Nuisance):
@@ -28,11 +28,11 @@ class PixelLight(Nuisance):
 
     @classmethod
     def gate(cls, evidence: Mapping[str, float]) -> Verdict:
-        """By the ``share`` of the misfit of the rays at metal that averaged light leaves."""
+        """By the ``share`` of the misfit of the rays that it changes that averaged light leaves."""
         share = evidence["share"]
         kept = share <= _AS_WELL
         kind = "the light of each pixel is averaged" if kept else "rays are infinitely thin"
-        words = f"averaged light leaves {share:.2f} of the misfit of the rays at metal, and is taken up to"
+        words = f"averaged light leaves {share:.2f} of the misfit of the rays that it changes, and is taken up to"
         return Verdict(kept, f"{kind}; {words} {_AS_WELL:g}")
 
     @classmethod

@@ -12,7 +12,7 @@ Light is spread before the logarithm, and -log of mixed light is less than this:
 
 .. math:: P'_k = -\log \sum_j A_{kj} \exp(-P_j)
 
-So it is where the rays at metal show that pixels average light. Elsewhere the blur is that of P: mixed light can hide
+So it is where the rays show that pixels average light. Elsewhere the blur is that of P: mixed light can hide
 any amount of metal at the edges of opaque metal, and a model of thin rays that mixes it adds metal where that mends
 another error of its edges (docs/decisions/detector_blur.md).
 """

@@ -164,7 +164,7 @@ def _evidence(
 ) -> dict[str, float]:
     """How much better the held-out rays are explained, each with what was found and without any.
 
-    The misfit is Huber's, with the corner that the fit has (`fit.loss.weighted_huber`).
+    The misfit is Huber's, with the corner that the fit has (`fit.loss.losses`).
     """
     rays, rms = len(sums.residual), float(np.sqrt(np.mean(found**2)))
     if rays < _FEWEST_RAYS:

@@ -69,7 +69,7 @@ def judge(outcome: FitOutcome, prepared: PreparedFit, problem: Problem, run_opti
     found = _misses(outcome.gaussians, replace(prepared, scene=scene), problem, run_options)
     first = plan.facts["rays_at_start"].value if "rays_at_start" in plan.facts else math.inf
     left = _left(found, first if is_number(first, 0.0) else math.inf)
-    words = f"{found.describe()}, and {left:.2g} of the first Gaussians' misfit is left"
+    words = f"{found.describe()}, and {f'{left:.2g}' if left else 'nothing'} of the first Gaussians' misfit is left"
     if far := found.allowed > _FAR:
         words += f"; that is {found.allowed:.2g} times what noise and the model's usual error come to"
         spectrum = (

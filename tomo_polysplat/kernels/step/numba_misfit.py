@@ -95,7 +95,7 @@ def misfit_sums(
     rays : four float32 tensors
         Predicted, measured, weights of the fitted and of those held out; of one shape.
     width : float
-        As `fit.loss.weighted_huber` takes it; 0 for absolute residuals.
+        As `fit.loss.losses` takes it; 0 for absolute residuals.
 
     Returns
     -------

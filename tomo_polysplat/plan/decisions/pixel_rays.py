@@ -2,28 +2,27 @@
 
 Real pixels do, and simulators that send several rays through each; others send one. Who is wrong about it puts up to
 a third too little metal there, or a quarter too much. At first a fit is too rough to tell: later the run is
-made both ways for a few passes over the views, and goes on as it explains the rays at metal.
+made both ways for a few passes over the views, and goes on as it explains the rays that averaging changes.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 
 from tomo_polysplat.fit.fitter import Fitter
 from tomo_polysplat.fit.fork import fork, passes_of_a_fork, why_no_fork
-from tomo_polysplat.fit.loss import misfit
+from tomo_polysplat.fit.loss import losses
 from tomo_polysplat.fit.rays import batches_around
-from tomo_polysplat.kernels.views import DetectorViews
 from tomo_polysplat.nuisances.pixel_light import PixelLight
 from tomo_polysplat.plan.answer import Answer, Status
 from tomo_polysplat.plan.decision import Decision, Known, When
 from tomo_polysplat.plan.decisions.passes import Passes
 from tomo_polysplat.plan.first_gaussians import AVERAGED_RAYS, why_one_run
 from tomo_polysplat.plan.lab import Lab, Untold
-from tomo_polysplat.render.renderer import project_gaussians
 
 __all__ = ["PixelRays"]
 
@@ -32,13 +31,13 @@ logger = logging.getLogger(__name__)
 # Share of the run after which it is asked, and the steps of each way, but for more than this share of the run: the
 # first ones are spent on getting used to it.
 _FROM, _STEPS, _MOST = 0.4, 60, 0.2
-# So little or so much left after one pass is enough: what began at 1.06 or less, 18 scans, ended at 1.17 at most; of
-# averaged light it was 1.7 and more in three of 67 (docs/decisions/pixel_rays.md).
-_SURELY_AVERAGED, _SURELY_THIN = 1.06, 1.7
+# So little or so much left after one pass is enough (docs/decisions/pixel_rays.md).
+_SURELY_AVERAGED, _SURELY_THIN = 1.15, 2.4
 # Factor of the time of a step, at most, where light is averaged over two rays a pixel and axis.
 _SLOWER = 4.0
-# Rays at metal: they and their neighbours see this share of the most metal that any does.
-_SEEN = 0.05
+# A ray counts by this power of what averaging changes in it, in its deviations, up to so many: what changes less than
+# its noise tells nothing, and a few opaque rays are not to decide alone.
+_POWER, _ENOUGH = 4, 6.0
 
 
 class PixelRays(Decision):
@@ -71,7 +70,7 @@ class PixelRays(Decision):
         return why or why_one_run(len(lab.gaussians), lab.plan, lab.problem, lab.device)
 
     def ask(self, known: Known, lab: Lab) -> Answer:
-        """The run is made both ways for some passes, and goes on as it explains the rays at metal."""
+        """The run is made both ways for some passes, and goes on as it explains the rays that averaging changes."""
         run = lab.run
         assert run is not None
         if not run.clock.allows(_SLOWER):
@@ -81,7 +80,7 @@ class PixelRays(Decision):
         shares: list[float] = []
 
         def settled() -> bool:
-            shares.append(_share([fitter, other]))
+            shares.append(_share(fitter, other))
             return _is_settled(shares)
 
         passes = passes_of_a_fork(fitter, known[Passes], _STEPS, _MOST)
@@ -111,32 +110,19 @@ def _is_settled(shares: Sequence[float]) -> bool:
     return PixelLight.margin(shares[-1]) > abs(shares[-1] - shares[-2])
 
 
-def _share(fitters: Sequence[Fitter]) -> float:
-    """What the second leaves of the misfit that the first leaves of the rays at metal."""
-    left = _misfits_at_metal(fitters)
-    return left[1] / left[0] if left[0] else float("inf")
-
-
 @torch.no_grad()
-def _misfits_at_metal(fitters: Sequence[Fitter]) -> list[float]:
-    """Mean misfit of the fitted rays that meet the first one's metal, and of their neighbours."""
-    one, totals, weighed = fitters[0], [0.0 for _ in fitters], 0.0
-    for views, measured, weight, _ in batches_around(one.rays):
-        weight = weight * _at_metal(one, views)
-        sum_of_weights = float(weight.sum())
-        weighed += sum_of_weights
-        for k, fitter in enumerate(fitters):
-            predicted, _ = fitter.scene.projections(fitter.gaussians, views)
-            totals[k] += sum_of_weights * float(misfit(predicted, measured, weight, fitter.settings))
-    return [total / weighed if weighed else 0.0 for total in totals]
+def _share(thin: Fitter, averaged: Fitter) -> float:
+    """What averaged light leaves of the misfit that thin rays leave.
 
-
-def _at_metal(fitter: Fitter, views: DetectorViews) -> torch.Tensor:
-    """(views, rows, columns) whether a ray meets metal, or one beside it does."""
-    gaussians, scene = fitter.gaussians, fitter.scene
-    metal = torch.where(gaussians.group > 0, gaussians.attenuation, 0.0)
-    seen, _ = project_gaussians(gaussians, metal[None], views, scene.kernel)
-    met = (seen > _SEEN * seen.max()).to(seen.dtype)
-    reach = (min(views.rows, 3), min(views.columns, 3))
-    padding = (reach[0] // 2, reach[1] // 2)
-    return torch.nn.functional.max_pool2d(met, reach, 1, padding)[0, :, : views.rows, : views.columns]
+    Only fitted rays that averaging changes by more than their noise count much.
+    """
+    as_thin = replace(averaged.scene, pixel_rays=1)
+    left = [0.0, 0.0]
+    for views, measured, weight, _ in batches_around(thin.rays):
+        by_thin, _ = thin.scene.projections(thin.gaussians, views)
+        by_averaged, _ = averaged.scene.projections(averaged.gaussians, views)
+        changed = (by_averaged - as_thin.projections(averaged.gaussians, views)[0]) * weight
+        told = (changed / (_ENOUGH * thin.settings.model_error)).abs().clamp(max=1.0) ** _POWER
+        for k, predicted in enumerate((by_thin, by_averaged)):
+            left[k] += float((told * losses(predicted, measured, weight, thin.settings)).sum())
+    return left[1] / left[0] if left[0] else float("inf")
