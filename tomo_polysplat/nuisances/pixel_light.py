@@ -32,7 +32,9 @@ class PixelLight(Nuisance):
         share = evidence["share"]
         kept = share <= _AS_WELL
         kind = "the light of each pixel is averaged" if kept else "rays are infinitely thin"
-        words = f"averaged light leaves {share:.2f} of the misfit of the rays that it changes, and is taken up to"
+        words = (
+            f"averaged light leaves {share:.2f} of the misfit of the rays that it changes, and is taken up to"
+        )
         return Verdict(kept, f"{kind}; {words} {_AS_WELL:g}")
 
     @classmethod
