@@ -24,7 +24,7 @@ L1 = Settings(loss="l1")
 
 def huber(width):
     """Settings of Huber's loss with its corner at this residual of a ray of weight 1."""
-    return replace(Settings(loss="huber"), huber_corner=1.0, model_error=width)
+    return replace(Settings(loss="huber"), huber_corner=2.0, model_error=width / 2)
 
 
 def uneven(seed=0, count=37):
@@ -80,6 +80,13 @@ def test_huber_tends_to_l1_as_its_corner_goes_to_zero():
     predicted, measured, weight = uneven()
     sharp = float(misfit(predicted, measured, weight, huber(1e-9)))
     assert sharp == pytest.approx(float(misfit(predicted, measured, weight, L1)), rel=1e-6)
+
+
+def test_the_settings_choose_the_loss():
+    rays = uneven()
+    corner = Settings().huber_corner * Settings().model_error
+    assert misfit(*rays, Settings(loss="huber")) == misfit(*rays, huber(corner))
+    assert misfit(*rays, Settings(loss="huber")) != misfit(*rays, L1)
 
 
 @pytest.mark.parametrize("loss", ["huber", "l1"])

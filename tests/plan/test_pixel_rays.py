@@ -1,6 +1,6 @@
 """Whether pixels average their light: scans of one ray a pixel and of several, and when nobody needs to ask."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, partial
 from types import SimpleNamespace
 
@@ -190,30 +190,23 @@ def test_a_run_resumed_around_the_question_is_the_uninterrupted_one(tmp_path, mo
         assert_same(resumed_after(share, run, tmp_path / f"{share}.npz"), whole, share)
 
 
-@dataclass(frozen=True)
-class Seen:
-    """A forward model whose rays are known."""
-
-    rays: torch.Tensor
-    without: torch.Tensor | None = None
-    pixel_rays: int = 2
-
-    def projections(self, gaussians, views):
-        return (self.rays if self.pixel_rays > 1 or self.without is None else self.without), 0
+def way(kind, **rays):
+    """One way of a run, whose Gaussians are known by the rays that either kind of light makes of them."""
+    scene = SimpleNamespace(projections=lambda gaussians, views: (gaussians[kind], 0))
+    return SimpleNamespace(
+        scene=scene, gaussians=rays, rays=None, settings=Settings(loss="l1", model_error=0.01)
+    )
 
 
 def test_rays_count_by_what_averaging_changes_in_them(monkeypatch):
     """Those that it leaves alone not at all, and those far beyond their noise all alike."""
-    one, error = torch.ones(1, 1, 4), 0.01
-    settings = Settings(loss="l1", model_error=error)
+    one = torch.ones(1, 1, 4)
     measured, changes = 2.0 * one, torch.tensor([0.0, 3.0, 6.0, 600.0])
     averaged, residuals = measured + 0.1, torch.tensor([9.0, 0.4, 0.2, 0.3])
-    told = [
-        SimpleNamespace(scene=Seen(measured + residuals), gaussians=None, settings=settings, rays=None),
-        SimpleNamespace(scene=Seen(averaged, averaged - error * changes), gaussians=None, settings=settings),
-    ]
+    thin = way("thin", thin=measured + residuals)
+    other = way("averaged", thin=averaged - thin.settings.model_error * changes, averaged=averaged)
     batch = None, measured, one, None
     monkeypatch.setattr(pixel_rays, "batches_around", lambda rays: [batch])
     counts = np.array([0.0, 0.5**4, 1.0, 1.0])
     expected = 0.1 * counts.sum() / (counts @ residuals.numpy())
-    assert pixel_rays._share(*told) == pytest.approx(expected, rel=1e-4)
+    assert pixel_rays._share(thin, other) == pytest.approx(expected, rel=1e-4)

@@ -16,6 +16,7 @@ import torch
 
 from tomo_polysplat.fit.adam import EPSILON, new_moments
 from tomo_polysplat.fit.feed import feed
+from tomo_polysplat.fit.loss import huber_width
 from tomo_polysplat.fit.setup import FitSetup
 from tomo_polysplat.fit.shares import Part
 from tomo_polysplat.fit.step import (
@@ -141,7 +142,6 @@ class FusedStep:
 
     def _measure(self) -> Measurement:
         rays, scene, settings = self.rays, self.scene, self.settings
-        corner = settings.huber_corner * settings.model_error if settings.loss == "huber" else 0.0
         nodes = None
         if scene.quadrature is not None:
             nodes = nodes_on(scene.quadrature, torch.float32, rays.target)
@@ -150,7 +150,7 @@ class FusedStep:
             rays.totals,
             rays.noise,
             rays.threshold,
-            corner,
+            huber_width(settings),
             scene.areal_scale,
             nodes,
             *self._filters(),

@@ -16,6 +16,7 @@ from tomo_polysplat.settings import Settings
 
 __all__ = [
     "away_from_edges",
+    "huber_width",
     "losses",
     "misfit",
     "misfit_by_view",
@@ -50,11 +51,15 @@ def losses(
     ``w |p - m|``, or Huber's function (1964, doi:10.1214/aoms/1177703732), which counts residuals squared where noise
     explains them and absolute beyond, with its corner at the same multiple of each ray's deviation.
     """
-    scaled = (predicted - measured).abs() * weight
-    if settings.loss != "huber":
+    scaled, width = (predicted - measured).abs() * weight, huber_width(settings)
+    if not width:
         return scaled
-    width = settings.huber_corner * settings.model_error
     return torch.where(scaled < width, scaled.square() / (2 * width), scaled - 0.5 * width)
+
+
+def huber_width(settings: Settings) -> float:
+    """Residual times weight from which on a ray counts absolute; 0 where all do."""
+    return settings.huber_corner * settings.model_error if settings.loss == "huber" else 0.0
 
 
 def misfits_of_step(
@@ -66,8 +71,7 @@ def misfits_of_step(
 ) -> tuple[torch.Tensor, torch.Tensor | float, torch.Tensor | float]:
     """`misfit` of the fitted rays, differentiable; that of those held ``aside``, times their weight, and this."""
     if is_for_compiled(predicted):
-        width = settings.huber_corner * settings.model_error if settings.loss == "huber" else 0.0
-        return _Misfits.apply(predicted, measured, weight, aside, width)
+        return _Misfits.apply(predicted, measured, weight, aside, huber_width(settings))
     fitted = misfit(predicted, measured, weight, settings)
     with torch.no_grad():
         total = aside.sum()

@@ -28,7 +28,7 @@ class PixelLight(Nuisance):
 
     @classmethod
     def gate(cls, evidence: Mapping[str, float]) -> Verdict:
-        """By the ``share`` of the misfit of the rays that it changes that averaged light leaves."""
+        """By the ``share`` that averaged light leaves of the misfit of the rays that it changes."""
         share = evidence["share"]
         kept = share <= _AS_WELL
         kind = "the light of each pixel is averaged" if kept else "rays are infinitely thin"

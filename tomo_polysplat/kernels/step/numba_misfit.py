@@ -95,7 +95,7 @@ def misfit_sums(
     rays : four float32 tensors
         Predicted, measured, weights of the fitted and of those held out; of one shape.
     width : float
-        Residual times weight from which on Huber's function (`fit.loss.losses`) is absolute; 0: everywhere.
+        As `fit.loss.huber_width` gives it.
 
     Returns
     -------

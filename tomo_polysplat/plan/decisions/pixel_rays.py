@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 
@@ -116,12 +115,12 @@ def _share(thin: Fitter, averaged: Fitter) -> float:
 
     Only fitted rays that averaging changes by more than their noise count much.
     """
-    as_thin = replace(averaged.scene, pixel_rays=1)
     left = [0.0, 0.0]
     for views, measured, weight, _ in batches_around(thin.rays):
         by_thin, _ = thin.scene.projections(thin.gaussians, views)
         by_averaged, _ = averaged.scene.projections(averaged.gaussians, views)
-        changed = (by_averaged - as_thin.projections(averaged.gaussians, views)[0]) * weight
+        unaveraged, _ = thin.scene.projections(averaged.gaussians, views)
+        changed = (by_averaged - unaveraged) * weight
         told = (changed / (_ENOUGH * thin.settings.model_error)).abs().clamp(max=1.0) ** _POWER
         for k, predicted in enumerate((by_thin, by_averaged)):
             left[k] += float((told * losses(predicted, measured, weight, thin.settings)).sum())

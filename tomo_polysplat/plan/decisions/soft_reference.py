@@ -147,8 +147,8 @@ def soft_reference(
         number = settings.soft_u
     elif problem.materials == Materials():
         number = _number_of(value, problem, problem.spectrum)
-    why = "what its main matter would have if it were of the first material, as there is nothing like soft matter"
-    why += f"; material number {number:.2f}"
+    why = "what the object's main matter would have if it were of the first material, as there is nothing like soft"
+    why += f" matter; material number {number:.2f}"
     return Reference(value, first, number, why)
 
 
