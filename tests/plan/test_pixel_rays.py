@@ -175,9 +175,14 @@ def test_no_pass_is_made_that_would_have_to_change_more_than_the_last_one_did(mo
     assert asked == 2 * passes * [1] and answer.value == (2 if left[-1] < 1.35 else 1)
 
 
-@pytest.mark.parametrize(("left", "averaged"), [(2.5, False), (1.1, True)])
-def test_one_pass_each_way_is_enough_where_its_share_is_far_from_the_limit(monkeypatch, left, averaged):
-    (answer, run, fitter), asked = passes_asked(monkeypatch, (left,))
+@pytest.mark.parametrize(
+    ("left", "steps", "averaged"), [(2.5, 30, False), (1.75, 100, False), (1.1, 30, True), (1.1, 100, True)]
+)
+def test_one_pass_each_way_is_enough_where_its_share_is_far_from_the_limit(
+    monkeypatch, left, steps, averaged
+):
+    """The nearer the more steps it had."""
+    (answer, run, fitter), asked = passes_asked(monkeypatch, (left,), steps)
     assert asked == [1, 1] and run.made == (0.2, 0.3, 1)
     assert answer.value == (2 if averaged else 1) and (run.fitter is fitter) is not averaged
 

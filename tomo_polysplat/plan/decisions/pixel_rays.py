@@ -30,8 +30,9 @@ logger = logging.getLogger(__name__)
 # Share of the run after which it is asked, and the steps of each way, but for more than this share of the run: the
 # first ones are spent on getting used to it.
 _FROM, _STEPS, _MOST = 0.4, 60, 0.2
-# So little or so much left after one pass is enough (docs/decisions/pixel_rays.md).
-_SURELY_AVERAGED, _SURELY_THIN = 1.15, 2.4
+# So little left after one pass is enough, or so much more than the limit, times the steps of a pass: the more steps, the
+# less the next ones take off (docs/decisions/pixel_rays.md).
+_SURELY_AVERAGED, _SURELY_THIN = 1.15, 28.0
 # Factor of the time of a step, at most, where light is averaged over two rays a pixel and axis.
 _SLOWER = 4.0
 # A ray counts by this power of what averaging changes in it, in its deviations, up to so many: what changes less than
@@ -80,7 +81,7 @@ class PixelRays(Decision):
 
         def settled() -> bool:
             shares.append(_share(fitter, other))
-            return _is_settled(shares)
+            return _is_settled(shares, fitter.steps_of_a_pass)
 
         passes = passes_of_a_fork(fitter, known[Passes], _STEPS, _MOST)
         ways = fork(fitter, other, run.clock, passes, settled)
@@ -102,11 +103,17 @@ class PixelRays(Decision):
         return f"1 or 2: not asked in the middle of the run; with 2 {rays} the pairs"
 
 
-def _is_settled(shares: Sequence[float]) -> bool:
-    """Whether the next pass would have to change the share by more than the last one did to change the answer."""
-    if len(shares) == 1:
-        return not _SURELY_AVERAGED < shares[0] < _SURELY_THIN
-    return PixelLight.margin(shares[-1]) > abs(shares[-1] - shares[-2])
+def _is_settled(shares: Sequence[float], steps: int) -> bool:
+    """Whether the next pass, of so many steps, would have to change the share by more than it does to change the answer.
+
+    After the first pass by what it did to others; later by what the last pass did.
+    """
+    share, margin = shares[-1], PixelLight.margin(shares[-1])
+    if len(shares) > 1:
+        return margin > abs(share - shares[-2])
+    if PixelLight.gate({"share": share}).kept:
+        return share <= _SURELY_AVERAGED
+    return margin >= _SURELY_THIN / steps
 
 
 @torch.no_grad()
