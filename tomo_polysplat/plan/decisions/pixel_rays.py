@@ -8,7 +8,7 @@ made both ways for a few passes over the views, and goes on as it explains the r
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 
@@ -30,8 +30,8 @@ logger = logging.getLogger(__name__)
 # Share of the run after which it is asked, and the steps of each way, but for more than this share of the run: the
 # first ones are spent on getting used to it.
 _FROM, _STEPS, _MOST = 0.4, 60, 0.2
-# So little left after one pass is enough, or so much more than the limit, times the steps of a pass: the more steps, the
-# less the next ones take off (docs/decisions/pixel_rays.md).
+# So little left after one pass is enough, or so much more than the limit times the steps of a pass: the more steps, the
+# less the next ones change (docs/decisions/pixel_rays.md).
 _SURELY_AVERAGED, _SURELY_THIN = 1.15, 28.0
 # Factor of the time of a step, at most, where light is averaged over two rays a pixel and axis.
 _SLOWER = 4.0
@@ -104,9 +104,9 @@ class PixelRays(Decision):
 
 
 def _is_settled(shares: Sequence[float], steps: int) -> bool:
-    """Whether the next pass, of so many steps, would have to change the share by more than it does to change the answer.
+    """Whether the next pass, of so many steps, would have to change the share by more than it is likely to.
 
-    After the first pass by what it did to others; later by what the last pass did.
+    After the first pass by what it did in other scans, later by what the last pass did.
     """
     share, margin = shares[-1], PixelLight.margin(shares[-1])
     if len(shares) > 1:
@@ -120,15 +120,36 @@ def _is_settled(shares: Sequence[float], steps: int) -> bool:
 def _share(thin: Fitter, averaged: Fitter) -> float:
     """What averaged light leaves of the misfit that thin rays leave.
 
-    Only fitted rays that averaging changes by more than their noise count much.
+    Only fitted rays that averaging changes by more than their noise count much. Where both fits miss those by more than
+    noise, they all count the more alike: what changes most is missed most, whichever fit is right.
     """
-    left = [0.0, 0.0]
+    enough, left = _ENOUGH / max(_missed(thin, averaged), 1.0), [0.0, 0.0]
+    for changed, both, measured, weight in _changed_rays(thin, averaged):
+        told = (changed / enough).clamp(max=1.0) ** _POWER
+        for k, predicted in enumerate(both):
+            left[k] += float((told * losses(predicted, measured, weight, thin.settings)).sum())
+    return left[1] / left[0] if left[0] else float("inf")
+
+
+def _missed(thin: Fitter, averaged: Fitter) -> float:
+    """Mean square, in deviations, by which the better fit misses rays that averaging changes by one and more."""
+    rays, squares = 0, [0.0, 0.0]
+    for changed, both, measured, weight in _changed_rays(thin, averaged):
+        told = changed >= 1.0
+        rays += int(told.sum())
+        for k, predicted in enumerate(both):
+            deviations = (predicted - measured) * weight / thin.settings.model_error
+            squares[k] += float(torch.where(told, deviations.square(), 0.0).sum())
+    return min(squares) / rays if rays else 0.0
+
+
+def _changed_rays(
+    thin: Fitter, averaged: Fitter
+) -> Iterator[tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor], torch.Tensor, torch.Tensor]]:
+    """By how many deviations averaging changes fitted rays, what either fit predicts, what was measured, weights."""
     for views, measured, weight, _ in batches_around(thin.rays):
         by_thin, _ = thin.scene.projections(thin.gaussians, views)
         by_averaged, _ = averaged.scene.projections(averaged.gaussians, views)
         unaveraged, _ = thin.scene.projections(averaged.gaussians, views)
-        changed = (by_averaged - unaveraged) * weight
-        told = (changed / (_ENOUGH * thin.settings.model_error)).abs().clamp(max=1.0) ** _POWER
-        for k, predicted in enumerate((by_thin, by_averaged)):
-            left[k] += float((told * losses(predicted, measured, weight, thin.settings)).sum())
-    return left[1] / left[0] if left[0] else float("inf")
+        changed = ((by_averaged - unaveraged) * weight / thin.settings.model_error).abs()
+        yield changed, (by_thin, by_averaged), measured, weight
