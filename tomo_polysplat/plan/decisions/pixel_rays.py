@@ -30,8 +30,8 @@ logger = logging.getLogger(__name__)
 # Share of the run after which it is asked, and the steps of each way, but for more than this share of the run: the
 # first ones are spent on getting used to it.
 _FROM, _STEPS, _MOST = 0.4, 60, 0.2
-# So little left after one pass is enough, or so much more than the limit times the steps of a pass: the more steps, the
-# less the next ones change (docs/decisions/pixel_rays.md).
+# So little left after one pass is enough, or more than the limit by this over the steps of a pass: the more there
+# were, the less the next ones change (docs/decisions/pixel_rays.md).
 _SURELY_AVERAGED, _SURELY_THIN = 1.15, 28.0
 # Factor of the time of a step, at most, where light is averaged over two rays a pixel and axis.
 _SLOWER = 4.0
