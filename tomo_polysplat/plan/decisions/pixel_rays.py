@@ -123,33 +123,30 @@ def _share(thin: Fitter, averaged: Fitter) -> float:
     Only fitted rays that averaging changes by more than their noise count much. Where both fits miss those by more than
     noise, they all count the more alike: what changes most is missed most, whichever fit is right.
     """
-    enough, left = _ENOUGH / max(_missed(thin, averaged), 1.0), [0.0, 0.0]
-    for changed, both, measured, weight in _changed_rays(thin, averaged):
-        told = (changed / enough).clamp(max=1.0) ** _POWER
-        for k, predicted in enumerate(both):
-            left[k] += float((told * losses(predicted, measured, weight, thin.settings)).sum())
-    return left[1] / left[0] if left[0] else float("inf")
-
-
-def _missed(thin: Fitter, averaged: Fitter) -> float:
-    """Mean square, in deviations, by which the better fit misses rays that averaging changes by one and more."""
-    rays, squares = 0, [0.0, 0.0]
-    for changed, both, measured, weight in _changed_rays(thin, averaged):
-        told = changed >= 1.0
-        rays += int(told.sum())
-        for k, predicted in enumerate(both):
-            deviations = (predicted - measured) * weight / thin.settings.model_error
-            squares[k] += float(torch.where(told, deviations.square(), 0.0).sum())
-    return min(squares) / rays if rays else 0.0
+    changed, squares, misfits = (
+        torch.cat(parts) for parts in zip(*_changed_rays(thin, averaged), strict=True)
+    )
+    told = changed >= 1.0
+    missed = float(squares[told].mean(0).min()) if bool(told.any()) else 0.0
+    counts = (changed * max(missed, 1.0) / _ENOUGH).clamp(max=1.0) ** _POWER
+    by_thin, by_averaged = (counts[:, None] * misfits).sum(0, dtype=torch.float64).tolist()
+    return by_averaged / by_thin if by_thin else float("inf")
 
 
 def _changed_rays(
     thin: Fitter, averaged: Fitter
-) -> Iterator[tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor], torch.Tensor, torch.Tensor]]:
-    """By how many deviations averaging changes fitted rays, what either fit predicts, what was measured, weights."""
+) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
+    """Of fitted rays by how many deviations averaging changes them, (rays,), and what either fit leaves, (rays, 2).
+
+    That is the square of what it misses them by, in deviations, and their misfit.
+    """
+    settings = thin.settings
     for views, measured, weight, _ in batches_around(thin.rays):
         by_thin, _ = thin.scene.projections(thin.gaussians, views)
         by_averaged, _ = averaged.scene.projections(averaged.gaussians, views)
         unaveraged, _ = thin.scene.projections(averaged.gaussians, views)
-        changed = ((by_averaged - unaveraged) * weight / thin.settings.model_error).abs()
-        yield changed, (by_thin, by_averaged), measured, weight
+        changed = ((by_averaged - unaveraged) * weight / settings.model_error).abs()
+        both, on = (by_thin, by_averaged), changed > 0
+        squares = [((p - measured) * weight / settings.model_error).square()[on] for p in both]
+        misfits = [losses(p, measured, weight, settings)[on] for p in both]
+        yield changed[on], torch.stack(squares, 1), torch.stack(misfits, 1)
