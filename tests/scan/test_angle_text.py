@@ -19,6 +19,7 @@ from tomo_polysplat.scan.readers.angle_text import angles_in, require_degrees
         ("a.tif\t0,25\nb.tif\t7,5  # noted later\n", [0.25, 7.5]),
         ("# degrees\n-90 \n-1e-3\n", [-90, -0.001]),
         ("1 0,5\n2 1\n", [0.5, 1]),
+        ("0,000°\n7,500°\n", [0, 7.5]),
     ],
 )
 def test_lists(text, angles):

@@ -24,7 +24,7 @@ def angles_in(text: str) -> np.ndarray:
     ValueError
         For a line, below the first with a number, that ends with none.
     """
-    lines = [line for line in (line.split("#")[0].strip() for line in text.splitlines()) if line]
+    lines = [line for line in (line.split("#")[0].strip(" \t°") for line in text.splitlines()) if line]
     decimal = _decimal_commas(lines)
     rows = [line.replace(",", "." if decimal else " ").replace(";", " ").split() for line in lines]
     first = next((k for k, words in enumerate(rows) if _is_number(words[-1])), len(rows))

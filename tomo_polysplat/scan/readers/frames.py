@@ -16,7 +16,7 @@ from tomo_polysplat.files import existing_file, require_plausible_size
 from tomo_polysplat.scan.hdf5_array import StoredArray
 from tomo_polysplat.scan.hdf5_links import moved
 
-__all__ = ["OTHER_PICTURE", "ArrayFrames", "Frames", "Hdf5Array", "Hdf5Frames", "TiffFrames"]
+__all__ = ["OTHER_PICTURE", "ArrayFrames", "Frames", "Hdf5Array", "Hdf5Frames", "MeanOfSums", "TiffFrames"]
 
 # What to do about a picture of another size among those of a scan.
 OTHER_PICTURE = (
@@ -63,6 +63,18 @@ class ArrayFrames:
     def read(self, index: int, rows: slice, columns: slice) -> np.ndarray:
         """Part of one picture."""
         return np.asarray(self._array[int(self._chosen[index]), rows, columns])
+
+
+class MeanOfSums:
+    """Pictures each of which is the sum of so many."""
+
+    def __init__(self, sums: Frames, summed: int) -> None:
+        self._sums, self._summed = sums, summed
+        self.shape, self.dtype = sums.shape, np.dtype(np.float32)
+
+    def read(self, index: int, rows: slice, columns: slice) -> np.ndarray:
+        """Part of the mean of the pictures of one sum."""
+        return self._sums.read(index, rows, columns) / np.float32(self._summed)
 
 
 class Hdf5Array:
@@ -127,7 +139,9 @@ class Hdf5Frames:
 
 
 class TiffFrames:
-    """Pictures of TIFF files: one in each of several files, or all in one.
+    """Pictures of TIFF files: one in each of several files, or several in one or in each.
+
+    A stack of more than 4 GB that ImageJ wrote has the first picture's entry alone, and the others behind it.
 
     Raises
     ------
@@ -139,18 +153,29 @@ class TiffFrames:
         self._files = [existing_file(file) for file in files]
         if not self._files:
             raise fail("path", "TIFF files", "none")
-        first = self._files[0]
-        with _page(first, 0) as page:
-            pages = _count(first, page)
+        with _page(self._files[0], 0) as page:
             self.dtype = np.dtype(page.dtype)
             rows, columns = page.shape
-        if len(self._files) > 1 and pages > 1:
-            raise fail("path", "one picture in each of several TIFF files", f"{pages} pictures in {first}")
-        self.shape = (max(pages, len(self._files)), rows, columns)
+            first, behind = _count(self._files[0], page), _lies_behind(page)
+        # Where the first file has one picture, so have the others, which are opened when they are asked for.
+        counts = [first] if first == 1 else [first, *(_pages(file) for file in self._files[1:])]
+        self._ends = np.cumsum(counts) if first > 1 else np.arange(1, len(self._files) + 1)
+        self._mapped = (
+            None if behind is None else _mapped(self._files[0], self.dtype, behind, (first, rows, columns))
+        )
+        if behind is not None and len(self._files) > 1:
+            got = f"{len(self._files)} such files"
+            raise fail(
+                "path", "one stack of ImageJ's of more than 4 GB", got, "write it as an image sequence"
+            )
+        self.shape = (int(self._ends[-1]), rows, columns)
 
     def read(self, index: int, rows: slice, columns: slice) -> np.ndarray:
         """Part of one picture."""
-        file, number = (self._files[0], index) if len(self._files) == 1 else (self._files[index], 0)
+        if self._mapped is not None:
+            return np.array(self._mapped[index, rows, columns])
+        which = int(np.searchsorted(self._ends, index, "right"))
+        file, number = self._files[which], index - (int(self._ends[which - 1]) if which else 0)
         with _page(file, number) as page:
             if page.shape != self.shape[1:] or np.dtype(page.dtype) != self.dtype:
                 got = f"{page.dtype} of {page.shape} in {file}"
@@ -162,11 +187,39 @@ class TiffFrames:
                 raise _unreadable(file, error) from error
 
 
+def _pages(file: Path) -> int:
+    with _page(file, 0) as page:
+        return _count(file, page)
+
+
 def _count(file: Path, page: Any) -> int:
-    """Pictures of the file of a page."""
+    """Pictures of the file of a page, without small ones of them for a viewer."""
     try:
-        return len(page.parent.pages)
+        tiff = page.parent
+        if _lies_behind(page) is not None:
+            return int(tiff.imagej_metadata["images"])
+        pages = len(tiff.pages)
+        return 1 if pages == 2 and tiff.pages[1].is_reduced else pages
     except Exception as error:  # its parser raises whatever it meets
+        raise _unreadable(file, error) from error
+
+
+def _lies_behind(page: Any) -> int | None:
+    """First byte of a stack of ImageJ's whose pictures follow the first one without entries; None of any other."""
+    tiff = page.parent
+    described = (tiff.imagej_metadata or {}) if tiff.is_imagej else {}
+    if len(tiff.pages) > 1 or not isinstance(described.get("images"), int) or described["images"] < 2:
+        return None
+    return int(page.dataoffsets[0])
+
+
+def _mapped(file: Path, dtype: np.dtype, offset: int, shape: tuple[int, int, int]) -> np.ndarray:
+    """The pictures of such a stack, in the file's order of bytes."""
+    with _page(file, 0) as page:
+        dtype = dtype.newbyteorder(page.parent.byteorder)
+    try:
+        return np.memmap(file, dtype, "r", offset, shape)
+    except ValueError as error:  # it is shorter than it says
         raise _unreadable(file, error) from error
 
 

@@ -20,6 +20,7 @@ __all__ = [
     "is_reconstructed",
     "named_files",
     "numbers_of",
+    "of_one_name",
     "pictures_in",
     "tiffs_in",
 ]
@@ -27,7 +28,7 @@ __all__ = [
 TIFF_SUFFIXES = (".tif", ".tiff")
 # What a plain stack may be of.
 PICTURE_SUFFIXES = (*TIFF_SUFFIXES, ".npy", ".edf")
-_MOST_GAPS = 3
+_MOST_GAPS, _MOST_NAMES = 3, 4
 # Words in a name that make a picture, or a folder of them, a flat or a dark one, or one with the object.
 _WORDS = {
     "flats": (
@@ -45,13 +46,20 @@ _WORDS = {
         ),
         *("ref", "refs", "reference", "gain", "ff", "i0", "io", "blank", "blanks"),
     ),
-    "darks": ("dark", "darks", "darkfield", "darkcurrent", "dk", "df", "di", "background"),
+    "darks": (
+        *("dark", "darks", "darkfield", "darkcurrent", "darkend", "dk", "df", "di", "background"),
+        *("offset", "offsets"),
+    ),
     "projections": ("projections", "projection", "proj", "projs", "data", "tomo", "images", "raw"),
 }
 
 
-# Folders that hold reconstructions.
-_RECONSTRUCTED = re.compile(r"rec\w*|slices|volume", re.I)
+# A number in a name, or an angle, as in -2.5 and 2p5.
+_NUMBER = re.compile(r"-?\d+([.,p]\d+)*")
+# Folders that hold reconstructions; NRecon makes one of the scan's name and "_Rec".
+_RECONSTRUCTED = re.compile(r"rec\w*|.*_rec|slices|volume", re.I)
+# Where a name that is no word of small letters begins a new word.
+_ENDS_OF_WORDS = re.compile(r"[^A-Za-z0-9]+|(?<=[a-z])(?=[A-Z0-9])")
 
 
 def is_reconstructed(folder: Path) -> bool:
@@ -97,9 +105,37 @@ def tiffs_in(folder: Path) -> list[Path]:
 
 
 def pictures_in(folder: Path) -> list[Path]:
-    """The TIFF files of a folder, else its EDF, else its ``.npy`` files, in order."""
+    """The TIFF, EDF or ``.npy`` files of a folder, in order: of those that take the most room, as a scan does."""
     kinds = (TIFF_SUFFIXES, (".edf",), (".npy",))
-    return next((files for kind in kinds if (files := _of_kind(folder, kind))), [])
+    found = [files for kind in kinds if (files := _of_kind(folder, kind))]
+    return found[0] if len(found) == 1 else max(found, key=_room, default=[])
+
+
+def _room(files: Sequence[Path]) -> int:
+    return sum(file.stat().st_size for file in files)
+
+
+def of_one_name(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """Pictures of one name and different numbers, which most of them have to be, and the others.
+
+    Where each has a name of its own, names tell nothing.
+
+    Raises
+    ------
+    ValueError
+        If no name is that of more than half of them.
+    """
+    named: dict[str, list[Path]] = {}
+    for file in files:
+        named.setdefault(_NUMBER.sub("#", file.stem.lower()), []).append(file)
+    most = max(named.values(), key=len, default=[])
+    if len(named) < 2 or len(most) < 2:
+        return list(files), []
+    if 2 * len(most) <= len(files):
+        got = ", ".join(f"{len(some)} as {some[0].name}" for some in list(named.values())[:_MOST_NAMES])
+        remedy = "name those of the scan by a pattern such as proj_*.tif: projections (--projections)"
+        raise fail("path", "pictures of one name and different numbers", got, remedy)
+    return most, [file for file in files if file not in most]
 
 
 def _of_kind(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
@@ -108,8 +144,13 @@ def _of_kind(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
 
 def has_word(name: str, kind: str) -> bool:
     """Whether a word of a name tells of flats, darks or projections."""
-    words = re.split(r"[^a-z0-9]+|(?<=[a-z])(?=[0-9])", name.lower())
-    return bool(set(words) & set(_WORDS[kind]))
+    # With its number as well, as in i0, and as in whatever is written in capitals.
+    words = {
+        *_ENDS_OF_WORDS.split(name),
+        *_ENDS_OF_WORDS.split(name.lower()),
+        *re.split(r"[^A-Za-z0-9]+", name),
+    }
+    return bool({word.lower() for word in words} & set(_WORDS[kind]))
 
 
 def named_files(folder: Path, names: Any, argument: str) -> list[Path]:

@@ -20,6 +20,7 @@ from tomo_polysplat.scan.readers.picture_names import (
     has_word,
     is_reconstructed,
     named_files,
+    of_one_name,
     pictures_in,
 )
 from tomo_polysplat.scan.readers.stated import read_toml, require_known, require_no_slips, stated_over
@@ -27,6 +28,7 @@ from tomo_polysplat.scan.readers.stated import read_toml, require_known, require
 __all__ = ["full_turn", "guessed", "read", "recognises", "stated_beside", "toml_files", "written_beside"]
 
 KIND = "stack of TIFFs, EDF or .npy files"
+_MOST_NAMED = 3
 _REMEDY = (
     "pass scanner={'source_object': ..., 'source_detector': ..., 'pixel': ...} in mm (--sod, --sdd, --pixel), write "
     "them into a file scan.toml in the folder, or say that beam = 'parallel'"
@@ -50,10 +52,19 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     if path.suffix.lower() in PICTURE_SUFFIXES and path.is_file():
         known.setdefault("projections", path)
     _require_lengths(folder, known)
-    files = _sorted_out(folder, known)
+    files, passed_over = _sorted_out(folder, known)
     frames = frames_of(files["projections"])
+    if frames.shape[0] < 2:
+        got = f"one, {files['projections'][0].name}"
+        raise fail("projections", "pictures of at least two views", got, "name the others (--projections)")
     known |= {name: files[name] for name in ("flats", "darks") if files[name]}
     told = Acquisition(KIND, frames, full_turn(frames.shape[0]), folder.name, other=other)
+    if passed_over:
+        names = ", ".join(file.name for file in passed_over[:_MOST_NAMED])
+        names += f" and {len(passed_over) - _MOST_NAMED} more" if len(passed_over) > _MOST_NAMED else ""
+        told = told.saying(
+            f"pictures of other names are passed over: {names}; give projections= if they are views"
+        )
     if "degrees" not in known and (gaps := gaps_in(files["projections"])):
         told = told.saying(
             f"the numbers of the pictures jump ({gaps}): steps are taken to be even over those that are there; give "
@@ -117,17 +128,20 @@ def _is_known(key: str) -> bool:
     return True
 
 
-def _sorted_out(folder: Path, known: Mapping[str, Any]) -> dict[str, list[Path]]:
-    """Files of the projections, flats and darks: as stated, else by the words in their names."""
+def _sorted_out(folder: Path, known: Mapping[str, Any]) -> tuple[dict[str, list[Path]], list[Path]]:
+    """Files of the projections, flats and darks, and those that are none: as stated, else by their names."""
     kinds = ("projections", "flats", "darks")
     files = {name: named_files(folder, known[name], name) for name in kinds if name in known}
     taken = {file for some in files.values() for file in some}
     inside = [inner for inner in entries_of(folder) if inner.is_dir()]
+    passed_over: list[Path] = []
     for name in ("flats", "darks"):
         if name not in files:
-            matching = [
-                file for file in pictures_in(folder) if has_word(file.stem, name) and file not in taken
-            ]
+            pictures = pictures_in(folder)
+            matching = [file for file in pictures if has_word(file.stem, name) and file not in taken]
+            if len(matching) == len(pictures) and not any(map(pictures_in, inside)):
+                # A word that all pictures of a scan have tells of the sample.
+                matching = []
             for inner in inside:
                 matching += pictures_in(inner) if has_word(inner.name, name) else []
             files[name] = matching
@@ -136,12 +150,12 @@ def _sorted_out(folder: Path, known: Mapping[str, Any]) -> dict[str, list[Path]]
         left = [file for file in pictures_in(folder) if file not in taken]
         # Flats that were not named, where one of them was, are none of the object.
         left = [file for file in left if not any(has_word(file.stem, name) for name in kinds[1:])] or left
-        left = left or _pictures_of_one(inside, taken)
+        left, passed_over = of_one_name(left or _pictures_of_one(inside, taken))
         if not left:
             remedy = "pass scanner={'projections': 'FOLDER or PATTERN'} (--projections)"
             raise fail("path", "pictures of an object (TIFF, EDF or .npy)", f"none in {folder}", remedy)
         files["projections"] = left
-    return files
+    return files, passed_over
 
 
 def _pictures_of_one(folders: list[Path], taken: set[Path]) -> list[Path]:
