@@ -71,3 +71,23 @@ def test_a_text_that_cannot_be_meant(folder):
     change(folder, "TOMO_N=                 9", "TOMO_N=                 4")
     with pytest.raises(ValueError, match="EDF pictures named marker0000.edf and so on, got none"):
         tps.load_scan(folder)
+
+
+def test_the_dark_picture_of_the_end_is_a_sum(folder):
+    expected = tps.load_scan(folder)
+    dark = (folder / "dark.edf").read_bytes()
+    end = dark.index(b"}") + 2
+    summed = 20 * np.frombuffer(dark[end:], "<f4")
+    (folder / "dark.edf").unlink()
+    (folder / "darkend0000.edf").write_bytes(dark[:end] + summed.astype("<f4").tobytes())
+    change(folder, "TOMO_N=", "DARK_N=                 20\nTOMO_N=")
+    np.testing.assert_allclose(tps.load_scan(folder).projections, expected.projections, atol=1e-6)
+
+
+def test_what_is_stated_is_no_guess(folder):
+    (folder / "scan.toml").write_text("offset = [0.0, 0.0]\n")
+    assert "the axis is taken" not in guesses(tps.load_scan(folder))
+    (folder / "scan.toml").unlink()
+    assert "the axis is taken" in guesses(tps.load_scan(folder))
+    cone = {"source_object": 900.0, "source_detector": 1000.0}
+    assert "parallel" not in guesses(tps.load_scan(folder, scanner=cone))

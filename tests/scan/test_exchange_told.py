@@ -103,3 +103,32 @@ def test_the_command_line_has_the_same_words(path, monkeypatch):
     np.testing.assert_array_equal(scan.projections, told.projections)
     np.testing.assert_equal(scan.proj_geom, told.proj_geom)
     assert scan.unit == "mm"
+
+
+def test_the_first_row_of_a_parallel_beam_is_the_first_slice_whatever_else_is_told(path):
+    plain = tps.load_scan(path, centre=20.0, pixel_size=0.4, unit="mm")
+    told = tps.load_scan(
+        path, scanner={"beam": "parallel", "pixel": 0.4, "offset": (0.0, 0.0), "name": "tooth"}
+    )
+    np.testing.assert_allclose(told.projections, plain.projections, atol=1e-6)
+    assert told.name == "tooth"
+    turned = tps.load_scan(
+        path, scanner={"beam": "parallel", "pixel": 0.4, "name": "tooth", "first_row": "top"}
+    )
+    np.testing.assert_array_equal(turned.projections, told.projections[::-1])
+
+
+@pytest.mark.parametrize("scanner", [None, SCANNER])
+def test_references_of_before_and_after(path, scanner):
+    known = {} if scanner is None else {"scanner": scanner}
+    expected = tps.load_scan(path, **known)
+    with h5py.File(path, "r+") as file:
+        exchange = file["exchange"]
+        white = exchange["data_white"][()]
+        assert len(white) > 1
+        exchange["data_white_pre"], exchange["data_white_post"] = white[:1], white[1:]
+        exchange["data_dark_post"] = exchange["data_dark"][()]
+        for name in ("data_white", "data_dark"):
+            del exchange[name]
+        exchange["data_dark"] = np.zeros((0, *white.shape[1:]), white.dtype)
+    np.testing.assert_allclose(tps.load_scan(path, **known).projections, expected.projections, atol=1e-6)

@@ -192,3 +192,34 @@ def test_the_text_beside_a_folder_of_the_pictures(folder):
     for file in folder.glob("*.tif"):
         file.rename(folder / "projections" / file.name)
     np.testing.assert_array_equal(tps.load_scan(folder).projections, expected)
+
+
+def test_a_toml_file_beside_stands_over_the_text(folder):
+    assert "no centre of rotation" not in " ".join(tps.load_scan(folder).notes["scanner"]["guessed"])
+    change(folder, ("ObjectOffsetX", "IgnoredOffsetX"))
+    assert "no centre of rotation" in " ".join(tps.load_scan(folder).notes["scanner"]["guessed"])
+    (folder / "scan.toml").write_text(
+        'offset = [1.5, 0.0]\nkvp = 120\nfilter = "Cu 0.5mm"\noperator = "me"\n'
+    )
+    scan = tps.load_scan(folder)
+    told = scan.notes["scanner"]
+    assert (told["tube_kv"], told["filter"], told["keys"]["operator"]) == ("120.0", "0.5 mm Cu", "me")
+    assert "no centre of rotation" not in " ".join(told["guessed"])
+    assert "scan.toml beside it is followed: offset, kvp, filter" in told["guessed"]
+    stated = tps.load_scan(folder / "marker.xtekct", scanner={"offset": (1.5, 0.0)})
+    np.testing.assert_array_equal(stated.proj_geom["Vectors"], scan.proj_geom["Vectors"])
+    assert tps.load_scan(folder, scanner={"kvp": 100}).notes["scanner"]["tube_kv"] == "100.0"
+    (folder / "scan.toml").write_text('filters = "Cu 0.5mm"\n')
+    with pytest.raises(ValueError, match=r"scan.toml.*'filters'"):
+        tps.load_scan(folder)
+
+
+def test_a_picture_of_the_screen_is_no_view(folder):
+    expected = tps.load_scan(folder)
+    pictures = [file for file in folder.glob("*.tif")]
+    (folder / "views").mkdir()
+    for file in pictures:
+        file.rename(folder / "views" / file.name)
+    change(folder, ("Name=marker", "InputFolderName=C:\\scans\\views\nName=marker"))
+    (folder / "Screenshot 1.tif").write_bytes((folder / "views" / pictures[0].name).read_bytes())
+    np.testing.assert_array_equal(tps.load_scan(folder).projections, expected.projections)

@@ -298,3 +298,44 @@ def test_an_nxtomo_in_an_entry_comes_before_the_entry_s_own_detectors(path):
         other["data"], other["image_key"] = np.ones((5, 3, 3)), np.zeros(5, int)
     scan = tps.load_scan(path)
     np.testing.assert_array_equal(scan.projections, expected.projections)
+
+
+def test_pictures_of_the_way_back_are_no_views(path):
+    expected = tps.load_scan(path)
+    with h5py.File(path, "a") as file:
+        detector = file["entry0000/instrument/detector"]
+        keys = detector["image_key"][()]
+        control = keys.copy()
+        control[np.flatnonzero(keys == 0)[-3:]] = -1
+        detector["image_key_control"] = control
+    scan = tps.load_scan(path)
+    np.testing.assert_array_equal(scan.projections, expected.projections[:, :-3])
+    assert any("3 pictures of the way back" in guess for guess in scan.notes["scanner"]["guessed"])
+
+
+def test_a_monitor_makes_up_for_a_beam_that_falls(path):
+    expected = tps.load_scan(path)
+    with h5py.File(path, "a") as file:
+        entry = file["entry0000"]
+        data, keys = entry["instrument/detector/data"], entry["instrument/detector/image_key"][()]
+        beam = np.where(keys == 0, np.linspace(1.0, 0.85, len(keys)), 1.0)
+        dark = data[()][keys == 2].mean(axis=0)
+        dimmed = dark + (data[()] - dark) * beam[:, None, None]
+        data[()] = np.where((keys == 0)[:, None, None], np.round(dimmed), data[()])
+        entry["control/data"] = 190.0 * beam
+    scan = tps.load_scan(path)
+    np.testing.assert_allclose(scan.projections, expected.projections, atol=3e-3)
+    assert any("control/data" in guess for guess in scan.notes["scanner"]["guessed"])
+    part = tps.load_scan(path, views=(1, 40, 3))
+    np.testing.assert_array_equal(part.projections, scan.projections[:, 1:40:3])
+    with h5py.File(path, "a") as file:
+        file["entry0000/control/data"][3] = 0.0
+    dim = tps.load_scan(path).projections
+    assert (dim - expected.projections)[:, -1].mean() > 0.1, "a monitor that failed tells nothing"
+
+
+def test_other_entries_are_said(path):
+    with h5py.File(path, "a") as file:
+        file.copy("entry0000", "entry0001")
+    said = " | ".join(tps.load_scan(path).notes["scanner"]["guessed"])
+    assert "the entry entry0000 is read; others of the file (entry0001)" in said

@@ -30,7 +30,7 @@ from tomo_polysplat.checks import fail, visible
 from tomo_polysplat.free_memory import in_gigabytes
 from tomo_polysplat.scan.counts import Counts, Marks, Read
 from tomo_polysplat.scan.data_exchange_parallel import parallel_told
-from tomo_polysplat.scan.data_exchange_pictures import input_kind, pictures_of
+from tomo_polysplat.scan.data_exchange_pictures import input_kind, pictures_of, references_of
 from tomo_polysplat.scan.defects import flat_and_dark
 from tomo_polysplat.scan.dxchange_host import read_block
 from tomo_polysplat.scan.filter_map_file import read_filter_map
@@ -171,22 +171,22 @@ def _counts(
 ) -> tuple[Counts, dict[str, Any]]:
     """What is stored, with what is needed to make line integrals of it, and notes of what that is."""
     rows, columns = data.shape[1:]
-    white, dark = find_array(exchange, "data_white"), find_array(exchange, "data_dark")
-    kind = input_kind(data, white is not None, options.input)
+    white, dark = (references_of(exchange.file, name) for name in ("data_white", "data_dark"))
+    kind = input_kind(data, bool(white), options.input)
     if kind != "counts" and options.saturation is not None:
         raise fail("saturation", "counts in the file", f"{kind}, which has none", "leave it out")
     flat = background = None
     if kind == "counts":
-        if white is None:
+        if not white:
             raise fail(
                 "path",
                 "/exchange/data_white beside counts",
                 "none",
                 "or pass input='transmission' or 'attenuation'",
             )
-        for frames in (one for one in (white, dark) if one is not None):
+        for frames in (*white, *dark):
             _require_few(frames, data)
-        no_light, open_beam = None if dark is None else read_block(dark), read_block(white)
+        no_light, open_beam = _together(dark) if dark else None, _together(white)
         flat, background = map(wanted.of_pixels, flat_and_dark(open_beam, no_light, (rows, columns)))
         means = {"white_frames": _frame_means(open_beam), "dark_frames": _frame_means(no_light)}
     else:
@@ -199,8 +199,13 @@ def _frame_means(frames: np.ndarray | None) -> list[float]:
     """Mean counts of each open-beam or dark image, by which `check` questions them."""
     if frames is None:
         return []
-    frames = frames[None] if frames.ndim == 2 else frames
     return [float(np.nanmean(frame, dtype=np.float64)) for frame in frames]
+
+
+def _together(stored: list[StoredArray]) -> np.ndarray:
+    """All of these pictures (n, rows, columns); one alone may have no axis for their number."""
+    read = [read_block(frames) for frames in stored]
+    return np.concatenate([frames[None] if frames.ndim == 2 else frames for frames in read])
 
 
 def _require_few(frames: StoredArray, data: StoredArray) -> None:

@@ -28,7 +28,9 @@ logger = logging.getLogger(__name__)
 # pixel is not used: without the magnification it is off by the objective's factor.
 PIXEL_SIZE_PATHS = ("measurement/instrument/detection_system/objective/resolution",)
 LENGTH_NAMES = {name: name for name in ("um", "mm", "cm", "m")}
-LENGTH_NAMES |= dict.fromkeys(("micron", "microns", "micrometers"), "um")
+LENGTH_NAMES |= dict.fromkeys(
+    ("micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres"), "um"
+)
 
 
 def parallel_told(

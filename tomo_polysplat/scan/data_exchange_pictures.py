@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from tomo_polysplat.scan.hdf5_array import StoredArray
 
-__all__ = ["input_kind", "pictures_of"]
+__all__ = ["input_kind", "pictures_of", "references_of"]
 
 logger = logging.getLogger(__name__)
 
@@ -34,6 +34,12 @@ def pictures_of(file: h5py.File, path: Path) -> StoredArray:
         expected = "a dataset /exchange/data of shape (views, rows, columns)"
         raise fail("path", expected, f"{got} in {path}", remedy)
     return data
+
+
+def references_of(file: h5py.File, name: str) -> list[StoredArray]:
+    """What there is of ``/exchange/data_white`` or ``data_dark``, also of before and after (``_pre``, ``_post``)."""
+    found = [find_array(file, f"exchange/{name}{end}") for end in ("", "_pre", "_post")]
+    return [frames for frames in found if frames is not None and frames.size]
 
 
 def input_kind(data: StoredArray, has_white: bool, stated: str | None) -> str:

@@ -14,7 +14,7 @@ from tomo_polysplat.scan.geometry import Geometry, geometry_from_astra
 if TYPE_CHECKING:
     from tomo_polysplat.scan.readers.frames import Frames
 
-__all__ = ["Acquisition", "Setup", "Tube"]
+__all__ = ["Acquisition", "Guess", "Setup", "Tube"]
 
 
 @dataclass(frozen=True)
@@ -124,6 +124,23 @@ class Tube:
     detector: str | None = None
 
 
+class Guess(str):
+    """What had to be guessed, in words, until somebody states one of some keys.
+
+    Attributes
+    ----------
+    unless : tuple of str
+        Names of `tomo_polysplat.scan.readers.stated.KEYS`.
+    """
+
+    unless: tuple[str, ...] = ()
+
+    def __new__(cls, words: str, *unless: str) -> Guess:
+        guess = super().__new__(cls, words)
+        guess.unless = unless
+        return guess
+
+
 @dataclass(frozen=True, eq=False)
 class Acquisition:
     """Pictures that are read when they are asked for, and what is known about them.
@@ -143,6 +160,8 @@ class Acquisition:
         ``"counts"``, ``"transmission"`` or ``"attenuation"``.
     flats, darks : Frames or None
         Pictures without the object, and without light.
+    light : array, shape (views,), or None
+        Of the beam in each view, over that in the flats, as a monitor counted it.
     white : float or None
         Counts of the open beam, the same in each pixel, where there are no flats.
     saturates : bool
@@ -170,6 +189,7 @@ class Acquisition:
     input: str = "counts"
     flats: Frames | None = None
     darks: Frames | None = None
+    light: np.ndarray | None = None
     white: float | None = None
     saturates: bool = True
     top_first: bool = True

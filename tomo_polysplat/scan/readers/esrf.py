@@ -1,8 +1,9 @@
 """Scans of the ESRF before HDF5: EDF pictures that are numbered after the folder, and an .info text beside them.
 
 Names and units are those of the ESRF's own reader (tomoscan): ``PixelSize`` in um, ``refHST0000.edf`` a picture without
-the object, ``dark.edf`` one without light; after ``TOMO_N`` views come pictures of the way back, which are left out.
-Pictures are taken as those of an NXtomo file, which the ESRF writes today.
+the object, ``dark.edf`` one without light, ``darkend0000.edf`` the sum of ``DARK_N`` of them; after ``TOMO_N`` views
+come pictures of the way back, which are left out. Pictures are taken as those of an NXtomo file, which the ESRF writes
+today.
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from tomo_polysplat.checks import fail, require_number
-from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup
+from tomo_polysplat.scan.readers.acquisition import Acquisition, Guess, Setup
 from tomo_polysplat.scan.readers.edf import EdfFrames
 from tomo_polysplat.scan.readers.entries import entries_of
 from tomo_polysplat.scan.readers.files_of_scans import the_one
+from tomo_polysplat.scan.readers.frames import Frames, MeanOfSums
 from tomo_polysplat.scan.readers.ini_text import IniText
 from tomo_polysplat.scan.readers.picture_names import gaps_in, in_order, numbers_of
 from tomo_polysplat.scan.readers.stated import require_known, stated_over
@@ -30,6 +32,7 @@ _START_BYTES = 4096
 # The first kind that is there is taken: medians before those that were summed up or averaged, then single pictures.
 _FLATS = (r"refhst\d*", r"ref\d+_\d+")
 _DARKS = (r"dark(hst)?", r"darkend\d*")
+_SUMMED = re.compile("darkend", re.I)
 
 
 def recognises(path: Path) -> bool:
@@ -49,7 +52,8 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
         raise fail("path", "EDF pictures of one name, numbered one after the other", got)
     numbers = counted[counted < planned]
     kept = files[: len(numbers)]
-    frames, said = EdfFrames(kept), []
+    frames = EdfFrames(kept)
+    said: list[str] = []
     if len(kept) < planned:
         said.append(f"{len(kept)} pictures are there, the .info tells of {planned}")
     if gaps := gaps_in(kept):
@@ -59,13 +63,16 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     told = Acquisition(KIND, frames, setup, name=file.stem, unit="mm" if pixel > 0 else "pixel")
     told = replace(told, exposure=text.number("Count_time", otherwise=0.0) or None)
     flats, darks = (_beside(folder, patterns) for patterns in (_FLATS, _DARKS))
-    told = replace(told, flats=EdfFrames(flats) if flats else None, darks=EdfFrames(darks) if darks else None)
+    told = replace(told, flats=EdfFrames(flats) if flats else None, darks=_dark(darks, text))
     if told.unit == "pixel":
-        said.append("the pixel is not known: lengths are in pixels; give pixel=")
-    said.append("the beam is taken to be parallel; give source_object= and source_detector= if it is not")
-    said.append("the axis is taken to fall on the detector's middle; give offset= if it does not")
+        said.append(Guess("the pixel is not known: lengths are in pixels; give pixel=", "pixel"))
+    beam = "the beam is taken to be parallel; give source_object= and source_detector= if it is not"
+    said.append(Guess(beam, "beam", "source_object", "source_detector"))
+    axis = "the axis is taken to fall on the detector's middle; give offset= if it does not"
+    said.append(Guess(axis, "offset"))
     if flats and not darks:
-        said.append("no dark pictures: without light a pixel is taken to count 0; give darks= if it does not")
+        dark = "no dark pictures: without light a pixel is taken to count 0; give darks= if it does not"
+        said.append(Guess(dark, "darks"))
     told = stated_over(told.saying(*said), known, folder)
     return replace(told, other=text.others())
 
@@ -88,6 +95,15 @@ def _views(folder: Path, name: str) -> list[Path]:
     if not files:
         raise fail("path", f"EDF pictures named {name}0000.edf and so on", f"none in {folder}")
     return in_order(files)
+
+
+def _dark(files: list[Path], text: IniText) -> Frames | None:
+    """Pictures without light; those of the scan's end are each the sum of ``DARK_N``."""
+    if not files:
+        return None
+    summed = int(require_number("DARK_N", text.number("DARK_N", otherwise=1.0), at_least=1))
+    frames = EdfFrames(files)
+    return MeanOfSums(frames, summed) if _SUMMED.match(files[0].name) and summed > 1 else frames
 
 
 def _beside(folder: Path, patterns: tuple[str, ...]) -> list[Path]:

@@ -1,6 +1,7 @@
 """Data Exchange that states no geometry, of a scanner that the user describes: its pictures, and angles if it has them.
 
-Its first row is taken for the top one and its pictures as seen from the source, as a camera writes them.
+Of a cone beam its first row is taken for the top one and its pictures as seen from the source, as a camera writes them.
+Of a parallel beam the first row is the first slice, as TomoPy and `load_scan` without a description have it.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tomo_polysplat.checks import fail
-from tomo_polysplat.scan.data_exchange_pictures import input_kind, pictures_of
+from tomo_polysplat.scan.data_exchange_pictures import input_kind, pictures_of, references_of
 from tomo_polysplat.scan.hdf5 import find_array, find_group, is_in_radians, opened, read_numbers, read_text
 from tomo_polysplat.scan.readers.acquisition import Acquisition
 from tomo_polysplat.scan.readers.frames import ArrayFrames, Frames, Hdf5Frames
@@ -67,6 +68,7 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
             ),
             flats=white,
             darks=dark,
+            top_first=known.get("beam") != "parallel",
         )
     if degrees is not None and not {"degrees", "arc"} & known.keys():
         known["degrees"] = degrees
@@ -75,12 +77,13 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
 
 def _frames(file: h5py.File, name: str, size: tuple[int, ...]) -> Frames | None:
     """Pictures of the open beam or of no light; one alone may have no axis for their number."""
-    found = find_array(file, f"exchange/{name}")
-    if found is None:
-        return None
-    if found.ndim == 2:
-        return ArrayFrames(read_numbers(file, f"exchange/{name}", size)[None])
-    return Hdf5Frames(found, np.arange(len(found)))
+    found = references_of(file, name)
+    if len(found) == 1 and found[0].ndim == 3:
+        return Hdf5Frames(found[0], np.arange(len(found[0])))
+    parts = [
+        read_numbers(file, frames.name, frames.shape).reshape(-1, *frames.shape[-2:]) for frames in found
+    ]
+    return ArrayFrames(np.concatenate(parts)) if parts else None
 
 
 def _degrees(file: h5py.File, views: int) -> np.ndarray | None:

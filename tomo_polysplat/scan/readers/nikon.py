@@ -16,7 +16,7 @@ import numpy as np
 
 from tomo_polysplat.checks import fail, require_number
 from tomo_polysplat.physics.filter_text import filters_of
-from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
+from tomo_polysplat.scan.readers.acquisition import Acquisition, Guess, Setup, Tube
 from tomo_polysplat.scan.readers.entries import entries_of
 from tomo_polysplat.scan.readers.files_of_scans import the_one
 from tomo_polysplat.scan.readers.frames import TiffFrames
@@ -79,13 +79,14 @@ def _pictures(folder: Path, text: IniText, name: str) -> list[Path]:
     inner = folder / Path(text.text("InputFolderName").replace("\\", "/")).name
     # One of the scan's own name holds the slices, as Inspect-X writes them.
     within = [place for place in entries_of(folder) if has_word(place.name, "projections")]
-    for place in (folder, inner, *within):
-        tiffs = tiffs_in(place) if place.is_dir() else []
-        named = [f for f in tiffs if re.fullmatch(rf"{re.escape(name)}_*\d+", f.stem, re.I)]
-        numbered = [f for f in tiffs if re.search(r"\d+$", f.stem)]
-        rest = [f for f in numbered if not (has_word(f.stem, "flats") or has_word(f.stem, "darks"))]
-        if named or rest:
-            return in_order(named or rest)
+    tiffs = [tiffs_in(place) for place in (folder, inner, *within) if place.is_dir()]
+    named = [[f for f in some if re.fullmatch(rf"{re.escape(name)}_*\d+", f.stem, re.I)] for some in tiffs]
+    numbered = [[f for f in some if re.search(r"\d+$", f.stem)] for some in tiffs]
+    rest = [
+        [f for f in some if not (has_word(f.stem, "flats") or has_word(f.stem, "darks"))] for some in numbered
+    ]
+    if found := next((some for some in (*named, *rest) if some), None):
+        return in_order(found)
     raise fail("path", f"TIFFs named {name}_0001.tif and so on", f"none in {folder}")
 
 
@@ -110,11 +111,10 @@ def _setup(text: IniText, folder: Path, numbers: np.ndarray) -> tuple[Setup, lis
     aside = text.number("ObjectOffsetX", otherwise=0.5 * (top + bottom) * near / far)
     leaning = -np.degrees(np.arctan2(top - bottom, height)) if height else 0.0
     roll = text.number("ObjectRoll", otherwise=float(leaning))
-    said = []
+    said: list[str] = []
     if "ObjectOffsetX" not in text and not (top or bottom):
-        said.append(
-            "no centre of rotation: the axis is taken to fall on the detector's middle; give offset= otherwise"
-        )
+        axis = "no centre of rotation: the axis is taken to fall on the detector's middle; give offset= otherwise"
+        said.append(Guess(axis, "offset"))
     right, up = (text.number(f"DetectorOffset{axis}", otherwise=0.0) for axis in "XY")
     tilt = text.number("ObjectTilt", otherwise=0.0)
     degrees, more = _degrees(text, folder, numbers)
@@ -124,9 +124,10 @@ def _setup(text: IniText, folder: Path, numbers: np.ndarray) -> tuple[Setup, lis
 
 def _degrees(text: IniText, folder: Path, numbers: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """Even steps, unless angles were measured that differ from them; the steps tell the sense."""
-    said = []
+    said: list[str] = []
     if "AngularStep" not in text:
-        said.append(f"no AngularStep: {numbers[-1] + 1} views are taken to make one full turn")
+        turn = f"no AngularStep: {numbers[-1] + 1} views are taken to make one full turn"
+        said.append(Guess(turn, "arc", "degrees"))
     step = text.number("AngularStep", otherwise=360.0 / (numbers[-1] + 1))
     start = text.number("InitialAngle", otherwise=0.0)
     even = step * numbers
@@ -174,5 +175,6 @@ def _tube(text: IniText) -> tuple[Tube, list[str]]:
     if material.lower() == "none" or (told and size == 0):
         return Tube(kvp, {}), []
     if material and not told:
-        return Tube(kvp), [f"a filter of {material} without its thickness: give filter='{material} ...mm'"]
+        unclear = f"a filter of {material} without its thickness: give filter='{material} ...mm'"
+        return Tube(kvp), [Guess(unclear, "filter")]
     return Tube(kvp, filters_of(f"{material} {size}mm") if material else None), []

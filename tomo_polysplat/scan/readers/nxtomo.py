@@ -30,10 +30,18 @@ from tomo_polysplat.scan.hdf5 import (
     read_text,
     text_attribute,
 )
-from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup
+from tomo_polysplat.scan.readers.acquisition import Acquisition, Guess, Setup
 from tomo_polysplat.scan.readers.files_of_scans import hdf5_files, the_one
 from tomo_polysplat.scan.readers.frames import Hdf5Frames
-from tomo_polysplat.scan.readers.nxtomo_entry import KEYS, detector_of, entry_of, group_of, names_in
+from tomo_polysplat.scan.readers.nxtomo_entry import (
+    CONTROL,
+    KEYS,
+    detector_of,
+    entries_with_pictures,
+    entry_of,
+    group_of,
+    names_in,
+)
 from tomo_polysplat.scan.readers.stated import require_known, stated_over
 
 if TYPE_CHECKING:
@@ -45,7 +53,9 @@ __all__ = ["KIND", "read", "recognises"]
 
 KIND = "NXtomo (HDF5)"
 _SUFFIXES = (".nx", ".nxs", ".h5", ".hdf5", ".hdf")
-_PROJECTION, _FLAT, _DARK = 0, 1, 2
+_PROJECTION, _FLAT, _DARK, _WAY_BACK = 0, 1, 2, -1
+# Counts of the beam in each picture, and the share by which they may change and say nothing.
+_MONITOR, _STEADY = "control/data", 1e-3
 _SOURCE = "instrument/source/distance"
 # Names of turns among Diamond's motors, and how those of positions that were asked for end.
 _ANGLE, _ASKED_FOR = re.compile("rot|theta|angle"), "_set"
@@ -69,6 +79,12 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
         entry = entry_of(file)
         assert entry is not None  # it was recognised by that
         told = _told(file_of_scan, entry)
+        entries, read = entries_with_pictures(file), entry.name.split("/")[1]
+    if len(entries) > 1:
+        others = ", ".join(name for name in entries if name != read)
+        told = told.saying(
+            f"the entry {read} is read; others of the file ({others[:200]}) want a file of their own"
+        )
     return stated_over(told, require_known(stated, "scanner"), file_of_scan.parent)
 
 
@@ -85,6 +101,7 @@ def _told(path: Path, entry: h5py.Group) -> Acquisition:
         raise fail("path", f"pictures in {detector}/data, (pictures, rows, columns)", got)
     name = next(key for key in KEYS if find_array(entry, f"{detector}/{key}") is not None)
     keys = read_numbers(entry, f"{detector}/{name}", (len(data),))
+    keys, said = _without_way_back(entry, detector, keys)
     angles = _degrees(entry, detector, len(data))
     frames = {key: np.flatnonzero(keys == key) for key in (_PROJECTION, _FLAT, _DARK)}
     if not len(frames[_PROJECTION]):
@@ -92,7 +109,7 @@ def _told(path: Path, entry: h5py.Group) -> Acquisition:
             "path", "pictures of image_key 0, the projections", f"keys {sorted(set(keys.tolist()))}"[:200]
         )
     stacks = {key: Hdf5Frames(data, chosen) for key, chosen in frames.items() if len(chosen)}
-    setup, unit, said = _setup(entry, detector, angles[frames[_PROJECTION]], data.shape[2])
+    setup, unit, more = _setup(entry, detector, angles[frames[_PROJECTION]], data.shape[2])
     told = Acquisition(
         KIND,
         stacks[_PROJECTION],
@@ -101,12 +118,47 @@ def _told(path: Path, entry: h5py.Group) -> Acquisition:
         unit=unit,
         flats=stacks.get(_FLAT),
         darks=stacks.get(_DARK),
+        light=_light(entry, frames),
         exposure=_first(entry, f"{detector}/count_time"),
         other=_others(entry, detector),
     )
     if _DARK not in stacks:
-        said.append("no dark pictures: without light a pixel is taken to count 0")
-    return _unflipped(told.saying(*said), entry, detector)
+        said.append(
+            Guess("no dark pictures: without light a pixel is taken to count 0; give darks=", "darks")
+        )
+    if told.light is not None:
+        ends = f"{told.light.min():.3g} to {told.light.max():.3g}"
+        monitor = (
+            f"the light of the views is taken to be {ends} times that of the flats, as control/data counts it"
+        )
+        said.append(Guess(monitor, "flats"))
+    return _unflipped(told.saying(*said, *more), entry, detector)
+
+
+def _without_way_back(entry: h5py.Group, detector: str, keys: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """Keys of which pictures for alignment, taken on the way back, have none of ours; and what to say of them."""
+    if not _is_there(entry, f"{detector}/{CONTROL}", len(keys)):
+        return keys, []
+    control = read_numbers(entry, f"{detector}/{CONTROL}", (len(keys),))
+    back = (control == _WAY_BACK) & (keys == _PROJECTION)
+    if not back.any():
+        return keys, []
+    words = f"{np.count_nonzero(back)} pictures of the way back ({CONTROL} {_WAY_BACK}) are left out"
+    return np.where(back, _WAY_BACK, keys), [words]
+
+
+def _light(entry: h5py.Group, frames: Mapping[int, np.ndarray]) -> np.ndarray | None:
+    """The beam in each view over that in the flats, by the monitor's counts; None where they tell of no change."""
+    pictures = sum(map(len, frames.values()))
+    found = find_array(entry, _MONITOR) if _MONITOR.partition("/")[0] in entry else None
+    if found is None or found.ndim != 1 or len(found) < pictures or not len(frames[_FLAT]):
+        return None
+    counts = read_numbers(entry, _MONITOR, found.shape).astype(np.float64)
+    used = counts[np.concatenate([frames[_PROJECTION], frames[_FLAT]])]
+    if not (np.isfinite(used).all() and (used > 0).all()):
+        return None
+    light = counts[frames[_PROJECTION]] / counts[frames[_FLAT]].mean()
+    return light if np.abs(light - 1).max() > _STEADY else None
 
 
 def _degrees(entry: h5py.Group, detector: str, pictures: int) -> np.ndarray:
@@ -193,18 +245,21 @@ def _setup(
     sides = [_length(entry, f"{detector}/{axis}_pixel_size") for axis in "xy"]
     behind, before = _length(entry, f"{detector}/distance"), _length(entry, _SOURCE)
     width, height = (side or sides[1 - k] or 0.0 for k, side in enumerate(sides))
-    said, unit = [], "mm"
+    said: list[str] = []
+    unit = "mm"
     if not width:
         width = height = 1.0
         unit, before = "pixel", None
-        said.append("the pixel is not known: lengths are in pixels; give pixel=")
+        said.append(Guess("the pixel is not known: lengths are in pixels; give pixel=", "pixel"))
     shift, counted = _axis_column(entry, detector, columns)
     said += counted
     if shift is None:
-        said.append("the axis is taken to fall on the detector's middle; give offset= if it does not")
+        axis = "the axis is taken to fall on the detector's middle; give offset= if it does not"
+        said.append(Guess(axis, "offset"))
     setup = Setup(degrees, (width, height), offset=(-(shift or 0.0) * width, 0.0))
     if not before or not behind or before > _FAR * behind:
-        said.append("the beam is taken to be parallel; give source_object= and source_detector= if it is not")
+        parallel = "the beam is taken to be parallel; give source_object= and source_detector= if it is not"
+        said.append(Guess(parallel, "beam", "source_object", "source_detector"))
         return setup, unit, said
     return replace(setup, source_object=before, source_detector=before + behind), unit, said
 

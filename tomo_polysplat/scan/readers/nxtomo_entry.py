@@ -11,9 +11,10 @@ from tomo_polysplat.scan.hdf5 import find_array, find_group
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["KEYS", "detector_of", "entry_of", "group_of", "names_in"]
+__all__ = ["CONTROL", "KEYS", "detector_of", "entries_with_pictures", "entry_of", "group_of", "names_in"]
 
-KEYS = ("image_key", "image_key_control")
+CONTROL = "image_key_control"
+KEYS = ("image_key", CONTROL)
 _USUAL = "detector"
 _MOST_ENTRIES = 100
 
@@ -27,6 +28,12 @@ def entry_of(file: h5py.File) -> h5py.Group | None:
             return group
         found = group if found is None and detector is not None else found
     return found
+
+
+def entries_with_pictures(file: h5py.File) -> list[str]:
+    """Names of the entries that have pictures and their keys, or have a group that has."""
+    found = (group.name.split("/")[1] for group, _ in _groups(file) if _detector_within(group) is not None)
+    return list(dict.fromkeys(found))
 
 
 def _detector_within(group: h5py.Group) -> str | None:

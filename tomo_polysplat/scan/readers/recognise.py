@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ _MOST_NAMED = 3
 # Pictures for the eye.
 _LOSSY = {".jpg", ".jpeg", ".png", ".bmp", ".gif"}
 # The first one that recognises what it is shown reads it: what any folder of pictures is comes last.
+_OF_ANY_TOML = (npz_stack, picture_stack)
 READERS = (skyscan, nikon, xradia, nxtomo, cil_nexus, rtk, esrf, npz_stack, picture_stack)
 _REMEDY = (
     "name the folder or the file that the scanner wrote; docs/scanner_files.md tells what is read of each"
@@ -54,13 +56,13 @@ def acquisition_of(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     """
     for reader in READERS[:-1]:
         if reader.recognises(path):
-            return reader.read(path, stated)
+            return _read(reader, path, stated)
     if path.is_dir() and not (pictures_in(path) or picture_stack.toml_files(path)):
         inside = [(folder, reader) for folder in _folders_of_scans(path) for reader in READERS[:-1]]
         scans = [(folder, reader) for folder, reader in inside if reader.recognises(folder)]
         if scans:
             folder = the_one([folder for folder, _ in scans], "one scan in the folder", "name one")
-            return scans[0][1].read(folder, stated).saying(f"what is read is {folder.name} in {path.name}")
+            return _read(scans[0][1], folder, stated).saying(f"what is read is {folder.name} in {path.name}")
     if picture_stack.recognises(path):
         if path.is_file() and "pixel" not in stated:
             _refuse_one_picture(path)
@@ -78,6 +80,17 @@ def acquisition_of(path: Path, stated: Mapping[str, Any]) -> Acquisition:
         f"{path}, which is none of these",
         _remedy(path),
     )
+
+
+def _read(reader: Any, path: Path, stated: Mapping[str, Any]) -> Acquisition:
+    """By this reader, with what stands in a file scan.toml beside a scanner's own text."""
+    beside = (path if path.is_dir() else path.parent) / "scan.toml"
+    if reader in _OF_ANY_TOML or not beside.is_file():
+        return reader.read(path, stated)
+    written, other = picture_stack.written_beside(beside)
+    told = reader.read(path, picture_stack.stated_beside(written, stated))
+    keys = ", ".join(written) or "nothing that is known"
+    return replace(told, other={**told.other, **other}).saying(f"scan.toml beside it is followed: {keys}")
 
 
 def _refuse_one_picture(path: Path) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 
 from tomo_polysplat.checks import fail, require_number
 from tomo_polysplat.physics.filter_text import filters_of
-from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
+from tomo_polysplat.scan.readers.acquisition import Acquisition, Guess, Setup, Tube
 from tomo_polysplat.scan.readers.entries import entries_of
 from tomo_polysplat.scan.readers.files_of_scans import the_one
 from tomo_polysplat.scan.readers.frames import TiffFrames
@@ -148,9 +148,10 @@ def _setup(log: IniText, numbers: np.ndarray, rows: int) -> tuple[Setup, list[st
     width = object_pixel * far / near
     ratio = log.number("CameraXYRatio", "Camera X/Y Ratio", otherwise=1.0)
     if abs(ratio - 1) > _ROUND:
-        said.append(
+        wide = (
             f"pixels are taken to be {ratio:g} times as wide as high (CameraXYRatio); give pixel= otherwise"
         )
+        said.append(Guess(wide, "pixel"))
     height = width / (ratio if ratio > 0 else 1.0)
     middle = (rows - 1) / 2
     line = log.number("Optical Axis (line)", otherwise=middle)
@@ -159,14 +160,17 @@ def _setup(log: IniText, numbers: np.ndarray, rows: int) -> tuple[Setup, list[st
         line = middle
     tilt = log.number("Image Rotation", otherwise=0.0)
     if tilt:
-        said.append(
+        rolled = (
             f"the camera's rotation of {tilt:g} degrees is not undone; give roll={tilt:g} or roll={-tilt:g}, or "
             "reconstruct with align=True (--align), which finds it"
         )
+        said.append(Guess(rolled, "roll"))
     # Of several positions the scanner has put the pictures together.
     together = log.number("Number Of Horizontal Offset Positions", otherwise=1.0) > 1
     if "ON" in log.text("Camera Offset").upper() and not together:
-        said.append("the camera was offset: is that in the pictures? give offset= if it is not")
+        said.append(
+            Guess("the camera was offset: is that in the pictures? give offset= if it is not", "offset")
+        )
     sense, guess = _sense(log)
     degrees = sense * _step(log, numbers) * numbers
     setup = Setup(degrees, (width, height), offset=(0.0, (middle - line) * height))
@@ -222,9 +226,8 @@ def _postalignment(log: IniText, folder: Path) -> tuple[float, list[str]]:
     found = (text.number(*keys, otherwise=0.0) for text in (log, *beside))
     shift = next((shift for shift in found if shift), log.number("Postalignment", otherwise=0.0))
     if shift == 0:
-        said.append(
-            "no Postalignment in the log: the axis is taken to fall on the detector's middle; give offset= else"
-        )
+        axis = "no Postalignment in the log: the axis is taken to fall on the detector's middle; give offset= else"
+        said.append(Guess(axis, "offset"))
     return shift, said
 
 

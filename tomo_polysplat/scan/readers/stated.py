@@ -13,7 +13,7 @@ import numpy as np
 
 from tomo_polysplat.checks import did_you_mean, fail, require_array, require_choice, require_number
 from tomo_polysplat.physics.filter_text import require_filters
-from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
+from tomo_polysplat.scan.readers.acquisition import Acquisition, Guess, Setup, Tube
 from tomo_polysplat.scan.readers.angle_text import angles_in, require_degrees
 from tomo_polysplat.scan.readers.picture_files import frames_of
 from tomo_polysplat.scan.readers.picture_names import named_files
@@ -147,6 +147,11 @@ def stated_over(told: Acquisition, stated: Mapping[str, Any], folder: Path) -> A
             told = replace(told, **{name: frames_of(named_files(folder, stated[name], name))})  # type: ignore[arg-type]
     return replace(
         told,
+        # A monitor compares views with the flats beside them.
+        light=None if "flats" in stated else told.light,
+        said=tuple(
+            words for words in told.said if not (isinstance(words, Guess) and stated.keys() & words.unless)
+        ),
         tube=tube,
         name=str(stated.get("name", told.name)),
         unit=require_choice("unit", stated.get("unit", told.unit), LENGTH_UNITS),

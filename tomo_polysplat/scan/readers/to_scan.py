@@ -68,6 +68,8 @@ def scan_from_acquisition(told: Acquisition, options: ReadOptions, part: Part) -
     told, flat, dark = _open_beam(told, kind, pictures)
     counts = Counts(lambda: nullcontext(pictures.views), pictures.shape, kind, flat, dark, limit)
     projections, valid, rays = line_integrals(counts, options.progress)
+    if told.light is not None and kind == "counts" and told.flats is not None:
+        projections += np.log(told.light[pictures.chosen]).astype(np.float32)[:, None]
     if told.flats is None and told.white is None and flat is not None:
         _require_light(told, float(flat.max()), rays["no_light"] / valid.size)
     _require_possible(told, kind, projections, valid)

@@ -16,7 +16,7 @@ import numpy as np
 
 from tomo_polysplat.checks import fail
 from tomo_polysplat.physics.filter_text import filters_of
-from tomo_polysplat.scan.readers.acquisition import Acquisition, Setup, Tube
+from tomo_polysplat.scan.readers.acquisition import Acquisition, Guess, Setup, Tube
 from tomo_polysplat.scan.readers.compound import CompoundFile, is_compound
 from tomo_polysplat.scan.readers.entries import entries_of
 from tomo_polysplat.scan.readers.files_of_scans import the_one
@@ -110,7 +110,8 @@ def _told(file: CompoundFile | XrmSeries, frames: Frames, flats: Frames | None, 
     """All that the file, or the files of single views, tell."""
     setup, shifts, said = _setup(file, frames.shape[0])
     if flats is not None:
-        said.append("no dark pictures: without light a pixel is taken to count 0; give darks= if it does not")
+        dark = "no dark pictures: without light a pixel is taken to count 0; give darks= if it does not"
+        said.append(Guess(dark, "darks"))
     parts: dict[str, Any] = {"flats": flats, "tube": _tube(file), "shifts": shifts, "other": _others(file)}
     return Acquisition(KIND, frames, setup, top_first=False, **parts, **known).saying(*said)
 
@@ -169,7 +170,8 @@ def _setup(file: CompoundFile | XrmSeries, views: int) -> tuple[Setup, np.ndarra
             f"the axis is {centre:g} columns off, as ReconSettings tells; AutoRecon tells {centres[1]:g}"
         )
     if not centre:
-        said.append("the axis is taken to fall on the detector's middle; give offset= if it does not")
+        axis = "the axis is taken to fall on the detector's middle; give offset= if it does not"
+        said.append(Guess(axis, "offset"))
     setup = replace(setup, offset=(centre * setup.pixel, 0.0))  # type: ignore[operator]
     return setup, _shifts(file, views), said
 
