@@ -38,7 +38,6 @@ from tomo_polysplat.plan.depth import weights_by_depth
 from tomo_polysplat.plan.lab import Lab, Untold
 from tomo_polysplat.plan.trial import views_of_short_steps
 from tomo_polysplat.settings import Settings
-from tomo_polysplat.start.initial import FEW_VIEWS
 
 __all__ = ["TvFactor"]
 
@@ -217,8 +216,6 @@ def _why_not(seeds: int, passes: float, problem: Problem, settings: Settings) ->
         return "there is nothing to smooth"
     if passes < _FEWEST_PASSES:
         return "in so few passes short fits would take too long a part"
-    if not problem.planar and problem.geometry.views < FEW_VIEWS:
-        return f"fewer than {FEW_VIEWS} views do not tell"
     if not settings.held_out:
         return "no rays are held out"
     if _HELD_OUT * problem.projections.size < _FEWEST_HELD_OUT:
