@@ -152,7 +152,9 @@ def _solve(
 ) -> None:
     """Reconstruct slices that share a geometry, into `recon`."""
     from tomo_polysplat.scan.geometry import from_astra
+    from tomo_polysplat.scan.layout import spatial_geometry
 
+    spatial_geometry(dict(proj_geom))
     remedy = "TomoPy makes one slice per detector row, of num_gridx x num_gridy pixels"
     shape = from_astra(proj_geom, vol_geom)[1].shape
     require_shape("recon", recon, shape, "of vol_geom (slices, rows, columns)", remedy)

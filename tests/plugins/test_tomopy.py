@@ -296,3 +296,13 @@ def test_the_scale_and_orientation_of_tomopys_own_algorithms():
         turned = (ours[::-1], ours[:, ::-1], ours[:, :, ::-1], ours.transpose(0, 2, 1))
         likeness = [np.corrcoef(other.ravel(), array.ravel())[0, 1] for array in (ours, *turned)]
         assert likeness[0] > 0.95 and likeness[0] > max(likeness[1:]) + 0.02
+
+
+def test_a_geometry_of_one_plane_is_named(tomopy):
+    """The plugin has slices: ASTRA's two-dimensional geometry would fit one of them only."""
+    astra = pytest.importorskip("astra")
+    theta = np.linspace(0, np.pi, 20, endpoint=False)
+    flat = astra.create_proj_geom("parallel", 1.0, 24, theta)
+    options = {"proj_geom": flat, "vol_geom": astra.create_vol_geom(24, 24, 1)}
+    with pytest.raises(ValueError, match="three-dimensional geometry with one detector row"):
+        tomopy.recon(np.ones((20, 1, 24), np.float32), theta, algorithm=polysplat, options=options)

@@ -301,3 +301,15 @@ def test_what_is_done_to_a_volume_does_not_change_what_is_saved(tmp_path):
 def test_results_are_compared_as_objects():
     one = polychromatic()
     assert one == one and one != polychromatic()
+
+
+def test_another_energy_makes_another_volume(tmp_path):
+    """Also in a file, where the number beside the volume has to be that of its energy."""
+    result = polychromatic()
+    before = result.volume.copy()
+    result.energy_kev = 80.0
+    expected = result.attenuation(80.0)
+    np.testing.assert_array_equal(result.volume, expected)
+    assert np.abs(before - expected).max() > 0.01 * before.max()
+    result.save(tmp_path / "other.h5")
+    np.testing.assert_array_equal(Result.load(tmp_path / "other.h5").volume, expected)

@@ -16,8 +16,9 @@ from tomo_polysplat.scan.centre import estimate_centre
         np.linspace(0, 180, 90, endpoint=False),
         np.linspace(-30, 330, 120, endpoint=False),
         np.random.default_rng(0).permutation(np.linspace(0, 180, 61)),
+        np.repeat(np.linspace(0, 180, 60, endpoint=False), 2),
     ],
-    ids=["half turn", "last angle left out", "full turn", "shuffled"],
+    ids=["half turn", "last angle left out", "full turn", "shuffled", "each angle twice"],
 )
 @pytest.mark.parametrize("centre", [CENTRE, 31.5, 38.75])
 def test_rotation_axis_is_found(theta, centre):

@@ -287,3 +287,28 @@ def test_a_scan_is_checked_when_it_is_made():
         replace(scan, unit="inch")
     with pytest.raises(ValueError, match="projections.*as proj_geom says"):
         replace(scan, projections=scan.projections[:, :-1], valid=None)
+
+
+@pytest.mark.parametrize("suffix", ["h5", "npz"])
+def test_a_volume_that_somebody_chose_is_that_of_a_part_too(tmp_path, suffix):
+    path = tmp_path / f"things.{suffix}"
+    save_scan(cone_scan(), path)
+    chosen = volume_geometry(np.array([6, 4, 5]), np.array([-1.0, 4.0, 0.5, 4.5, -3.0, 3.0]))
+    for part in ({"views": 2}, {"rows": (1, 3)}, {"columns": (1, 5)}, {"binning": 2}):
+        assert load_scan(path, vol_geom=chosen, **part).vol_geom == chosen, part
+    # One that is not about the z axis stays where it is, of coarser voxels.
+    save_scan(replace(cone_scan(), vol_geom=chosen, truth=None, metal_mask=None), path, overwrite=True)
+    grid = from_astra(cone_scan().proj_geom, load_scan(path, binning=2).vol_geom)[1]
+    np.testing.assert_allclose([grid.lower[:2], grid.upper[:2]], [[-1.0, 0.5], [4.0, 4.5]])
+    np.testing.assert_allclose(grid.voxel_size[:2], [5 / 2, 4 / 2])
+
+
+def test_a_volume_as_astra_itself_describes_it_is_saved(tmp_path):
+    """ASTRA gives a volume's window under another word than it takes it; without one voxels have edges of 1."""
+    scan = cone_scan()
+    plain = {key: scan.vol_geom[key] for key in ("GridColCount", "GridRowCount", "GridSliceCount")}
+    for number, told in enumerate((plain | {"options": scan.vol_geom["option"]}, plain)):
+        path = tmp_path / f"{number}.npz"
+        save_scan(replace(scan, vol_geom=told), path)
+        expected, back = (from_astra(scan.proj_geom, geom)[1] for geom in (told, load_scan(path).vol_geom))
+        np.testing.assert_array_equal([back.lower, back.upper], [expected.lower, expected.upper])

@@ -16,6 +16,7 @@ from tomo_polysplat.physics.water import areal_density
 from tomo_polysplat.quality.refit import fit_again, geometry_of, levels_of, require_scan_of, voxel_edge
 from tomo_polysplat.result.detail import Contrast
 from tomo_polysplat.result.result import Result
+from tomo_polysplat.scan.flattened import flattened
 from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, from_astra
 from tomo_polysplat.scan.scan import Scan
 from tomo_polysplat.units import cm_per
@@ -73,6 +74,7 @@ def contrast(
     added = require_number("added", added, above=0, at_most=1)
     sizes = [require_number("diameters", one, above=0) for one in diameters]
     require_scan_of(result, scan)
+    scan = flattened(scan)
     without, voxel = result.volume_zyx, voxel_edge(result.grid)
     radii = 0.5 * voxel * np.array(sizes)
     balls = places_for_balls(without, result, radii, seed)

@@ -13,6 +13,7 @@ from tomo_polysplat.plan.answer import Status
 from tomo_polysplat.reconstruction import reconstruct
 from tomo_polysplat.result.filter_found import filter_of
 from tomo_polysplat.result.result import Result
+from tomo_polysplat.scan.flattened import flattened
 from tomo_polysplat.scan.scan import Scan
 from tomo_polysplat.scan.volume_grid import VolumeGrid
 from tomo_polysplat.settings import Settings
@@ -83,6 +84,7 @@ def fit_again(
     progress: Any = None,
 ) -> np.ndarray:
     """(z, y, x) volume of a fit of other ``projections``, of some ``views``, or both, else as the result was made."""
+    scan = flattened(scan)
     proj_geom = geometry_of(result, scan)
     values = scan.projections if projections is None else projections
     valid, spectrum = scan.usable, result.spectrum if result.materials is not None else None

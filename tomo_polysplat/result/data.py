@@ -54,6 +54,12 @@ class ResultData:
     flipped_2d: bool = False
     residuals: Residuals | None = None
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        object.__setattr__(self, name, value)
+        if name == "energy_kev":
+            # It was made at another energy.
+            self.__dict__.pop("volume", None)
+
     def __post_init__(self) -> None:
         self.basis = np.ascontiguousarray(require_array("basis", self.basis, 4), np.float32)
         channels = 1 if self.materials is None else 3

@@ -19,6 +19,7 @@ from tomo_polysplat.scan.volume_grid import VolumeGrid, require_count
 __all__ = [
     "from_astra",
     "geometry_from_astra",
+    "grid_from_astra",
     "is_planar_geometry",
     "projections_from_astra",
     "require_projections",
@@ -73,7 +74,7 @@ def from_astra(proj_geom: Mapping[str, Any], vol_geom: Mapping[str, Any]) -> tup
         kinds = [f"a {'2D' if is_planar_geometry(g) else '3D'} one" for g in (proj_geom, vol_geom)]
         remedy = "give create_vol_geom (rows, columns) in 2D or (rows, columns, slices) in 3D"
         raise fail("vol_geom", f"{kinds[0]} to go with proj_geom {kind!r}", kinds[1], remedy)
-    grid = _volume_grid(vol_geom)
+    grid = grid_from_astra(vol_geom)
     geometry = geometry_from_astra(proj_geom)
     _check_source(geometry, grid)
     _log.debug("%s", geometry.describe())
@@ -162,7 +163,7 @@ def require_projections(array: Any, proj_geom: Mapping[str, Any]) -> None:
 def volume_from_astra(volume: Any, vol_geom: Mapping[str, Any]) -> np.ndarray:
     """A volume ``(z, y, x)`` with y ascending, from ASTRA's ``(z, y, x)`` or 2D image (row 0 at +y)."""
     array = require_array("volume", volume)
-    grid = _volume_grid(vol_geom)
+    grid = grid_from_astra(vol_geom)
     expected = grid.shape[1:] if is_planar_geometry(vol_geom) else grid.shape
     if array.shape != expected:
         order = "(y, x)" if len(expected) == 2 else "(z, y, x)"
@@ -196,7 +197,8 @@ def _number_of_views(proj_geom: Mapping[str, Any]) -> int:
     return len(_entry(proj_geom, "Vectors" if _type_of(proj_geom).endswith("_vec") else "ProjectionAngles"))
 
 
-def _volume_grid(vol_geom: Mapping[str, Any]) -> VolumeGrid:
+def grid_from_astra(vol_geom: Mapping[str, Any]) -> VolumeGrid:
+    """The volume of ASTRA's geometry of one; without a window its voxels have edges of 1."""
     names = {"X": "GridColCount", "Y": "GridRowCount", "Z": "GridSliceCount"}
     planar = is_planar_geometry(vol_geom)
     counts, lower, upper = [], [], []

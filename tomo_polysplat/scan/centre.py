@@ -22,6 +22,8 @@ SMALLEST_OVERLAP = 0.08
 _MOST_ROWS, _MOST_LINES, _PARTS = 128, 2048, 16
 # Rows transformed together: few enough to stay in cache.
 _ROWS_AT_ONCE = 8
+# Radians by which one angle is the same as another.
+_SAME = 1e-6
 
 
 def estimate_centre(projections: np.ndarray, angles: np.ndarray, valid: np.ndarray | None = None) -> float:
@@ -108,15 +110,20 @@ def _opposite_views(angles: np.ndarray, most: int) -> _Pairs:
     A scan over 0 to 180 degrees that leaves the last angle out has no exact pair: the missing view is then
     extrapolated from the two nearest, by at most one step.
     """
-    ordered = np.sort(np.mod(angles, 2 * np.pi))
-    step = float(np.median(np.diff(ordered))) if len(ordered) > 2 else 0.0
+    gaps = np.diff(np.sort(np.mod(angles, 2 * np.pi)))
+    # An angle may be there more than once.
+    gaps = gaps[gaps > _SAME]
+    step = float(np.median(gaps)) if len(gaps) > 1 else 0.0
     found = []
     for view in range(len(angles)):
         away = np.angle(np.exp(1j * (angles - angles[view] - np.pi)))
-        first, second = np.argsort(np.abs(away))[:2]
-        if abs(away[first]) < 1e-6:
+        near = np.argsort(np.abs(away))
+        first = near[0]
+        others = near[np.abs(away[near] - away[first]) > _SAME]
+        if abs(away[first]) < _SAME:
             found.append((view, first, first, 0.0))
-        elif abs(away[first]) <= 1.01 * step and away[second] != away[first]:
+        elif abs(away[first]) <= 1.01 * step and len(others):
+            second = others[0]
             found.append((view, first, second, away[first] / (away[first] - away[second])))
     if not found:
         raise fail(

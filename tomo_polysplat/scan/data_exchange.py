@@ -98,7 +98,7 @@ def scan_from_hdf5(path: Path, options: ReadOptions, part: Part = _ALL) -> Scan:
         _report_defects(notes["rays"], left_out, counts.size)
         views, rows, columns = data.shape
         whole = _geometry(file, (rows, views, columns), (projections, valid, wanted), options, notes)
-        geometry, same = wanted.geometries(whole)
+        geometry, same = wanted.geometries(whole, options.vol_geom)
         known = _knowledge(file, whole["vol_geom"], options)
         if not same:
             known |= {"truth": None, "metal_mask": None}
@@ -115,7 +115,7 @@ def scan_from_hdf5(path: Path, options: ReadOptions, part: Part = _ALL) -> Scan:
         )
         usual = options.proj_geom is None and options.vol_geom is None
         own = find_group(file, "polysplat/geometry") is not None
-    scan = scan if later.whole else scan_part(scan, later)
+    scan = scan if later.whole else scan_part(scan, later, options.vol_geom)
     return with_room(scan) if usual and not own else scan
 
 

@@ -136,7 +136,7 @@ def load_scan(
     if reader is scan_from_hdf5:
         return scan_from_hdf5(existing_file(path), options, part)
     scan = reader(existing_file(path), options)
-    return scan if part.whole else scan_part(scan, part)
+    return scan if part.whole else scan_part(scan, part, options.vol_geom)
 
 
 def is_of_scanner(path: str | os.PathLike, scanner: Mapping[str, Any]) -> bool:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from tomo_polysplat.checks import fail, require_array, require_choice, require_shape
+from tomo_polysplat.scan.geometry import grid_from_astra
 
 __all__ = [
     "spatial_geometry",
@@ -63,5 +64,5 @@ def spatial_geometry(proj_geom: dict[str, Any]) -> dict[str, Any]:
 
 def window_of(vol_geom: dict[str, Any]) -> np.ndarray:
     """Window (xmin, xmax, ymin, ymax, zmin, zmax) of an ASTRA volume geometry."""
-    names = [f"Window{side}{axis}" for axis in "XYZ" for side in ("Min", "Max")]
-    return np.array([vol_geom["option"][name] for name in names], np.float64)
+    grid = grid_from_astra(vol_geom)
+    return np.stack([grid.lower, grid.upper], axis=1).reshape(-1)

@@ -19,6 +19,8 @@ __all__ = ["OppositeRays", "RaysAndOpposites"]
 
 # Gaps between views of more than this many usual ones are not bridged.
 _GAP = 2.5
+# Radians by which one angle is the same as another.
+_SAME_ANGLE = 1e-6
 # Columns by which no matter on the detector moves between views that are taken for the same.
 _STILL = 0.02
 # Views next to the seam of half a turn are evenly spaced to this share of a step.
@@ -288,7 +290,9 @@ class OppositeRays:
 
     @cached_property
     def _step(self) -> float:
-        return float(np.median(self._gaps))
+        # An angle may be there more than once.
+        gaps = self._gaps[self._gaps > _SAME_ANGLE]
+        return float(np.median(gaps)) if len(gaps) else 0.0
 
     @property
     def _still(self) -> float:

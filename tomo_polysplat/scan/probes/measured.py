@@ -12,6 +12,7 @@ from tomo_polysplat.scan.apart_columns import apart_columns
 from tomo_polysplat.scan.counts import Counts, Marks
 from tomo_polysplat.scan.defects import fill_invalid
 from tomo_polysplat.scan.dropouts import dropped_rays
+from tomo_polysplat.scan.flattened import flattened
 from tomo_polysplat.scan.geometry import Geometry, from_astra
 from tomo_polysplat.scan.probes.air import Air, look_for_air
 from tomo_polysplat.scan.rotation_axis import axis_column, azimuth_of_views, reach_of, rotation_axis
@@ -33,6 +34,10 @@ class Measured:
     """Pixels not to look at, (rows, columns)."""
     beam: float = 0.0
     """What all rays hold beside what they pass."""
+
+    def __post_init__(self) -> None:
+        # Probes look at pixels where the geometry has them.
+        object.__setattr__(self, "scan", flattened(self.scan))
 
     @cached_property
     def _told(self) -> tuple[Geometry, VolumeGrid]:
