@@ -19,6 +19,7 @@ from tomo_polysplat.plan.bowtie import find_bowtie
 from tomo_polysplat.plan.preparation import RunOptions
 from tomo_polysplat.report.decided import found_about_the_scanner
 from tomo_polysplat.result.filter_found import filter_of
+from tomo_polysplat.scan.filter_map_file import thickness_of
 from tomo_polysplat.scan.geometry import from_astra
 from tomo_polysplat.scan.io import load_scan, save_scan
 from tomo_polysplat.scan.scan import Scan
@@ -192,3 +193,12 @@ def test_fits_find_a_bowtie_of_grains_and_none_where_there_is_none(monkeypatch):
         options = RunOptions.of("balanced", {"views_per_step": 10}, None, 0, "cpu", [])
         answer = find_bowtie(problem, options, lambda *_: None)
         assert least <= answer.evidence["thickest"] <= most, answer
+
+
+def test_one_row_of_numbers_stands_for_all_in_any_file(tmp_path):
+    row = np.linspace(0.0, 2.0, 7)
+    np.save(tmp_path / "row.npy", row)
+    np.save(tmp_path / "rows.npy", row[None])
+    np.savetxt(tmp_path / "row.txt", row[None])
+    for name in ("row.npy", "rows.npy", "row.txt"):
+        np.testing.assert_allclose(thickness_of(tmp_path / name, "--filter-map"), row[None])

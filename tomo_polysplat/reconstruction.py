@@ -145,7 +145,7 @@ def reconstruct(
     calibrate : bool or names among "scatter", "kvp", "filter", optional
         Fit these by a few short fits first, and use what fits the held-out rays better: a scattered signal, and the
         tube's voltage or its filters, which need ``soft_density``. True calibrates scatter, and the voltage where
-        the density is given; False nothing; None scatter, where the rays show it after a third of the fit, which
+        the density is given; False nothing; None scatter, where the rays show it after three tenths of the fit, which
         then begins anew (and callbacks see its iterations and share begin again).
         ``result.plan["calibration"]`` and ``["scatter"]`` tell what came of it; what a time budget leaves no room for
         is left as it is.
@@ -155,9 +155,9 @@ def reconstruct(
         Move the scanner's geometry to where the rays have it, before the fit. "auto": the detector along its columns
         where opposite rays say that the axis of rotation is off and two short fits confirm it, its roll and shifts of
         single views where a fit of one pass shows them and a few more confirm them; a scan that is right stays as it
-        is, bit for bit. True: the skew of the axis as well, by fits that take about as long as the run. Names: these
-        alone, likewise; pixels,
-        degrees, and per cent of the distance. Moves that held-out rays do not confirm are not made.
+        is, bit for bit. True: the skew of the axis as well, by fits that take a quarter to a half of the run's time.
+        Names: these alone, likewise; pixels, degrees, and per cent of the distance. Moves that held-out rays do not
+        confirm are not made.
         `Result.geometry` is the geometry found, ``result.plan["alignment"]`` the moves. None or False: the geometry
         is as told. Beside a ``time_budget`` "auto" alone, without the fits.
     mend : bool

@@ -138,3 +138,13 @@ def test_the_report_has_a_section_on_it(result, found, tmp_path):
     assert "How fine, and how faint" in page and found.describe()[:40] in page
     result.report(tmp_path / "b.html")
     assert "How fine" not in (tmp_path / "b.html").read_text()
+
+
+def test_what_was_not_fitted_or_is_of_another_unit_is_refused(result):
+    """Half a fit of Gaussians would tell nothing of a volume by FDK."""
+    plain = tps.baselines.fdk(fan())
+    for judge in (tps.resolution, tps.contrast):
+        with pytest.raises(ValueError, match="Gaussians were fitted.*reconstruct"):
+            judge(plain, fan())
+        with pytest.raises(ValueError, match="the scan of the result"):
+            judge(result, replace(fan(), unit="mm"))

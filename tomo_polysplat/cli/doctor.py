@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 NAME = "doctor"
 HELP = "say which versions, devices and kernels are there and why, and test them"
@@ -27,17 +29,23 @@ def run(arguments: argparse.Namespace) -> int:
         print(heading)
         for name, text in lines:
             print(f"  {name:<16} {text}")
-    if arguments.warm:
-        # What is wrong with the small scans that kernels are compiled by is nobody's concern.
-        logger = logging.getLogger("tomo_polysplat")
-        level = logger.level
-        logger.setLevel(logging.ERROR)
-        try:
+    with _errors_alone():
+        if arguments.warm:
             print(f"kernels\n  {'compiled':<16} {warm()}")
-        finally:
-            logger.setLevel(level)
-    if arguments.no_test:
-        return 0
-    passed, text = self_test()
+        if arguments.no_test:
+            return 0
+        passed, text = self_test()
     print(f"self-test\n  {'passed' if passed else 'FAILED':<16} {text}")
     return 0 if passed else 1
+
+
+@contextmanager
+def _errors_alone() -> Iterator[None]:
+    """What is wrong with the small scans of this command is nobody's concern, unless it ends them."""
+    logger = logging.getLogger("tomo_polysplat")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)

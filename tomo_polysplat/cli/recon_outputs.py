@@ -109,7 +109,8 @@ def require_room_of(arguments: argparse.Namespace, scan: Scan) -> None:
 def _require_hounsfield(arguments: argparse.Namespace, scan: Scan, option: str) -> None:
     """Refuse Hounsfield units without a spectrum or a real length: they compare with water at an energy."""
     if scan.unit == "pixel" or arguments.mono or scan.spectrum is None:
-        remedy = "pass --kvp or --spectrum and the pixel's size, or leave Hounsfield units out"
+        spectrum = "leave --mono out" if arguments.mono else "pass --kvp or --spectrum and the pixel's size"
+        remedy = f"{spectrum}, or leave Hounsfield units out"
         raise fail(
             option, "a spectrum and real lengths for Hounsfield units", "a volume without an energy", remedy
         )

@@ -84,7 +84,9 @@ class Calibration:
         """What a caller asks for, checked; None for nothing."""
         if not calibrate:
             if soft_density is not None:
-                raise fail("soft_density", "calibrate beside it", "none", "pass calibrate=True as well")
+                raise fail(
+                    "soft_density", "calibrate beside it", "none", "pass calibrate=True (--calibrate) as well"
+                )
             return None
         if spectrum is None:
             raise fail("calibrate", "a spectrum to calibrate", "none")

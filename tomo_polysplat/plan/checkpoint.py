@@ -155,9 +155,8 @@ class Checkpoint:
         if about["format"] != FORMAT:
             raise fail("checkpoint", f"a file of format {FORMAT}", f"{about['format']!r}", remedy)
         if about["scan"] != self.scan:
-            raise fail(
-                "checkpoint", "one of this scan", f"{self.path}, which another scan left behind", remedy
-            )
+            got = f"{self.path}, which another scan, spectrum, list of materials or filter map left behind"
+            raise fail("checkpoint", "one of this scan, and of how it is modelled", got, remedy)
         names = sorted(self.options.keys() | about["options"].keys())
         other = [name for name in names if self.options.get(name) != about["options"].get(name)]
         if other:

@@ -125,7 +125,7 @@ def under(problem: Problem, found: dict[str, Any] | None) -> tuple[Problem, Plan
     plan = Plan()
     if found is None:
         return problem, plan
-    plan.note("calibration", found)
+    plan.note("calibration", found, str(found.get("why", "")))
     if "scatter" in found["accepted"]:
         modelled = bool(found["accepted"]["scatter"])
         why = f"modelled: {describe_scatter(found['fitted'])}" if modelled else f"none: {found['why']}"

@@ -58,7 +58,13 @@ def settings_of(result: Result) -> dict[str, Any]:
 
 
 def require_scan_of(result: Result, scan: Scan) -> None:
-    """Raise ValueError unless the scan has the volume of the result."""
+    """Raise ValueError unless the result was fitted, and the scan has its volume and unit."""
+    if not result.gaussians:
+        raise fail(
+            "result", "one that Gaussians were fitted for", "a volume without any", "reconstruct makes one"
+        )
+    if scan.unit != result.unit:
+        raise fail("scan", f"the scan of the result, in {result.unit}", f"one in {scan.unit}")
     if scan.volume_shape != result.grid.shape:
         raise fail("scan", f"the scan of the result, {result.grid.shape}", f"a volume of {scan.volume_shape}")
 

@@ -95,7 +95,7 @@ def _by_short_fits(lab: Lab, evidence: dict[str, float]) -> Answer:
         # Torch's or ours, of a GPU that has no room for a second cloud, or a fit that did not converge.
         logger.warning("Scatter is not looked for: %s", error)
         raise Untold(f"{error}") from error
-    lab.plan.note("calibration", found)
+    lab.plan.note("calibration", found, found["why"])
     if found["accepted"]["scatter"]:
         lab.run.restart = found
         return Answer(found["fitted"], found["why"], Status.ASKED, evidence)

@@ -26,8 +26,12 @@ def probe_lengths(measured: Measured) -> Finding:
     """How dense water would be that attenuates as the object does, whose size its shadow tells."""
     scan = measured.scan
     if scan.unit == "pixel" or scan.spectrum is None:
-        text = "without a spectrum and a unit of length there is no density to look at"
-        return Finding(LENGTHS, UNKNOWN, text, "a spectrum, and the size of a pixel")
+        lacking = [
+            *["a spectrum"] * (scan.spectrum is None),
+            *["the size of a pixel"] * (scan.unit == "pixel"),
+        ]
+        text = f"without {' and '.join(lacking)} there is no density to look at"
+        return Finding(LENGTHS, UNKNOWN, text, ", and ".join(lacking))
     if measured.air is None:
         text = "without air on both sides the size of the object is not told"
         return Finding(LENGTHS, UNKNOWN, text, _NEEDS)

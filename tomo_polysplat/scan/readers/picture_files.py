@@ -48,12 +48,22 @@ class NpyFrames:
             raise fail("path", expected, got, OTHER_PICTURE)
         return np.asarray(picture[rows, columns])
 
+    @staticmethod
+    def row_of(file: Path) -> np.ndarray | None:
+        """The numbers of a file of one axis, (1, columns); None where it has more."""
+        values = _mapped(file)
+        return np.array(values[None], np.float64) if values.ndim == 1 and values.dtype.kind in "fiu" else None
+
     def _mapped(self, index: int) -> np.ndarray:
-        try:
-            return np.load(self._files[index], mmap_mode="r", allow_pickle=False)
-        except Exception as error:  # headers are texts of Python, whose parser raises whatever it meets
-            got = f"{self._files[index]} ({str(error)[:120]})"
-            raise fail("path", "a .npy file of numbers", got, "save it again with numpy.save") from error
+        return _mapped(self._files[index])
+
+
+def _mapped(file: Path) -> np.ndarray:
+    try:
+        return np.load(file, mmap_mode="r", allow_pickle=False)
+    except Exception as error:  # headers are texts of Python, whose parser raises whatever it meets
+        got = f"{file} ({str(error)[:120]})"
+        raise fail("path", "a .npy file of numbers", got, "save it again with numpy.save") from error
 
 
 _READERS: dict[str, Callable[[Sequence[Path]], Frames]] = {
