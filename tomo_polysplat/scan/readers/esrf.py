@@ -101,9 +101,10 @@ def _dark(files: list[Path], text: IniText) -> Frames | None:
     """Pictures without light; those of the scan's end are each the sum of ``DARK_N``."""
     if not files:
         return None
-    summed = int(require_number("DARK_N", text.number("DARK_N", otherwise=1.0), at_least=1))
     frames = EdfFrames(files)
-    return MeanOfSums(frames, summed) if _SUMMED.match(files[0].name) and summed > 1 else frames
+    if not _SUMMED.match(files[0].name):
+        return frames
+    return MeanOfSums(frames, int(require_number("DARK_N", text.number("DARK_N", otherwise=1.0), at_least=1)))
 
 
 def _beside(folder: Path, patterns: tuple[str, ...]) -> list[Path]:

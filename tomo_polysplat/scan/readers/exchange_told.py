@@ -81,7 +81,7 @@ def _frames(file: h5py.File, name: str, size: tuple[int, ...]) -> Frames | None:
     if len(found) == 1 and found[0].ndim == 3:
         return Hdf5Frames(found[0], np.arange(len(found[0])))
     parts = [
-        read_numbers(file, frames.name, frames.shape).reshape(-1, *frames.shape[-2:]) for frames in found
+        read_numbers(file, frames.name, (*frames.shape[:-2], *size)).reshape(-1, *size) for frames in found
     ]
     return ArrayFrames(np.concatenate(parts)) if parts else None
 

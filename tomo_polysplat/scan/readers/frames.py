@@ -158,8 +158,8 @@ class TiffFrames:
             rows, columns = page.shape
             first, behind = _count(self._files[0], page), _lies_behind(page)
         # Where the first file has one picture, so have the others, which are opened when they are asked for.
-        counts = [first] if first == 1 else [first, *(_pages(file) for file in self._files[1:])]
-        self._ends = np.cumsum(counts) if first > 1 else np.arange(1, len(self._files) + 1)
+        others = [1 if first == 1 else _pages(file) for file in self._files[1:]]
+        self._ends = np.cumsum([first, *others])
         self._mapped = (
             None if behind is None else _mapped(self._files[0], self.dtype, behind, (first, rows, columns))
         )
