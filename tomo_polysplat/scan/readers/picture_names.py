@@ -135,7 +135,8 @@ def of_one_name(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
         got = ", ".join(f"{len(some)} as {some[0].name}" for some in list(named.values())[:_MOST_NAMES])
         remedy = "name those of the scan by a pattern such as proj_*.tif: projections (--projections)"
         raise fail("path", "pictures of one name and different numbers", got, remedy)
-    return most, [file for file in files if file not in most]
+    kept = set(most)
+    return most, [file for file in files if file not in kept]
 
 
 def _of_kind(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
