@@ -54,9 +54,6 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
     _require_lengths(folder, known)
     files, passed_over = _sorted_out(folder, known)
     frames = frames_of(files["projections"])
-    if frames.shape[0] < 2:
-        got = f"one, {files['projections'][0].name}"
-        raise fail("projections", "pictures of at least two views", got, "name the others (--projections)")
     known |= {name: files[name] for name in ("flats", "darks") if files[name]}
     told = Acquisition(KIND, frames, full_turn(frames.shape[0]), folder.name, other=other)
     if passed_over:
@@ -70,7 +67,11 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
             f"the numbers of the pictures jump ({gaps}): steps are taken to be even over those that are there; give "
             "degrees="
         )
-    return guessed(stated_over(told, known, folder), known)
+    told = guessed(stated_over(told, known, folder), known)
+    if frames.shape[0] < 2:
+        got = f"one, {files['projections'][0].name}"
+        raise fail("projections", "pictures of at least two views", got, "name the others (--projections)")
+    return told
 
 
 def _require_lengths(folder: Path, known: Mapping[str, Any]) -> None:
