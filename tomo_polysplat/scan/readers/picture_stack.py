@@ -67,11 +67,7 @@ def read(path: Path, stated: Mapping[str, Any]) -> Acquisition:
             f"the numbers of the pictures jump ({gaps}): steps are taken to be even over those that are there; give "
             "degrees="
         )
-    told = guessed(stated_over(told, known, folder), known)
-    if frames.shape[0] < 2:
-        got = f"one, {files['projections'][0].name}"
-        raise fail("projections", "pictures of at least two views", got, "name the others (--projections)")
-    return told
+    return guessed(stated_over(told, known, folder), known)
 
 
 def _require_lengths(folder: Path, known: Mapping[str, Any]) -> None:

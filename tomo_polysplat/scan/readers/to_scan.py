@@ -104,6 +104,8 @@ def _geometry(told: Acquisition) -> Geometry:
         if geometry.views == views:
             got = f"{geometry.rows} x {geometry.columns} for pictures of {rows} x {columns} pixels"
         raise fail("path", "one angle for each picture, and a detector of their size", got)
+    if views < 2:
+        raise fail("projections", "pictures of at least two views", "one", "name the others (--projections)")
     return geometry
 
 
