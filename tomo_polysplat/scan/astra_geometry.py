@@ -19,6 +19,7 @@ from tomo_polysplat.scan.volume_grid import VolumeGrid, require_count
 __all__ = [
     "from_astra",
     "geometry_from_astra",
+    "geometry_to_astra",
     "grid_from_astra",
     "is_planar_geometry",
     "projections_from_astra",
@@ -109,12 +110,18 @@ def to_astra(geometry: Geometry, grid: VolumeGrid) -> tuple[dict[str, Any], dict
     """ASTRA's 3D vector geometry and volume geometry for ours; a 2D scan becomes one row and one slice."""
     import astra
 
-    kind = "cone_vec" if geometry.beam == "cone" else "parallel3d_vec"
-    vectors = np.hstack([geometry.origin, geometry.centre, geometry.u, geometry.v])
-    proj_geom = astra.create_proj_geom(kind, geometry.rows, geometry.columns, vectors)
     slices, rows, columns = grid.shape
     window = [float(edge) for pair in zip(grid.lower, grid.upper) for edge in pair]
-    return proj_geom, astra.create_vol_geom(rows, columns, slices, *window)
+    return geometry_to_astra(geometry), astra.create_vol_geom(rows, columns, slices, *window)
+
+
+def geometry_to_astra(geometry: Geometry) -> dict[str, Any]:
+    """The first of `to_astra`, which needs no volume."""
+    import astra
+
+    kind = "cone_vec" if geometry.beam == "cone" else "parallel3d_vec"
+    vectors = np.hstack([geometry.origin, geometry.centre, geometry.u, geometry.v])
+    return astra.create_proj_geom(kind, geometry.rows, geometry.columns, vectors)
 
 
 def projections_from_astra(projections: Any, proj_geom: Mapping[str, Any]) -> np.ndarray:

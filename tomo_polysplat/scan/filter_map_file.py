@@ -56,14 +56,14 @@ def thickness_of(path: str | os.PathLike, argument: str = "path") -> np.ndarray:
     ValueError
         If it holds no such numbers.
     """
-    from tomo_polysplat.scan.readers.picture_files import NpyFrames, frames_of
+    from tomo_polysplat.scan.readers.picture_files import frames_of, mapped_npy
     from tomo_polysplat.scan.readers.picture_names import PICTURE_SUFFIXES
 
     file = existing_file(path, argument)
     if file.suffix.lower() not in PICTURE_SUFFIXES:
         return _table(file, argument)
-    if file.suffix.lower() == ".npy" and (row := NpyFrames.row_of(file)) is not None:
-        return row
+    if file.suffix.lower() == ".npy" and (row := mapped_npy(file)).ndim == 1 and row.dtype.kind in "fiu":
+        return np.array(row[None], np.float64)
     frames = frames_of([file])
     if frames.shape[0] != 1:
         raise fail(argument, "one picture (rows, columns)", f"{frames.shape[0]} in {file}")

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tomo_polysplat.scan.geometry import VolumeGrid, geometry_from_astra, projections_from_astra, to_astra
+from tomo_polysplat.scan.geometry import geometry_from_astra, geometry_to_astra, projections_from_astra
 from tomo_polysplat.scan.scan import Scan
 
 __all__ = ["flattened"]
@@ -19,9 +19,6 @@ def flattened(scan: Scan) -> Scan:
     """
     if scan.proj_geom.get("type") != "cyl_cone_vec":
         return scan
-    flat = geometry_from_astra(scan.proj_geom)
-    # The window stands for any: only the other half of the answer is used.
-    proj_geom, _ = to_astra(flat, VolumeGrid((1, 1, 1), np.zeros(3), np.ones(3)))
     values = projections_from_astra(scan.projections, scan.proj_geom)
     # Copied, where nothing had to be resampled.
     values = np.where(np.isinf(values), np.float32(np.nan), values)
@@ -33,5 +30,5 @@ def flattened(scan: Scan) -> Scan:
         scan,
         projections=np.ascontiguousarray(values.swapaxes(0, 1)),
         valid=None if good.all() else np.ascontiguousarray(good.swapaxes(0, 1)),
-        proj_geom=proj_geom,
+        proj_geom=geometry_to_astra(geometry_from_astra(scan.proj_geom)),
     )

@@ -11,6 +11,7 @@ edges of the package by the functions named here, and nowhere else.
 from tomo_polysplat.scan.astra_geometry import (
     from_astra,
     geometry_from_astra,
+    geometry_to_astra,
     grid_from_astra,
     is_planar_geometry,
     projections_from_astra,
@@ -27,6 +28,7 @@ __all__ = [
     "VolumeGrid",
     "from_astra",
     "geometry_from_astra",
+    "geometry_to_astra",
     "grid_from_astra",
     "is_planar_geometry",
     "projections_from_astra",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from tomo_polysplat.checks import fail
 from tomo_polysplat.scan.circular import volume_seen
 from tomo_polysplat.scan.dxchange_host import read_block
-from tomo_polysplat.scan.geometry import VolumeGrid, geometry_from_astra, grid_from_astra, to_astra
+from tomo_polysplat.scan.geometry import geometry_from_astra, geometry_to_astra, grid_from_astra
 from tomo_polysplat.scan.layout import volume_geometry
 from tomo_polysplat.scan.readers.part import Part
 
@@ -69,16 +70,17 @@ class StoredPart:
             raise fail("filter_thickness", f"shape {whole}, (rows, columns)", f"{np.shape(thickness)}")
         return material, np.array(self.of_pixels(np.broadcast_to(thickness, whole))), *density
 
-    def geometries(self, known: dict[str, Any], vol_geom: Any = None) -> tuple[dict[str, Any], bool]:
+    def geometries(
+        self, known: dict[str, Any], asked: Mapping[str, Any] | None
+    ) -> tuple[dict[str, Any], bool]:
         """Those of the part, of ``proj_geom`` and ``vol_geom`` of the whole; whether the volume is still the same.
 
-        A ``vol_geom`` that somebody asked for is that of the part.
+        `asked` is as of `part_of_geometry`.
         """
         if self.part.whole:
             return known, True
-        proj_geom, seen = part_of_geometry(self.part, known["proj_geom"], known["vol_geom"], self._spans)
-        if vol_geom is not None:
-            seen = dict(vol_geom)
+        whole = known["proj_geom"], known["vol_geom"]
+        proj_geom, seen = part_of_geometry(self.part, *whole, self._spans, asked)
         return known | {"proj_geom": proj_geom} | ({} if seen is None else {"vol_geom": seen}), seen is None
 
 
@@ -87,16 +89,19 @@ def part_of_geometry(
     proj_geom: dict[str, Any],
     vol_geom: dict[str, Any],
     spans: tuple[tuple[int, int], tuple[int, int]],
+    asked: Mapping[str, Any] | None,
 ) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """ASTRA's geometries of a part; None for that of the volume where views are all that is left out.
 
-    The volume is what the part sees. One that is not about the z axis stays where it is, as high as the part sees.
+    The volume is the one `asked` for, if any, else what the part sees. One that is not about the z axis stays where it
+    is, as high as the part sees.
     """
     seen = part.of(geometry_from_astra(proj_geom), spans)
-    # The window stands for any: only the other half of the answer is used.
-    chosen, _ = to_astra(seen, VolumeGrid((1, 1, 1), np.zeros(3), np.ones(3)))
+    chosen = geometry_to_astra(seen)
     if (part.rows, part.columns, part.binning) == (None, None, 1):
         return chosen, None
+    if asked is not None:
+        return chosen, dict(asked)
     usual, whole = volume_seen(seen), grid_from_astra(vol_geom)
     if np.abs(whole.lower + whole.upper)[:2].max() < 2 * whole.voxel_size[:2].max():
         return chosen, usual

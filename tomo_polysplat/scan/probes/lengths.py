@@ -26,10 +26,8 @@ def probe_lengths(measured: Measured) -> Finding:
     """How dense water would be that attenuates as the object does, whose size its shadow tells."""
     scan = measured.scan
     if scan.unit == "pixel" or scan.spectrum is None:
-        lacking = [
-            *["a spectrum"] * (scan.spectrum is None),
-            *["the size of a pixel"] * (scan.unit == "pixel"),
-        ]
+        needed = {"a spectrum": scan.spectrum is None, "the size of a pixel": scan.unit == "pixel"}
+        lacking = [words for words, missing in needed.items() if missing]
         text = f"without {' and '.join(lacking)} there is no density to look at"
         return Finding(LENGTHS, UNKNOWN, text, ", and ".join(lacking))
     if measured.air is None:

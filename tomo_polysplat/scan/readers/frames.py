@@ -157,17 +157,16 @@ class TiffFrames:
             self.dtype = np.dtype(page.dtype)
             rows, columns = page.shape
             first, behind = _count(self._files[0], page), _lies_behind(page)
+            stored = self.dtype.newbyteorder(page.parent.byteorder)
         # Where the first file has one picture, so have the others, which are opened when they are asked for.
         others = [1 if first == 1 else _pages(file) for file in self._files[1:]]
         self._ends = np.cumsum([first, *others])
-        self._mapped = (
-            None if behind is None else _mapped(self._files[0], self.dtype, behind, (first, rows, columns))
-        )
-        if behind is not None and len(self._files) > 1:
-            got = f"{len(self._files)} such files"
-            raise fail(
-                "path", "one stack of ImageJ's of more than 4 GB", got, "write it as an image sequence"
-            )
+        self._mapped = None
+        if behind is not None:
+            if others:
+                got, remedy = f"{len(self._files)} such files", "write it as an image sequence"
+                raise fail("path", "one stack of ImageJ's of more than 4 GB", got, remedy)
+            self._mapped = _mapped(self._files[0], stored, behind, (first, rows, columns))
         self.shape = (int(self._ends[-1]), rows, columns)
 
     def read(self, index: int, rows: slice, columns: slice) -> np.ndarray:
@@ -214,9 +213,7 @@ def _lies_behind(page: Any) -> int | None:
 
 
 def _mapped(file: Path, dtype: np.dtype, offset: int, shape: tuple[int, int, int]) -> np.ndarray:
-    """The pictures of such a stack, in the file's order of bytes."""
-    with _page(file, 0) as page:
-        dtype = dtype.newbyteorder(page.parent.byteorder)
+    """The pictures of such a stack, as numbers of the file's order of bytes."""
     try:
         return np.memmap(file, dtype, "r", offset, shape)
     except ValueError as error:  # it is shorter than it says

@@ -118,7 +118,7 @@ def _told(path: Path, entry: h5py.Group) -> Acquisition:
         unit=unit,
         flats=stacks.get(_FLAT),
         darks=stacks.get(_DARK),
-        light=_light(entry, frames),
+        light=_light(entry, frames, len(data)),
         exposure=_first(entry, f"{detector}/count_time"),
         other=_others(entry, detector),
     )
@@ -147,13 +147,11 @@ def _without_way_back(entry: h5py.Group, detector: str, keys: np.ndarray) -> tup
     return np.where(back, _WAY_BACK, keys), [words]
 
 
-def _light(entry: h5py.Group, frames: Mapping[int, np.ndarray]) -> np.ndarray | None:
+def _light(entry: h5py.Group, frames: Mapping[int, np.ndarray], pictures: int) -> np.ndarray | None:
     """The beam in each view over that in the flats, by the monitor's counts; None where they tell of no change."""
-    pictures = sum(map(len, frames.values()))
-    found = find_array(entry, _MONITOR) if _MONITOR.partition("/")[0] in entry else None
-    if found is None or found.ndim != 1 or len(found) < pictures or not len(frames[_FLAT]):
+    if not len(frames[_FLAT]) or not _is_there(entry, _MONITOR, pictures):
         return None
-    counts = read_numbers(entry, _MONITOR, found.shape).astype(np.float64)
+    counts = read_numbers(entry, _MONITOR, (pictures,)).astype(np.float64)
     used = counts[np.concatenate([frames[_PROJECTION], frames[_FLAT]])]
     if not (np.isfinite(used).all() and (used > 0).all()):
         return None

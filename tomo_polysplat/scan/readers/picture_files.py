@@ -13,7 +13,7 @@ from tomo_polysplat.scan.readers.edf import EdfFrames
 from tomo_polysplat.scan.readers.frames import OTHER_PICTURE, ArrayFrames, Frames, TiffFrames
 from tomo_polysplat.scan.readers.xradia_frames import xrm_pictures
 
-__all__ = ["NpyFrames", "frames_of"]
+__all__ = ["NpyFrames", "frames_of", "mapped_npy"]
 
 
 class NpyFrames:
@@ -27,7 +27,7 @@ class NpyFrames:
 
     def __init__(self, files: Sequence[Path]) -> None:
         self._files = [existing_file(file) for file in files]
-        first = self._mapped(0)
+        first = mapped_npy(self._files[0])
         self._stack = ArrayFrames(first) if first.ndim == 3 and len(self._files) == 1 else None
         if self._stack is None and (first.ndim != 2 or first.dtype.kind not in "fiu"):
             got = f"{first.dtype} of shape {first.shape} in {self._files[0]}"
@@ -41,24 +41,22 @@ class NpyFrames:
         """Part of one picture."""
         if self._stack is not None:
             return self._stack.read(index, rows, columns)
-        picture = self._mapped(index)
+        picture = mapped_npy(self._files[index])
         if picture.shape != self.shape[1:] or picture.dtype != self.dtype:
             got = f"{picture.dtype} of {picture.shape} in {self._files[index]}"
             expected = f"{self.dtype} of {self.shape[1:]} as in {self._files[0].name}"
             raise fail("path", expected, got, OTHER_PICTURE)
         return np.asarray(picture[rows, columns])
 
-    @staticmethod
-    def row_of(file: Path) -> np.ndarray | None:
-        """The numbers of a file of one axis, (1, columns); None where it has more."""
-        values = _mapped(file)
-        return np.array(values[None], np.float64) if values.ndim == 1 and values.dtype.kind in "fiu" else None
 
-    def _mapped(self, index: int) -> np.ndarray:
-        return _mapped(self._files[index])
+def mapped_npy(file: Path) -> np.ndarray:
+    """The array of a ``.npy`` file, of which nothing is read yet.
 
-
-def _mapped(file: Path) -> np.ndarray:
+    Raises
+    ------
+    ValueError
+        If there is none.
+    """
     try:
         return np.load(file, mmap_mode="r", allow_pickle=False)
     except Exception as error:  # headers are texts of Python, whose parser raises whatever it meets

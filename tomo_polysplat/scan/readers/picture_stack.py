@@ -131,10 +131,9 @@ def _sorted_out(folder: Path, known: Mapping[str, Any]) -> tuple[dict[str, list[
     files = {name: named_files(folder, known[name], name) for name in kinds if name in known}
     taken = {file for some in files.values() for file in some}
     inside = [inner for inner in entries_of(folder) if inner.is_dir()]
-    passed_over: list[Path] = []
+    pictures, passed_over = pictures_in(folder), list[Path]()
     for name in ("flats", "darks"):
         if name not in files:
-            pictures = pictures_in(folder)
             matching = [file for file in pictures if has_word(file.stem, name) and file not in taken]
             if len(matching) == len(pictures) and not any(map(pictures_in, inside)):
                 # A word that all pictures of a scan have tells of the sample.
@@ -144,7 +143,7 @@ def _sorted_out(folder: Path, known: Mapping[str, Any]) -> tuple[dict[str, list[
             files[name] = matching
             taken |= set(matching)
     if "projections" not in files:
-        left = [file for file in pictures_in(folder) if file not in taken]
+        left = [file for file in pictures if file not in taken]
         # Flats that were not named, where one of them was, are none of the object.
         left = [file for file in left if not any(has_word(file.stem, name) for name in kinds[1:])] or left
         left, passed_over = of_one_name(left or _pictures_of_one(inside, taken))

@@ -32,8 +32,9 @@ _MOST_FOLDERS = 100
 _MOST_NAMED = 3
 # Pictures for the eye.
 _LOSSY = {".jpg", ".jpeg", ".png", ".bmp", ".gif"}
-# The first one that recognises what it is shown reads it: what any folder of pictures is comes last.
+# Those that read a TOML file themselves, of any name.
 _OF_ANY_TOML = (npz_stack, picture_stack)
+# The first one that recognises what it is shown reads it: what any folder of pictures is comes last.
 READERS = (skyscan, nikon, xradia, nxtomo, cil_nexus, rtk, esrf, npz_stack, picture_stack)
 _REMEDY = (
     "name the folder or the file that the scanner wrote; docs/scanner_files.md tells what is read of each"

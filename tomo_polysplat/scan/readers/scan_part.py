@@ -39,10 +39,10 @@ def scan_part(scan: Scan, part: Part, asked: Mapping[str, Any] | None = None) ->
         of_pixels = np.broadcast_to(filters[1], (scan.rows, scan.columns))[slice(*rows), slice(*columns)]
         whole = part.averaged(of_pixels[None])[0] if part.binning > 1 else of_pixels
         filters = (filters[0], np.array(whole), *filters[2:])
-    proj_geom, vol_geom = part_of_geometry(part, scan.proj_geom, scan.vol_geom, (rows, columns))
+    proj_geom, vol_geom = part_of_geometry(part, scan.proj_geom, scan.vol_geom, (rows, columns), asked)
     kept: dict[str, Any] = {}
     if vol_geom is not None:
-        kept = {"vol_geom": vol_geom if asked is None else dict(asked), "truth": None, "metal_mask": None}
+        kept = {"vol_geom": vol_geom, "truth": None, "metal_mask": None}
     return replace(
         scan,
         projections=projections.transpose(1, 0, 2),

@@ -14,7 +14,7 @@ from tomo_polysplat.evenly_spread import evenly_spread
 from tomo_polysplat.scan.circular import volume_seen
 from tomo_polysplat.scan.counts import Counts
 from tomo_polysplat.scan.defects import flat_and_dark
-from tomo_polysplat.scan.geometry import Geometry, VolumeGrid, to_astra
+from tomo_polysplat.scan.geometry import Geometry, geometry_to_astra
 from tomo_polysplat.scan.half_acquisition import with_room
 from tomo_polysplat.scan.in_blocks import line_integrals
 from tomo_polysplat.scan.layout import spatial_geometry
@@ -202,8 +202,7 @@ def _geometries(seen: Geometry, told: Acquisition, options: ReadOptions) -> dict
     if options.proj_geom is not None:
         proj_geom = spatial_geometry(dict(options.proj_geom))
     else:
-        # The window stands for any: only the other half of the answer is used.
-        proj_geom, _ = to_astra(seen, VolumeGrid((1, 1, 1), np.zeros(3), np.ones(3)))
+        proj_geom = geometry_to_astra(seen)
     vol_geom = volume_seen(seen) if options.vol_geom is None else dict(options.vol_geom)
     return {"proj_geom": proj_geom, "vol_geom": vol_geom, "unit": unit}
 
