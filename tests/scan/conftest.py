@@ -1,9 +1,12 @@
-"""A Data Exchange file to change."""
+"""A Data Exchange file to change, and a plain stack of TIFFs."""
 
 import h5py
 import numpy as np
 import pytest
 from discs import COLUMNS, ROWS, discs
+from folders import marked
+
+from tomo_polysplat.simulate.folders.write import write_folder
 
 
 @pytest.fixture
@@ -27,3 +30,19 @@ def exchange(tmp_path):
         return path, lines
 
     return write
+
+
+@pytest.fixture(scope="module")
+def tiff_stack(tmp_path_factory):
+    """A folder of TIFFs with its scan.toml."""
+    place = tmp_path_factory.mktemp("stack") / "sample"
+    write_folder("tiffs", place, marked())
+    return place
+
+
+@pytest.fixture
+def bare(tiff_stack, tmp_path):
+    """The pictures alone."""
+    for file in tiff_stack.glob("*.tif"):
+        (tmp_path / file.name).symlink_to(file)
+    return tmp_path

@@ -9,7 +9,10 @@ from tomo_polysplat.simulate.folders.scene import MARKER, marked_scan
 from tomo_polysplat.start.fdk import fdk
 from tomo_polysplat.units import cm_per
 
-__all__ = ["error_db", "marked", "require_the_same_volume", "volume_of"]
+__all__ = ["STATED", "error_db", "marked", "require_the_same_volume", "volume_of"]
+
+# What nothing tells of the pictures in `tiff_stack`.
+STATED = {"sod": 100.0, "sdd": 250.0, "pixel": 1.6, "offset": (2.4, 0.0), "arc": 360.0}
 
 
 @cache

@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 import tifffile
-from folders import marked, require_the_same_volume
+from folders import STATED, marked, require_the_same_volume
 
 import tomo_polysplat as tps
 from tomo_polysplat.scan.geometry import from_astra
@@ -16,33 +16,16 @@ from tomo_polysplat.simulate.folders.arrays import edf_bytes
 from tomo_polysplat.simulate.folders.scene import pictures_of
 from tomo_polysplat.simulate.folders.write import write_folder
 
-STATED = {"sod": 100.0, "sdd": 250.0, "pixel": 1.6, "offset": (2.4, 0.0), "arc": 360.0}
 
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    place = tmp_path_factory.mktemp("stack") / "sample"
-    write_folder("tiffs", place, marked())
-    return place
-
-
-@pytest.fixture
-def bare(folder, tmp_path):
-    """The pictures alone."""
-    for file in folder.glob("*.tif"):
-        (tmp_path / file.name).symlink_to(file)
-    return tmp_path
-
-
-def test_counts_become_line_integrals_through_flats_and_darks(folder):
-    scan = tps.load_scan(folder)
+def test_counts_become_line_integrals_through_flats_and_darks(tiff_stack):
+    scan = tps.load_scan(tiff_stack)
     assert scan.valid is None and scan.name == "sample" and scan.unit == "mm"
     # Counts are whole numbers: half of one in the 30000 behind nothing.
     np.testing.assert_allclose(scan.projections, marked().projections, atol=1e-4)
 
 
-def test_arguments_say_what_the_toml_file_says(bare, folder):
-    scan, told = tps.load_scan(bare, scanner=STATED), tps.load_scan(folder)
+def test_arguments_say_what_the_toml_file_says(bare, tiff_stack):
+    scan, told = tps.load_scan(bare, scanner=STATED), tps.load_scan(tiff_stack)
     np.testing.assert_array_equal(scan.projections, told.projections)
     assert scan.proj_geom.keys() == told.proj_geom.keys()
     np.testing.assert_allclose(scan.proj_geom["Vectors"], told.proj_geom["Vectors"], atol=1e-12)
@@ -63,16 +46,16 @@ def test_pictures_that_are_missing_are_said(bare):
     assert "the numbers of the pictures jump (6 to 8): steps are taken to be even" in gap
 
 
-def test_angles_that_are_stated_stand_over_the_arc_of_the_file(folder):
-    told = tps.load_scan(folder)
-    scan = tps.load_scan(folder, scanner={"degrees": np.arange(48) * 7.5})
+def test_angles_that_are_stated_stand_over_the_arc_of_the_file(tiff_stack):
+    told = tps.load_scan(tiff_stack)
+    scan = tps.load_scan(tiff_stack, scanner={"degrees": np.arange(48) * 7.5})
     np.testing.assert_allclose(scan.proj_geom["Vectors"], told.proj_geom["Vectors"], atol=1e-9)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
-def test_a_toml_file_of_a_windows_program(bare, folder, encoding):
-    told = tps.load_scan(folder)
-    text = (folder / "scan.toml").read_text()
+def test_a_toml_file_of_a_windows_program(bare, tiff_stack, encoding):
+    told = tps.load_scan(tiff_stack)
+    text = (tiff_stack / "scan.toml").read_text()
     (bare / "scan.toml").write_bytes(text.replace("\n", "\r\n").encode(encoding))
     np.testing.assert_array_equal(tps.load_scan(bare).proj_geom["Vectors"], told.proj_geom["Vectors"])
 
@@ -113,9 +96,9 @@ def test_a_parallel_beam(tmp_path):
     require_the_same_volume(tps.load_scan(tmp_path / "sample", scanner=stated), own)
 
 
-def test_rows_columns_views_and_binning(folder):
-    whole = tps.load_scan(folder)
-    part = tps.load_scan(folder, rows=(2, 31), columns=(5, 36), views=(1, 47, 3), binning=2)
+def test_rows_columns_views_and_binning(tiff_stack):
+    whole = tps.load_scan(tiff_stack)
+    part = tps.load_scan(tiff_stack, rows=(2, 31), columns=(5, 36), views=(1, 47, 3), binning=2)
     assert part.projections.shape == (14, 16, 15)
     # The light of four pixels: rows run upwards in the scan, downwards in the pictures.
     light = np.exp(-whole.projections.astype(np.float64))
@@ -131,11 +114,11 @@ def test_rows_columns_views_and_binning(folder):
     assert from_astra(part.proj_geom, part.vol_geom)[1].voxel_size[0] == pytest.approx(2 * 0.64)
 
 
-def test_the_package_s_own_file_in_part(folder, tmp_path):
-    tps.save_scan(tps.load_scan(folder), tmp_path / "scan.h5")
+def test_the_package_s_own_file_in_part(tiff_stack, tmp_path):
+    tps.save_scan(tps.load_scan(tiff_stack), tmp_path / "scan.h5")
     # Its rows ascend with z: the same part is counted from the other end.
     ours = tps.load_scan(tmp_path / "scan.h5", rows=(3, 31), columns=(5, 35), views=3, binning=2)
-    pictures = tps.load_scan(folder, rows=(2, 30), columns=(5, 35), views=3, binning=2)
+    pictures = tps.load_scan(tiff_stack, rows=(2, 30), columns=(5, 35), views=3, binning=2)
     np.testing.assert_allclose(ours.projections, pictures.projections, atol=2e-3)
     np.testing.assert_allclose(ours.proj_geom["Vectors"], pictures.proj_geom["Vectors"], atol=1e-9)
 
@@ -195,9 +178,9 @@ def test_what_does_not_fit_is_refused(bare, stated, message):
         ({"columns": 7}, "columns: expected two whole numbers"),
     ],
 )
-def test_a_part_outside_the_pictures_is_refused(folder, part, message):
+def test_a_part_outside_the_pictures_is_refused(tiff_stack, part, message):
     with pytest.raises(ValueError, match=message):
-        tps.load_scan(folder, **part)
+        tps.load_scan(tiff_stack, **part)
 
 
 def test_pictures_that_do_not_go_together_are_refused(bare):
@@ -218,8 +201,8 @@ def test_a_folder_without_pictures_is_refused(tmp_path):
         tps.load_scan(tmp_path / "missing")
 
 
-def test_texts_of_files_are_shown_as_they_are(folder, bare):
-    text = (folder / "scan.toml").read_text() + 'comment = "\\u001b[31mred"\n'
+def test_texts_of_files_are_shown_as_they_are(tiff_stack, bare):
+    text = (tiff_stack / "scan.toml").read_text() + 'comment = "\\u001b[31mred"\n'
     (bare / "scan.toml").write_text(text)
     keys = tps.load_scan(bare).notes["scanner"]["keys"]
     assert keys == {"operator": "nobody", "comment": "\\x1b[31mred"}
@@ -310,21 +293,21 @@ def test_edf_as_fabio_writes_it(kind, tmp_path):
         assert frames.dtype == pictures.dtype
 
 
-def test_flats_that_are_not_named_are_no_projections(folder):
+def test_flats_that_are_not_named_are_no_projections(tiff_stack):
     """One flat is enough to name; the others must not become views, which would shift all angles."""
-    scan = tps.load_scan(folder, scanner={"flats": "flat_0001.tif"})
-    np.testing.assert_array_equal(scan.projections, tps.load_scan(folder).projections)
+    scan = tps.load_scan(tiff_stack, scanner={"flats": "flat_0001.tif"})
+    np.testing.assert_array_equal(scan.projections, tps.load_scan(tiff_stack).projections)
 
 
-def test_pictures_that_all_have_a_word_for_flats_are_the_object_s(folder, tmp_path):
-    for file in folder.glob("proj_*.tif"):
+def test_pictures_that_all_have_a_word_for_flats_are_the_object_s(tiff_stack, tmp_path):
+    for file in tiff_stack.glob("proj_*.tif"):
         (tmp_path / file.name.replace("proj", "open_door")).symlink_to(file)
-    scan = tps.load_scan(tmp_path, scanner=STATED | {"flats": folder / "flat_0001.tif"})
+    scan = tps.load_scan(tmp_path, scanner=STATED | {"flats": tiff_stack / "flat_0001.tif"})
     assert scan.views == 48
 
 
-def test_eight_bits_are_said(folder, tmp_path):
-    for file in folder.glob("*.tif"):
+def test_eight_bits_are_said(tiff_stack, tmp_path):
+    for file in tiff_stack.glob("*.tif"):
         tifffile.imwrite(tmp_path / file.name, (tifffile.imread(file) >> 8).astype(np.uint8))
     said = " ".join(tps.load_scan(tmp_path, scanner=STATED).notes["scanner"]["guessed"])
     assert "8 bits, 256 grey values" in said
@@ -344,26 +327,26 @@ def test_what_tifffile_logs_of_its_own_is_still_there_for_others(bare, caplog):
     assert caplog.records
 
 
-def test_the_only_folder_of_pictures_is_that_of_the_object(folder, tmp_path):
+def test_the_only_folder_of_pictures_is_that_of_the_object(tiff_stack, tmp_path):
     """Flats and darks beside it; a folder of slices is another thing, and of two others none is taken."""
     (tmp_path / "tiffs").mkdir()
-    for file in folder.glob("*.tif"):
+    for file in tiff_stack.glob("*.tif"):
         place = tmp_path / "tiffs" if file.name.startswith("proj") else tmp_path
         (place / file.name).symlink_to(file)
-    expected = tps.load_scan(folder, scanner=STATED)
+    expected = tps.load_scan(tiff_stack, scanner=STATED)
     np.testing.assert_array_equal(tps.load_scan(tmp_path, scanner=STATED).projections, expected.projections)
     for name in ("slices", "other"):
         (tmp_path / name).mkdir()
-        (tmp_path / name / "a.tif").symlink_to(next(folder.glob("proj*.tif")))
+        (tmp_path / name / "a.tif").symlink_to(next(tiff_stack.glob("proj*.tif")))
         if name == "slices":
             assert tps.load_scan(tmp_path, scanner=STATED).views == expected.views
     with pytest.raises(ValueError, match=r"pictures of an object .*--projections"):
         tps.load_scan(tmp_path, scanner=STATED)
 
 
-def test_line_integrals_are_not_taken_for_counts(folder, tmp_path):
+def test_line_integrals_are_not_taken_for_counts(tiff_stack, tmp_path):
     """Decimals around 0 in the air: refused until somebody says what they are; transmission has air near 1."""
-    lines = tps.load_scan(folder).projections.transpose(1, 0, 2)[:, ::-1]
+    lines = tps.load_scan(tiff_stack).projections.transpose(1, 0, 2)[:, ::-1]
     np.save(tmp_path / "proj.npy", lines)
     with pytest.raises(ValueError, match=r"input: expected counts.*% of them 0 or less.*attenuation"):
         tps.load_scan(tmp_path, scanner=STATED)
@@ -383,95 +366,3 @@ def test_several_guesses_are_one_warning_of_a_line_each(bare, caplog):
         guessed = tps.load_scan(bare, scanner=stated).notes["scanner"]["guessed"]
     (record,) = (one for one in caplog.records if "guessed" in one.message)
     assert len(guessed) > 2 and record.message.split("\n  - ")[1:] == guessed
-
-
-def link(files, folder):
-    for file in files:
-        (folder / file.name).symlink_to(file)
-
-
-def guesses(scan):
-    return " | ".join(scan.notes["scanner"]["guessed"])
-
-
-def test_pictures_of_other_names_are_no_views(bare, folder):
-    expected = tps.load_scan(bare, scanner=STATED)
-    one = next(folder.glob("proj_*.tif"))
-    for name in ("proj_scout_000.tif", "proj_scout_090.tif", "Preview.tif"):
-        (bare / name).symlink_to(one)
-    scan = tps.load_scan(bare, scanner=STATED)
-    np.testing.assert_array_equal(scan.projections, expected.projections)
-    assert "other names are passed over: Preview.tif, proj_scout_000.tif, proj_scout_090.tif" in guesses(scan)
-
-
-def test_two_scans_in_one_folder_are_told_apart_by_somebody(bare):
-    for number, file in enumerate(sorted(bare.glob("proj_*.tif"))):
-        file.rename(bare / f"{'first' if number % 2 else 'second'}_{number:04}.tif")
-    with pytest.raises(ValueError, match="one name and different numbers.*24 as first_0001.tif.*projections"):
-        tps.load_scan(bare, scanner=STATED)
-    assert tps.load_scan(bare, scanner=STATED | {"projections": "first*.tif"}).views == 24
-
-
-def test_angles_in_names_are_numbers(bare):
-    for number, file in enumerate(sorted(bare.glob("proj_*.tif"))):
-        file.rename(bare / f"sample_{7.5 * number:g}deg.tif")
-    assert tps.load_scan(bare, scanner=STATED).views == 48
-
-
-def test_flats_and_darks_by_the_words_of_panels_and_programs(bare):
-    expected = tps.load_scan(bare, scanner=STATED)
-    for kind, names in (("flat", ("GainImage", "FlatAfter")), ("dark", ("OffsetImage", "darkend"))):
-        for number, file in enumerate(sorted(bare.glob(f"{kind}_*.tif"))):
-            file.rename(bare / f"{names[number % 2]}{number:04}.tif")
-    np.testing.assert_array_equal(tps.load_scan(bare, scanner=STATED).projections, expected.projections)
-
-
-def test_a_word_that_all_pictures_have_tells_of_the_sample(bare):
-    for file in [*bare.glob("flat_*.tif"), *bare.glob("dark_*.tif")]:
-        file.unlink()
-    for file in bare.glob("proj_*.tif"):
-        file.rename(bare / file.name.replace("proj", "white_rice"))
-    scan = tps.load_scan(bare, scanner=STATED | {"white": 30000})
-    assert scan.views == 48
-
-
-def test_a_picture_of_another_kind_hides_no_scan(folder, tmp_path):
-    write_folder("edf", tmp_path / "edf", marked())
-    expected = tps.load_scan(tmp_path / "edf")
-    tifffile.imwrite(tmp_path / "edf" / "preview.tif", np.zeros((4, 4), np.uint8))
-    np.testing.assert_array_equal(tps.load_scan(tmp_path / "edf").projections, expected.projections)
-
-
-def test_one_picture_is_no_scan(bare):
-    for file in sorted(bare.glob("proj_*.tif"))[1:]:
-        file.unlink()
-    with pytest.raises(ValueError, match="at least two views"):
-        tps.load_scan(bare, scanner=STATED)
-
-
-@pytest.mark.parametrize("order", ["<", ">"])
-def test_a_large_stack_of_imagej_has_one_entry_for_all_its_pictures(order, folder, tmp_path):
-    """ImageJ writes more than 4 GB so; tifffile does where it is asked to."""
-    stack = np.stack([tifffile.imread(file) for file in sorted(folder.glob("proj_*.tif"))])
-    link(folder.glob("[fd]*.tif"), tmp_path)
-    with tifffile.TiffWriter(tmp_path / "stack.tif", imagej=True, byteorder=order) as file:
-        file.write(stack, truncate=True)
-    scan = tps.load_scan(tmp_path, scanner=STATED)
-    np.testing.assert_array_equal(scan.projections, tps.load_scan(folder).projections)
-    (tmp_path / "stack.tif").write_bytes((tmp_path / "stack.tif").read_bytes()[:-9])
-    with pytest.raises(ValueError, match="readable TIFF.*copy or write"):
-        tps.load_scan(tmp_path, scanner=STATED)
-
-
-def test_several_files_of_several_pictures_and_small_ones_for_a_viewer(folder, tmp_path):
-    for number, file in enumerate(sorted(folder.glob("proj_*.tif"))):
-        picture = tifffile.imread(file)
-        with tifffile.TiffWriter(tmp_path / f"proj_{number:04}.tif") as tiff:
-            tiff.write(picture)
-            tiff.write(picture[::4, ::4], subfiletype=1)
-    link(folder.glob("dark*.tif"), tmp_path)
-    flats = np.stack([tifffile.imread(file) for file in sorted(folder.glob("flat_*.tif"))])
-    for name, some in (("flat_before", flats[:2]), ("flat_after", flats[2:])):
-        tifffile.imwrite(tmp_path / f"{name}.tif", some, photometric="minisblack")
-    scan = tps.load_scan(tmp_path, scanner=STATED)
-    np.testing.assert_allclose(scan.projections, tps.load_scan(folder).projections, atol=1e-6)
